@@ -1,0 +1,81 @@
+"""Every error a user can meet. Each message names the symbol or value at fault and says what to do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scvi_codegen.trajectory import Trajectory
+
+__all__ = [
+    "BuildError",
+    "ExpressionError",
+    "MethodError",
+    "MethodWarning",
+    "ModelFileError",
+    "ScviCodegenError",
+    "StateError",
+    "StepFailedError",
+    "SystemDefinitionError",
+]
+
+
+class ScviCodegenError(Exception):
+    """Base of all errors raised on purpose by this package."""
+
+
+class SystemDefinitionError(ScviCodegenError, ValueError):
+    """The mechanical system is not well defined (unknown symbol, singular mass matrix, ...)."""
+
+
+class ExpressionError(SystemDefinitionError):
+    """Text that is not a formula of the accepted grammar.
+
+    Attributes:
+        text: the text as given.
+        column: 0-based position of the offence in ``text``.
+    """
+
+    def __init__(self, message: str, text: str, column: int) -> None:
+        self.text, self.column = text, column
+        start = max(0, column - 50)
+        window = text[start : column + 30].replace("\n", " ")
+        super().__init__(f"{message}\n  {window}\n  {' ' * (column - start)}^ column {column + 1}")
+
+
+class MethodError(ScviCodegenError, ValueError):
+    """A combination of degree, nodes and quadrature that makes no sense."""
+
+
+class MethodWarning(UserWarning):
+    """A method that can be built, with a property the user should know of."""
+
+
+class ModelFileError(ScviCodegenError, ValueError):
+    """A model file that cannot be read, or that lacks or repeats something."""
+
+
+class StateError(ScviCodegenError, ValueError):
+    """A state, step or parameter of the wrong shape, type or name."""
+
+
+class BuildError(ScviCodegenError, RuntimeError):
+    """No C compiler was found, or it refused the generated source."""
+
+
+class StepFailedError(ScviCodegenError, ArithmeticError):
+    """A step did not converge; the state before it is untouched.
+
+    Attributes:
+        status: the status word of the C code (``"not converged"``, ``"singular"``, ``"not finite"``).
+        step: index of the failing step, counted from 0.
+        t: time at the start of the failing step.
+        residual: the last scaled Newton update.
+        trajectory: the part computed before the failure (``None`` for a single step).
+    """
+
+    def __init__(
+        self, message: str, *, status: str, step: int, t: float, residual: float, trajectory: Trajectory | None = None
+    ) -> None:
+        super().__init__(message)
+        self.status, self.step, self.t, self.residual, self.trajectory = status, step, t, residual, trajectory
