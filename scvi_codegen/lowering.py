@@ -1,0 +1,353 @@
+"""Symbolic to program: expressions become straight-line arithmetic, tables are rounded, loops are listed.
+
+A kernel's expressions are read into one graph in which equal nodes are the same node. Three rules make sharing cheap
+and complete enough that no separate search for common subexpressions is needed:
+
+* the factors of a product are multiplied left to right in a fixed order (numbers, parameters, composites, coordinates),
+  so 3 mu r^-5 x and 3 mu r^-5 y share all but the last factor;
+* a sum is normalised to content 1 and a positive first term, so a - b, b - a and 2 a - 2 b are one node;
+* every negative power of x is built from 1/x and every half-integer power from sqrt(x), so r^-3 and r^-5 cost one
+  division and one root together.
+
+Nothing here changes a value but by rounding; ``tests/test_lowering.py`` reads kernels back and compares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import sympy
+
+from scvi_codegen.derivatives import jacobian
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics import momentum
+from scvi_codegen.methods.method import Method
+from scvi_codegen.precision import Matrix, Vector
+from scvi_codegen.program import (
+    Constant,
+    Expression,
+    Family,
+    GatherLoop,
+    Kernel,
+    Load,
+    Operation,
+    Program,
+    ScatterLoop,
+    SlopeBlock,
+)
+from scvi_codegen.stage_system import PointFamily, StageSystem
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["lower", "lower_kernel"]
+
+FUNCTIONS = {
+    sympy.sin: "sin",
+    sympy.cos: "cos",
+    sympy.tan: "tan",
+    sympy.asin: "asin",
+    sympy.acos: "acos",
+    sympy.atan: "atan",
+    sympy.atan2: "atan2",
+    sympy.sinh: "sinh",
+    sympy.cosh: "cosh",
+    sympy.tanh: "tanh",
+    sympy.asinh: "asinh",
+    sympy.acosh: "acosh",
+    sympy.atanh: "atanh",
+    sympy.exp: "exp",
+    sympy.log: "log",
+}
+LARGEST_UNROLLED_POWER = 64
+CONSTANT_DIGITS = 30
+
+
+class _Graph:
+    """Hash-consed arithmetic: ``nodes[k]`` is a leaf or (operator, operand ids)."""
+
+    def __init__(self, loads: Mapping[sympy.Symbol, Load]) -> None:
+        self.loads = loads
+        self.nodes: list[Constant | Load | tuple[str, tuple[int, ...]]] = []
+        self._ids: dict[Constant | Load | tuple[str, tuple[int, ...]], int] = {}
+        self._read: dict[sympy.Expr, int] = {}
+
+    def node(self, content: Constant | Load | tuple[str, tuple[int, ...]]) -> int:
+        """The id of a node, new or not."""
+        if content not in self._ids:
+            self._ids[content] = len(self.nodes)
+            self.nodes.append(content)
+        return self._ids[content]
+
+    def read(self, expression: sympy.Expr) -> int:
+        """The id of a SymPy expression."""
+        if expression not in self._read:
+            self._read[expression] = self._build(expression)
+        return self._read[expression]
+
+    def _build(self, expression: sympy.Expr) -> int:
+        if isinstance(expression, sympy.Symbol):
+            return self.node(self.loads[expression])
+        if not expression.free_symbols:
+            return self.node(Constant(_double(expression)))
+        if isinstance(expression, sympy.Add):
+            return self._sum(expression)
+        if isinstance(expression, sympy.Mul):
+            return self._product(expression)
+        if isinstance(expression, sympy.exp):
+            return self.node(("exp", (self.read(expression.args[0]),)))
+        if isinstance(expression, sympy.Pow):
+            return self._power(*expression.as_base_exp())
+        name = FUNCTIONS.get(expression.func)
+        if name is None:
+            raise SystemDefinitionError(f"the function in '{expression}' has no C counterpart")
+        return self.node((name, tuple(self.read(argument) for argument in expression.args)))
+
+    def _sum(self, expression: sympy.Add) -> int:
+        content, primitive = expression.primitive()
+        terms = [term.as_coeff_Mul() for term in primitive.args]
+        terms.sort(key=lambda term: self._rank(term[1]))
+        if terms[0][0] < 0:
+            content, terms = -content, [(-coefficient, rest) for coefficient, rest in terms]
+        total = self._scaled(*terms[0])
+        for coefficient, rest in terms[1:]:
+            operator = "-" if coefficient < 0 else "+"
+            total = self.node((operator, (total, self._scaled(abs(coefficient), rest))))
+        return self._times(content, total)
+
+    def _scaled(self, coefficient: sympy.Rational, rest: sympy.Expr) -> int:
+        if rest == 1:
+            return self.node(Constant(_double(coefficient)))
+        if coefficient == 1:
+            return self.read(rest)
+        return self.read(sympy.Mul(coefficient, rest, evaluate=not isinstance(rest, sympy.Add)))
+
+    def _times(self, coefficient: sympy.Rational, node: int) -> int:
+        if coefficient == 1:
+            return node
+        if coefficient == -1:
+            return self.node(("neg", (node,)))
+        return self.node(("*", (self.node(Constant(_double(coefficient))), node)))
+
+    def _product(self, expression: sympy.Mul) -> int:
+        coefficient, rest = expression.as_coeff_Mul()
+        factors = sorted(sympy.Mul.make_args(rest), key=self._rank)
+        negative = coefficient < 0
+        magnitude = abs(coefficient)
+        nodes = [] if magnitude == 1 else [self.node(Constant(_double(magnitude)))]
+        for factor in factors:
+            node = self.read(factor)
+            content = self.nodes[node]
+            if isinstance(content, tuple) and content[0] == "neg":
+                negative, node = not negative, content[1][0]
+            nodes.append(node)
+        product = nodes[0]
+        for node in nodes[1:]:
+            product = self.node(("*", (product, node)))
+        return self.node(("neg", (product,))) if negative else product
+
+    def _power(self, base: sympy.Expr, exponent: sympy.Expr) -> int:
+        doubled = 2 * exponent
+        if not (doubled.is_Integer and abs(doubled) <= 2 * LARGEST_UNROLLED_POWER):
+            return self.node(("pow", (self.read(base), self.read(exponent))))
+        x = self.read(base)
+        whole = int(doubled // 2)
+        if not doubled % 2:
+            return self._whole(x, whole) if whole > 0 else self._whole(self._inverse(x), -whole)
+        root = self.node(("sqrt", (x,)))
+        if whole == 0:
+            return root
+        power = self._whole(x, whole) if whole > 0 else self._whole(self._inverse(x), -whole)
+        return self.node(("*", (power, root)))
+
+    def _inverse(self, x: int) -> int:
+        return self.node(("/", (self.node(Constant(1.0)), x)))
+
+    def _whole(self, x: int, n: int) -> int:
+        """x^n by halving, n >= 1."""
+        if n == 1:
+            return x
+        half = self._whole(x, n // 2)
+        square = self.node(("*", (half, half)))
+        return self.node(("*", (square, x))) if n % 2 else square
+
+    def _rank(self, factor: sympy.Expr) -> tuple[int, int]:
+        """Numbers, parameters, composites, coordinates; among equals the order of first reading."""
+        if not factor.free_symbols:
+            return (0, self.read(factor))
+        if isinstance(factor, sympy.Symbol):
+            return (1 if self.loads[factor].source == "parameters" else 3, self.read(factor))
+        return (2, self.read(factor))
+
+
+def _double(number: sympy.Expr) -> float:
+    """The nearest binary64 number to a constant expression."""
+    if isinstance(number, sympy.Rational):
+        try:
+            return int(number.p) / int(number.q)
+        except OverflowError:
+            raise SystemDefinitionError(f"the constant {number} does not fit a double") from None
+    value = complex(number.evalf(CONSTANT_DIGITS))
+    if value.imag or value.real != value.real or value.real in (float("inf"), -float("inf")):
+        raise SystemDefinitionError(f"the constant {number} is not a finite real number")
+    return value.real
+
+
+def lower_kernel(
+    name: str,
+    *,
+    arguments: Sequence[sympy.Symbol],
+    time: sympy.Symbol,
+    parameters: Sequence[sympy.Symbol],
+    values: Sequence[sympy.Expr],
+    slopes: Sequence[sympy.Expr] = (),
+) -> Kernel:
+    """One kernel with all its results sharing their common parts."""
+    loads = {symbol: Load("u", i) for i, symbol in enumerate(arguments)}
+    loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
+    loads[time] = Load("t", -1)
+    graph = _Graph(loads)
+    roots = [graph.read(expression) for expression in (*values, *slopes)]
+    temporaries, results = _linearise(graph, roots)
+    return Kernel(
+        name=name, arguments=len(arguments), temporaries=temporaries, results=results, values=len(values)
+    )
+
+
+def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, ...], tuple[Expression, ...]]:
+    """Nodes used more than once become temporaries, in order of definition; others are written where they are used."""
+    uses = [0] * len(graph.nodes)
+    reachable = _reachable(graph, roots)
+    for k in reachable:
+        content = graph.nodes[k]
+        if isinstance(content, tuple):
+            for operand in content[1]:
+                uses[operand] += 1
+    for root in roots:
+        uses[root] += 1
+    texts: dict[int, Expression] = {}
+    temporaries: list[Expression] = []
+    for k in sorted(reachable):
+        content = graph.nodes[k]
+        if not isinstance(content, tuple):
+            texts[k] = content
+            continue
+        expression = Operation(content[0], tuple(texts[operand] for operand in content[1]))
+        texts[k] = expression
+        if uses[k] > 1:
+            texts[k] = Load("w", len(temporaries))
+            temporaries.append(expression)
+    return tuple(temporaries), tuple(texts[root] for root in roots)
+
+
+def _reachable(graph: _Graph, roots: Sequence[int]) -> set[int]:
+    seen: set[int] = set()
+    stack = list(roots)
+    while stack:
+        k = stack.pop()
+        if k in seen:
+            continue
+        seen.add(k)
+        content = graph.nodes[k]
+        if isinstance(content, tuple):
+            stack.extend(content[1])
+    return seen
+
+
+def lower(system: LagrangianSystem, method: Method, *, prefix: str) -> Program:
+    """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``."""
+    stages = method.stage_system(system)
+    common = {"time": system.time, "parameters": system.parameters}
+    momenta = momentum(system)
+    mass = jacobian(momenta, system.velocities)
+    state = (*system.coordinates, *system.velocities)
+    legendre = lower_kernel("legendre", arguments=state, values=momenta, slopes=tuple(mass.values()), **common)
+    lagrangian = lower_kernel("lagrangian", arguments=state, values=(system.lagrangian,), **common)
+    return Program(
+        prefix=prefix,
+        title=f"{system.name}: {method.title}",
+        notes=_notes(method),
+        coordinate_names=tuple(q.name for q in system.coordinates),
+        parameter_names=tuple(parameter.name for parameter in system.parameters),
+        parameter_defaults=system.defaults,
+        blocks=len(stages.blocks),
+        families=tuple(_family(system, family) for family in stages.families),
+        momentum_rows=_doubles(tuple(row.momentum for row in stages.rows)),
+        end_position=_doubles(stages.end_position.entries[0][1:]),
+        straight=tuple(int(block.straight[1]) for block in stages.blocks),
+        extrapolation=_matrix(_required_extrapolation(stages)),
+        legendre=legendre,
+        mass_entries=tuple(mass),
+        lagrangian=lagrangian,
+        action=stages.action[0] if stages.action else None,
+    )
+
+
+def _notes(method: Method) -> tuple[str, ...]:
+    order = "no order claimed" if method.order is None else f"order {method.order}"
+    return (
+        order,
+        "symplectic" if method.symplectic else "not symplectic",
+        "symmetric" if method.symmetric else "not symmetric",
+    )
+
+
+def _required_extrapolation(stages: StageSystem) -> Matrix:
+    if stages.extrapolation is None or any(block.power != 1 for block in stages.blocks):
+        raise TypeError("only stage systems with velocities as unknowns can be lowered")
+    return stages.extrapolation
+
+
+def _family(system: LagrangianSystem, family: PointFamily) -> Family:
+    common = {"arguments": family.arguments, "time": system.time, "parameters": system.parameters}
+    slopes, blocks = _slope_blocks(family)
+    return Family(
+        name=family.name,
+        abscissae=_doubles(family.abscissae),
+        weights=_doubles(family.weights),
+        gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
+        scatters=tuple(_scatter_loop(family, s) for s in range(len(family.scatters))),
+        value=lower_kernel(f"{family.name}_value", values=family.results, **common),
+        slope=lower_kernel(f"{family.name}_slope", values=family.results, slopes=slopes, **common),
+        blocks=blocks,
+    )
+
+
+def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:
+    """Non-zero slopes, grouped by scatter and gather."""
+    slopes: list[sympy.Expr] = []
+    blocks = []
+    for s, scatter in enumerate(family.scatters):
+        for g, gather in enumerate(family.gathers):
+            entries = jacobian(scatter.results, gather.arguments)
+            if entries:
+                blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=tuple(entries)))
+                slopes.extend(entries.values())
+    return tuple(slopes), tuple(blocks)
+
+
+def _gather_loop(family: PointFamily, index: int) -> GatherLoop:
+    gather = family.gathers[index]
+    return GatherLoop(
+        name=f"{family.name}_gather_{index}",
+        offset=sum(len(other.arguments) for other in family.gathers[:index]),
+        from_state=bool(gather.table.entries[0][0]),
+        power=gather.power + 1,
+        table=_matrix(tuple(line[1:] for line in gather.table.entries)),
+    )
+
+
+def _scatter_loop(family: PointFamily, index: int) -> ScatterLoop:
+    scatter = family.scatters[index]
+    return ScatterLoop(
+        name=f"{family.name}_scatter_{index}",
+        offset=sum(len(other.results) for other in family.scatters[:index]),
+        power=scatter.power,
+        table=_matrix(scatter.table.entries),
+    )
+
+
+def _doubles(numbers: Vector) -> tuple[float, ...]:
+    return tuple(float(x) for x in numbers)
+
+
+def _matrix(entries: Matrix) -> tuple[tuple[float, ...], ...]:
+    return tuple(_doubles(line) for line in entries)

@@ -1,0 +1,328 @@
+"""Galerkin spectral variational integrators, (25)-(30), and the Stoermer-Verlet method.
+
+The discrete Lagrangian is the quadrature of L along a polynomial curve of degree s,
+
+    L_d(Q^0 .. Q^s) = (h/2) sum_n w_n L(q(tau_n), qdot(tau_n), t_n),     q(tau) = sum_v Q^v l_v(tau),       (25)
+
+made stationary in the interior coefficients (26a); p0 = -D_1 L_d and p1 = D_{s+1} L_d (27). The step depends on the
+degree and the quadrature alone: the nodes parametrise the same polynomials. Compiled, the curve is therefore given by
+the values V_b of its velocity at s points, whatever the nodes: Q = q0 + h sum_b a_nb V_b.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from fractions import Fraction
+
+from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, extrapolation
+from scvi_codegen.errors import MethodError, MethodWarning
+from scvi_codegen.methods.method import Method, Specification, check_count, unit_sum
+from scvi_codegen.nodes import Nodes, nodes_by_name
+from scvi_codegen.precision import Matrix, Vector, mp
+from scvi_codegen.quadrature import Quadrature, gauss_legendre, quadrature_by_name
+from scvi_codegen.stage_system import (
+    Block,
+    Gather,
+    Row,
+    ScalarFamily,
+    StageSystem,
+    Table,
+    dyadic,
+    stationary_increments,
+    stationary_nodal,
+)
+from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.tableau import lobatto_iiia
+
+__all__ = [
+    "SVI",
+    "StoermerVerlet",
+    "galerkin_system",
+    "identity_matrix",
+    "nodal_quadrature_family",
+    "position_block",
+    "resolve_nodes",
+    "resolve_quadrature",
+]
+
+EXTRAPOLATION_DEGREE = 8
+"""Highest degree used to guess the next step: the row sums of the extrapolation grow 20-fold a degree."""
+
+
+@dataclass(frozen=True, slots=True)
+class SVI(Method):
+    """Galerkin spectral variational integrator of a polynomial degree, with any quadrature.
+
+    Symplectic, conserves the momentum maps of affine symmetries to round-off, order min(2 degree, order of the
+    quadrature), reversible if the quadrature is symmetric. Paper: section 3, (25)-(30), Table 5.
+
+    Args:
+        degree: degree s of the trial curve, at least 1.
+        quadrature: rule of at least s points, an object or a name such as ``"gauss-legendre:8"``; default: s-point
+            Gauss-Legendre, with which the method is the s-stage Gauss collocation method.
+        nodes: of that degree, containing both ends; they appear in the derivation, the step does not depend on them.
+
+    Raises:
+        MethodError: on a degree below 1, nodes without the end points or of another degree.
+
+    Warns:
+        MethodWarning: with fewer quadrature points than the degree, where the stage equations are singular.
+    """
+
+    degree: int
+    quadrature: Quadrature | str | None = None
+    nodes: Nodes | str | None = None
+
+    def __post_init__(self) -> None:
+        check_count(self.degree, "the degree of a spectral variational integrator")
+        object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
+        object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
+        if len(self.rule) < self.degree:
+            warnings.warn(
+                f"{len(self.rule)} quadrature points do not determine a curve of degree {self.degree}: the stage "
+                f"equations are singular for most systems and no order is claimed; use at least {self.degree} points",
+                MethodWarning,
+                stacklevel=3,
+            )
+
+    @property
+    def rule(self) -> Quadrature:
+        """The quadrature, resolved."""
+        assert isinstance(self.quadrature, Quadrature)
+        return self.quadrature
+
+    @property
+    def node_set(self) -> Nodes:
+        """The nodes, resolved."""
+        assert isinstance(self.nodes, Nodes)
+        return self.nodes
+
+    @property
+    def name(self) -> str:
+        """``svi-<degree>-<quadrature>``."""
+        return f"svi-{self.degree}-{self.rule.name.replace(':', '-')}"
+
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        return f"Galerkin spectral variational integrator, degree {self.degree}, {self.rule.name}"
+
+    @property
+    def order(self) -> int | None:
+        """min(2 degree, order of the quadrature); ``None`` with fewer points than the degree."""
+        return None if len(self.rule) < self.degree else min(2 * self.degree, self.rule.order)
+
+    @property
+    def symmetric(self) -> bool:
+        """True for a symmetric quadrature."""
+        return self.rule.symmetric
+
+    @property
+    def symplectic(self) -> bool:
+        """Always."""
+        return True
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        return {"method": "svi", "degree": self.degree, "quadrature": self.rule.name, "nodes": self.node_set.name}
+
+    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+        """Unknowns V_b at the quadrature points if there are s of them, else at the s Gauss points."""
+        rule = self.rule
+        points = rule.abscissae if len(rule) == self.degree else gauss_legendre(self.degree).abscissae
+        return galerkin_system(
+            system,
+            abscissae=rule.abscissae,
+            weights=rule.unit_weights,
+            position=cardinal_integrals(points, rule.abscissae, 0),
+            velocity=cardinal_values(points, rule.abscissae),
+            end_position=cardinal_integrals(points, (mp.one,), 0)[0],
+            extrapolation=extrapolation(points, 1, min(self.degree - 1, EXTRAPOLATION_DEGREE)),
+        )
+
+    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+        """Unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c)."""
+        s = self.degree
+        blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
+        return stationary_nodal(
+            families=(nodal_quadrature_family(system, self.node_set, self.rule),),
+            blocks=blocks,
+            end_block=s - 1,
+            rows=(
+                Row(number="27a", kind="IDEL", momentum=mp.one),
+                *(Row(number="27b", kind="stage", momentum=mp.zero) for _ in range(s - 1)),
+            ),
+            action=("quadrature", system.lagrangian),
+            end_numbers=("27", "27c"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class StoermerVerlet(Method):
+    """Stoermer-Verlet: the two-stage Lobatto IIIA-IIIB pair, order 2, symplectic, symmetric.
+
+    For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the trapezoidal
+    rule; for other Lagrangians it is implicit. Source: Hairer, Lubich & Wanner, Geometric Numerical Integration, II.2.
+    """
+
+    @property
+    def name(self) -> str:
+        """``stoermer-verlet``."""
+        return "stoermer-verlet"
+
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        return "Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages)"
+
+    @property
+    def order(self) -> int | None:
+        """2."""
+        return 2
+
+    @property
+    def symmetric(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
+    def symplectic(self) -> bool:
+        """Yes."""
+        return True
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        return {"method": "stoermer-verlet"}
+
+    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+        """The pair written by its generating function, unknowns V_1, V_2."""
+        tableau = lobatto_iiia(2)
+        return galerkin_system(
+            system,
+            abscissae=tableau.c,
+            weights=tableau.b,
+            position=tableau.A,
+            velocity=identity_matrix(2),
+            end_position=tableau.b,
+            extrapolation=extrapolation(tableau.c, 1),
+        )
+
+    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+        """The same equations: the paper uses the method without printing it."""
+        return self.stage_system(system)
+
+
+def galerkin_system(
+    system: LagrangianSystem,
+    *,
+    abscissae: Vector,
+    weights: Vector,
+    position: Matrix,
+    velocity: Matrix,
+    end_position: Vector,
+    extrapolation: Matrix,
+) -> StageSystem:
+    """Stationarity of h sum_n w_n L(q0 + h sum_b a_nb V_b, sum_b l_nb V_b, t_n) at fixed q1 = q0 + h sum_b beta_b V_b.
+
+    Args:
+        system: the Lagrangian.
+        abscissae: (g,) points in [0, 1].
+        weights: (g,) with sum 1.
+        position: (g, s) matrix a.
+        velocity: (g, s) matrix l.
+        end_position: (s,) vector beta.
+        extrapolation: (s, s), the guess for the next step.
+    """
+    points, size = len(abscissae), len(end_position)
+    beta = unit_sum(end_position)
+    family = ScalarFamily(
+        name="quadrature",
+        abscissae=abscissae,
+        weights=unit_sum(weights),
+        weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
+        gathers=(
+            Gather(
+                arguments=system.coordinates,
+                table=Table.joined(Table.constant(points, 1, 1), Table.named("a", dyadic(position))),
+                power=0,
+            ),
+            Gather(
+                arguments=system.velocities,
+                table=Table.joined(Table.constant(points, 1, 0), Table.named("l", velocity)),
+                power=-1,
+            ),
+        ),
+        scalar=system.lagrangian,
+    )
+    return stationary_increments(
+        families=(family,),
+        blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
+        end_position=beta,
+        rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=beta[b - 1]) for b in range(1, size + 1)),
+        action=("quadrature", system.lagrangian),
+        extrapolation=extrapolation,
+    )
+
+
+def nodal_quadrature_family(
+    system: LagrangianSystem, nodes: Nodes, rule: Quadrature, *, other_blocks: int = 0
+) -> ScalarFamily:
+    """The quadrature of L along the interpolant through Q^0 .. Q^s, in the paper's notation.
+
+    ``other_blocks`` unknown blocks behind Q^s (velocities, multipliers) do not move the curve.
+    """
+    padding = Table.constant(len(rule), other_blocks)
+    values = Table.named("l", cardinal_values(nodes.points, rule.points), column=0)
+    slopes = Table.named("dl", cardinal_slopes(nodes.points, rule.points), column=0)
+    return ScalarFamily(
+        name="quadrature",
+        abscissae=rule.abscissae,
+        weights=rule.weights,
+        weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
+        gathers=(
+            Gather(arguments=system.coordinates, table=Table.joined(values, padding), power=0),
+            Gather(arguments=system.velocities, table=Table.joined(slopes, padding), power=-1, scale=Fraction(2)),
+        ),
+        scalar=system.lagrangian,
+        scale=Fraction(1, 2),
+    )
+
+
+def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quadrature:
+    """A quadrature given as an object, a name or not at all (then ``degree`` Gauss points)."""
+    if quadrature is None:
+        return gauss_legendre(degree)
+    if isinstance(quadrature, str):
+        return quadrature_by_name(quadrature)
+    if not isinstance(quadrature, Quadrature):
+        raise MethodError(f"a quadrature is wanted, or a name such as 'gauss-legendre:{degree}', not {quadrature!r}")
+    return quadrature
+
+
+def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
+    """Nodes given as an object, a name or not at all (then Chebyshev-Lobatto), checked to contain both ends."""
+    if nodes is None:
+        nodes = "chebyshev-lobatto"
+    if isinstance(nodes, str):
+        nodes = nodes_by_name(nodes, degree)
+    if not isinstance(nodes, Nodes):
+        raise MethodError(f"nodes are wanted, or a name such as 'chebyshev-lobatto', not {nodes!r}")
+    if nodes.degree != degree:
+        raise MethodError(f"nodes of degree {nodes.degree} do not fit a curve of degree {degree}")
+    if not nodes.contains_ends:
+        raise MethodError(
+            f"the nodes '{nodes.name}' lack an end point of the step, but Q^0 = q0 and Q^s = q1 must be node values; "
+            "use chebyshev-lobatto, legendre-lobatto or equispaced"
+        )
+    return nodes
+
+
+def position_block(v: int, nodes: Nodes) -> Block:
+    """The unknown Q^v, first guessed on the straight line."""
+    return Block(name=f"Q_{v}", power=0, straight=(mp.one, (nodes.points[v] + 1) / 2))
+
+
+def identity_matrix(size: int) -> Matrix:
+    """The (size, size) identity."""
+    return tuple(tuple(mp.mpf(int(i == j)) for j in range(size)) for i in range(size))

@@ -1,0 +1,104 @@
+"""What every method is: frozen data that knows its properties and gives its stage equations for a system."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+import sympy
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics import force, momentum
+from scvi_codegen.precision import Number, Vector, mp
+from scvi_codegen.stage_system import PointFamily, Scatter, StageSystem, dyadic
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["Method", "Specification", "check_count", "lagrangian_scatters", "unit_sum"]
+
+Specification = Mapping[str, str | int | bool | Sequence[float]]
+
+
+class Method(ABC):
+    """One-step method for the Euler-Lagrange equations: (t, q0, p0), h -> (q1, p1)."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Short identifier, unique among methods: ``"svi-8-gauss-legendre-8"``."""
+
+    @property
+    @abstractmethod
+    def order(self) -> int | None:
+        """Order of convergence in h for smooth regular systems; ``None`` where none is claimed."""
+
+    @property
+    @abstractmethod
+    def symmetric(self) -> bool:
+        """Whether the step with -h undoes the step with h."""
+
+    @property
+    @abstractmethod
+    def symplectic(self) -> bool:
+        """Whether the step preserves dq ^ dp for every regular Lagrangian."""
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """One line for people."""
+
+    @abstractmethod
+    def specification(self) -> Specification:
+        """The method as plain data, read back by ``method_from_specification`` (model files, command line)."""
+
+    @abstractmethod
+    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+        """The equations as compiled: velocities as unknowns."""
+
+    @abstractmethod
+    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+        """The equations as the paper prints them."""
+
+
+def check_count(value: int, what: str, *, least: int = 1) -> None:
+    """Raise :class:`MethodError` unless ``value`` is an integer of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise MethodError(f"{what} must be an integer, not {value!r}")
+    if value < least:
+        raise MethodError(f"{what} must be at least {least}, not {value}")
+
+
+def unit_sum(weights: Sequence[Number]) -> Vector:
+    """Weights in [0, 1] rounded to multiples of 2^-52, the largest adjusted so that they sum to exactly 1.
+
+    Weights whose sum is not 1 (of an unusual quadrature) are rounded only.
+    """
+    rounded = list(dyadic([weights])[0])
+    excess = mp.fsum(rounded) - 1
+    if abs(excess) < mp.mpf("1e-12"):
+        largest = max(range(len(rounded)), key=lambda n: abs(rounded[n]))
+        rounded[largest] -= excess
+    return tuple(rounded)
+
+
+def lagrangian_scatters(
+    family: PointFamily, system: LagrangianSystem, force_scatter: Scatter, momentum_scatter: Scatter
+) -> PointFamily:
+    """``family`` with L_q and L_v as kernel results, scattered as given (their ``results`` are filled in)."""
+    filled = (
+        _with_results(force_scatter, force(system)),
+        _with_results(momentum_scatter, momentum(system)),
+    )
+    return PointFamily(
+        name=family.name,
+        abscissae=family.abscissae,
+        weights=family.weights,
+        weight_names=family.weight_names,
+        gathers=family.gathers,
+        scatters=filled,
+    )
+
+
+def _with_results(scatter: Scatter, results: tuple[sympy.Expr, ...]) -> Scatter:
+    return Scatter(results=results, table=scatter.table, power=scatter.power, scale=scatter.scale)

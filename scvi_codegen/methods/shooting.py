@@ -1,0 +1,364 @@
+"""Shooting-based spectral-collocation variational integrators (SCVI), section 4, (33)-(34), differentiated in full.
+
+The curve is the spectral-collocation solution of the Euler-Lagrange boundary-value problem from q0 to q1: with
+V = A Q + a0 q0 and Acc = A V + a0 v0, the residual E_i(Q^i, V_i, Acc_i) vanishes at nodes 1 .. s (34a). L_d is the
+quadrature of L along it (33), a function of (q0, q1) alone, because v0 and the interior Q solve E = 0. Hence
+
+    p0 = -dG/dq0,   0 = dG/d(v0, Q^1 .. Q^{s-1}),   0 = dG/dlambda,   p1 = dG/dq1,    G = L_d(Q) + sum_i lambda_i . E_i,
+
+the multipliers lambda carrying the dependence of the inner curve on the end points (the chain rule). The map is
+symplectic, conserves the momenta of affine symmetries and has order min(2s, order of the quadrature).
+
+The paper prints (34d), (34e) with the *partial* derivatives of L_d instead. With more than two nodes that is another
+map: ``variational=False`` gives it, to reproduce the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, matrix_product
+from scvi_codegen.mechanics import euler_lagrange, multiplied_residual, multipliers
+from scvi_codegen.methods.collocation import (
+    acceleration_extrapolation,
+    acceleration_gathers,
+    acceleration_unknowns,
+    nodal_blocks,
+    nodal_gathers,
+)
+from scvi_codegen.methods.galerkin import SVI, nodal_quadrature_family, resolve_nodes, resolve_quadrature
+from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters, unit_sum
+from scvi_codegen.nodes import Nodes
+from scvi_codegen.precision import Matrix, Vector, mp
+from scvi_codegen.quadrature import Quadrature
+from scvi_codegen.stage_system import (
+    Block,
+    Gather,
+    PointFamily,
+    Row,
+    ScalarFamily,
+    Scatter,
+    StageSystem,
+    Table,
+    dyadic,
+    stationary_increments,
+    stationary_nodal,
+)
+from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.tableau import Tableau, collocation_tableau
+
+__all__ = ["SCVI"]
+
+
+@dataclass(frozen=True, slots=True)
+class SCVI(Method):
+    """Shooting-based spectral-collocation variational integrator.
+
+    Args:
+        degree: degree s of the collocation polynomial, at least 1.
+        quadrature: rule for the action, an object or a name; default: s-point Gauss-Legendre.
+        nodes: collocation nodes of that degree, containing both ends; default Chebyshev-Lobatto (the paper's).
+        variational: ``True`` differentiates the discrete Lagrangian in full: symplectic and momentum-preserving, order
+            min(2s, order of the quadrature). ``False`` is the paper's printed form (34a)-(34e), which drops the
+            chain-rule term: for degree >= 2 it is neither symplectic nor momentum-preserving.
+
+    Raises:
+        MethodError: on a degree below 1, nodes without the end points or of another degree.
+    """
+
+    degree: int
+    quadrature: Quadrature | str | None = None
+    nodes: Nodes | str | None = None
+    variational: bool = True
+
+    def __post_init__(self) -> None:
+        check_count(self.degree, "the degree of a spectral-collocation variational integrator")
+        object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
+        object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
+
+    @property
+    def rule(self) -> Quadrature:
+        """The quadrature, resolved."""
+        assert isinstance(self.quadrature, Quadrature)
+        return self.quadrature
+
+    @property
+    def node_set(self) -> Nodes:
+        """The nodes, resolved."""
+        assert isinstance(self.nodes, Nodes)
+        return self.nodes
+
+    @property
+    def tableau(self) -> Tableau:
+        """The collocation tableau (23) on the nodes 1 .. s."""
+        return collocation_tableau(tuple((x + 1) / 2 for x in self.node_set.points[1:]))
+
+    @property
+    def name(self) -> str:
+        """``scvi[-printed]-<degree>-<nodes>-<quadrature>``."""
+        form = "scvi" if self.variational else "scvi-printed"
+        return f"{form}-{self.degree}-{self.node_set.name}-{self.rule.name.replace(':', '-')}"
+
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        form = "" if self.variational else ", as printed in the paper"
+        return (
+            f"Spectral-collocation variational integrator, degree {self.degree}, {self.node_set.name} nodes, "
+            f"{self.rule.name}{form}"
+        )
+
+    @property
+    def order(self) -> int | None:
+        """min(2s, order of the quadrature); as printed about s - 1 for s >= 2, where none is claimed."""
+        if self.variational or self.degree == 1:
+            return min(2 * self.degree, self.rule.order)
+        return None
+
+    @property
+    def symmetric(self) -> bool:
+        """True where the step equals the symmetric SVI (degree 1) or the abscissae and the quadrature are symmetric."""
+        if self.degree == 1:
+            return self.rule.symmetric
+        return self.variational and self.tableau.is_symmetric and self.rule.symmetric
+
+    @property
+    def symplectic(self) -> bool:
+        """Yes, but for the printed form of degree >= 2."""
+        return self.variational or self.degree == 1
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        return {
+            "method": "scvi",
+            "degree": self.degree,
+            "quadrature": self.rule.name,
+            "nodes": self.node_set.name,
+            "variational": self.variational,
+        }
+
+    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+        """Unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI of degree 1 with the same quadrature."""
+        if self.degree == 1:
+            return SVI(1, self.rule, self.node_set).stage_system(system)
+        build = _shooting_increments if self.variational else _printed_increments
+        return build(system, self.tableau, self.rule, self.node_set)
+
+    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+        """(34a)-(34e), with the multiplier terms unless the degree is 1 (where they vanish) or as printed."""
+        if self.variational and self.degree > 1:
+            return _shooting_nodal(system, self.node_set, self.rule)
+        return _printed_nodal(system, self.node_set, self.rule)
+
+
+def _shooting_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadrature, _nodes: Nodes) -> StageSystem:
+    """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i)."""
+    size = len(tableau.b)
+    position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
+    blocks = (
+        *acceleration_unknowns(size),
+        *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+    )
+    action = ScalarFamily(
+        name="quadrature",
+        abscissae=rule.abscissae,
+        weights=unit_sum(rule.unit_weights),
+        weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
+        gathers=_curve_gathers(system, dyadic(position_rows), velocity_rows, other_blocks=size),
+        scalar=system.lagrangian,
+    )
+    beta = dyadic([end_row])[0]
+    extrapolated = acceleration_extrapolation(tableau)
+    return stationary_increments(
+        families=(action, _multiplier_family(system, tableau)),
+        blocks=blocks,
+        end_position=(*beta, *(mp.zero,) * size),
+        rows=(
+            *(Row(number=f"z_{i}", kind="IDEL", momentum=beta[i]) for i in range(size + 1)),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        action=("quadrature", system.lagrangian),
+        extrapolation=(
+            *((*line, *(mp.zero,) * size) for line in extrapolated),
+            *((*(mp.zero,) * (size + 1), *(mp.mpf(int(i == j)) for j in range(size))) for i in range(size)),
+        ),
+    )
+
+
+def _multiplier_family(system: LagrangianSystem, tableau: Tableau) -> ScalarFamily:
+    """The collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
+    size = len(tableau.b)
+    position, velocity, acceleration = acceleration_gathers(system, tableau.c, tableau.A, other_blocks=size)
+    rounded = Gather(
+        arguments=position.arguments,
+        table=Table(entries=dyadic(position.table.entries), names=position.table.names),
+        power=0,
+    )
+    own = Gather(
+        arguments=multipliers(system),
+        table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
+        power=-1,
+    )
+    return ScalarFamily(
+        name="node",
+        abscissae=tableau.c,
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(rounded, velocity, acceleration, own),
+        scalar=multiplied_residual(system),
+        power=1,
+    )
+
+
+def _curve(tableau: Tableau, at: Vector) -> tuple[Matrix, Matrix, Vector]:
+    """The polynomial through V_i = v0 + sum a_ij z_j at abscissae ``at``: rows for q / h and v, and the row of q1 / h."""
+    moved = tuple((mp.one, *line) for line in tableau.A)
+    position = matrix_product(cardinal_integrals(tableau.c, at, 0), moved)
+    velocity = matrix_product(cardinal_values(tableau.c, at), moved)
+    return position, velocity, matrix_product((tableau.b,), moved)[0]
+
+
+def _curve_gathers(
+    system: LagrangianSystem, position: Matrix, velocity: Matrix, *, other_blocks: int = 0
+) -> tuple[Gather, Gather]:
+    points = len(position)
+    padding = Table.constant(points, other_blocks)
+    return (
+        Gather(
+            arguments=system.coordinates,
+            table=Table.joined(Table.constant(points, 1, 1), Table.named("r", position, column=0), padding),
+            power=0,
+        ),
+        Gather(
+            arguments=system.velocities,
+            table=Table.joined(Table.constant(points, 1), Table.named("u", velocity, column=0), padding),
+            power=-1,
+        ),
+    )
+
+
+def _printed_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
+    """(34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
+    size, points = len(tableau.b), len(rule)
+    position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
+    abscissae = tuple((x + 1) / 2 for x in nodes.points)
+    values = cardinal_values(abscissae, rule.abscissae)
+    slopes = cardinal_slopes(abscissae, rule.abscissae)
+    none = Table.constant(points, size)
+
+    def first_and_sum(lines: Matrix) -> Table:
+        first, both = [(line[0],) for line in lines], [(line[0] + line[-1],) for line in lines]
+        return Table.joined(Table.named("l", first), none, Table.named("l", both))
+
+    quadrature = lagrangian_scatters(
+        PointFamily(
+            name="quadrature",
+            abscissae=rule.abscissae,
+            weights=rule.unit_weights,
+            weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
+            gathers=_curve_gathers(system, position_rows, velocity_rows),
+            scatters=(),
+        ),
+        system,
+        Scatter(results=(), table=first_and_sum(values), power=1),
+        Scatter(results=(), table=first_and_sum(slopes), power=0),
+    )
+    node = PointFamily(
+        name="node",
+        abscissae=tableau.c,
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=acceleration_gathers(system, tableau.c, tableau.A),
+        scatters=(
+            Scatter(
+                results=euler_lagrange(system),
+                table=Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1)),
+                power=1,
+            ),
+        ),
+    )
+    return StageSystem(
+        blocks=acceleration_unknowns(size),
+        rows=(
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        families=(quadrature, node),
+        end_position=Table.named("r", [(1, *end_row)], column=0),
+        end_momentum=mp.one,
+        end_numbers=("34c", "34e"),
+        extrapolation=acceleration_extrapolation(tableau),
+    )
+
+
+def _shooting_nodal(system: LagrangianSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+    """G = L_d + sum lambda_i . E_i in the paper's unknowns Q^1 .. Q^s, v0 and lambda_1 .. lambda_s."""
+    size = nodes.degree
+    own = Gather(
+        arguments=multipliers(system),
+        table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
+        power=0,
+    )
+    node = ScalarFamily(
+        name="node",
+        abscissae=tuple((x + 1) / 2 for x in nodes.points[1:]),
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(*nodal_gathers(system, nodes, other_blocks=size), own),
+        scalar=multiplied_residual(system),
+        power=-1,
+    )
+    return stationary_nodal(
+        families=(nodal_quadrature_family(system, nodes, rule, other_blocks=1 + size), node),
+        blocks=(
+            *nodal_blocks(nodes),
+            *(Block(name=f"lambda_{i}", power=0, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+        ),
+        end_block=size - 1,
+        rows=(
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+            *(Row(number="dG/dQ", kind="multiplier", momentum=mp.zero) for _ in range(size - 1)),
+            Row(number="dG/dv0", kind="multiplier", momentum=mp.zero, power=1),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        action=("quadrature", system.lagrangian),
+        end_numbers=("34c", "34e"),
+    )
+
+
+def _printed_nodal(system: LagrangianSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+    """(34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
+    size = nodes.degree
+    action = nodal_quadrature_family(system, nodes, rule, other_blocks=1)
+    none = Table.constant(len(rule), size)
+
+    def ends(table: Table) -> Table:
+        return Table.joined(none, table.columns([0]), table.columns([size]))
+
+    quadrature = action.point_family([ends(gather.table) for gather in action.gathers])
+    node = PointFamily(
+        name="node",
+        abscissae=tuple((x + 1) / 2 for x in nodes.points[1:]),
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=nodal_gathers(system, nodes),
+        scatters=(
+            Scatter(
+                results=euler_lagrange(system),
+                table=Table.joined(Table.identity(size), Table.constant(size, 2)),
+                power=0,
+            ),
+        ),
+    )
+    return StageSystem(
+        blocks=nodal_blocks(nodes),
+        rows=(
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+        ),
+        families=(quadrature, node),
+        end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
+        end_momentum=mp.zero,
+        end_numbers=("34c", "34e"),
+        action=("quadrature", system.lagrangian),
+    )

@@ -1,0 +1,239 @@
+"""The intermediate representation: a program is kernels, tables and loops, C without syntax. It prints itself.
+
+A kernel is straight-line arithmetic over ``u[i]`` (its arguments), ``t`` and ``parameters[i]``: temporaries, each used
+more than once, then results. Operations are ``+ - * / neg sqrt`` and calls of elementary functions on binary64 numbers;
+there are no branches, loops or integers. Everything around the kernels (gather, scatter, Newton, the run) is a loop over
+the tables of a :class:`Family`, the same for every method and system, and stands in the templates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+__all__ = ["Constant", "Expression", "Family", "GatherLoop", "Kernel", "Load", "Operation", "Program", "ScatterLoop", "SlopeBlock"]
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A binary64 number."""
+
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """``u[index]``, ``parameters[index]``, ``t`` (index -1) or temporary ``w[index]``, by ``source``."""
+
+    source: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """``operator`` applied to operands; anything but ``+ - * / neg`` is a call of that C function."""
+
+    operator: str
+    operands: tuple[Expression, ...]
+
+
+Expression: TypeAlias = Constant | Load | Operation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kernel:
+    """Straight-line code: ``temporaries[k]`` defines ``w[k]``, ``results`` are stored in order.
+
+    Attributes:
+        name: C identifier.
+        arguments: length of ``u``.
+        temporaries, results: expressions.
+        values: how many of the results are values; the rest are slopes.
+    """
+
+    name: str
+    arguments: int
+    temporaries: tuple[Expression, ...]
+    results: tuple[Expression, ...]
+    values: int
+
+    @property
+    def uses_arguments(self) -> bool:
+        """Whether any ``u[i]`` occurs."""
+        return self._uses("u")
+
+    @property
+    def uses_time(self) -> bool:
+        """Whether ``t`` occurs."""
+        return self._uses("t")
+
+    @property
+    def uses_parameters(self) -> bool:
+        """Whether any ``parameters[i]`` occurs."""
+        return self._uses("parameters")
+
+    def _uses(self, source: str) -> bool:
+        return any(_occurs(source, expression) for expression in (*self.temporaries, *self.results))
+
+    def operation_counts(self) -> dict[str, int]:
+        """Operations by name, in alphabetical order."""
+        counts: dict[str, int] = {}
+        for expression in (*self.temporaries, *self.results):
+            _count(expression, counts)
+        return dict(sorted(counts.items()))
+
+    def __str__(self) -> str:
+        """The kernel as readable text, one assignment a line."""
+        lines = [f"kernel {self.name}(u[{self.arguments}], t, parameters)"]
+        lines += [f"  w{k} = {_text(e)}" for k, e in enumerate(self.temporaries)]
+        lines += [f"  value[{k}] = {_text(e)}" for k, e in enumerate(self.results[: self.values])]
+        lines += [f"  slope[{k}] = {_text(e)}" for k, e in enumerate(self.results[self.values :])]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatherLoop:
+    """m arguments: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][i]``."""
+
+    name: str
+    offset: int
+    from_state: bool
+    power: int
+    table: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScatterLoop:
+    """m results: ``rows[r][i] += weight_n h^power table[n][r] value[offset + i]``; the last column belongs to p1."""
+
+    name: str
+    offset: int
+    power: int
+    table: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlopeBlock:
+    """Non-zero slopes of one scatter against one gather: ``slope[first + e]`` is d value[i_e] / d u[j_e]."""
+
+    scatter: int
+    gather: int
+    first: int
+    entries: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """Points of one kind with the loops around their kernel."""
+
+    name: str
+    abscissae: tuple[float, ...]
+    weights: tuple[float, ...]
+    gathers: tuple[GatherLoop, ...]
+    scatters: tuple[ScatterLoop, ...]
+    value: Kernel
+    slope: Kernel
+    blocks: tuple[SlopeBlock, ...]
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return len(self.abscissae)
+
+    @property
+    def uses_time(self) -> bool:
+        """Whether the kernel depends on time explicitly (its slopes then can only do so, too)."""
+        return self.value.uses_time or self.slope.uses_time
+
+    @property
+    def weighted(self) -> bool:
+        """Whether any weight differs from 1."""
+        return any(weight != 1.0 for weight in self.weights)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program:
+    """All of an integrator but its syntax.
+
+    Attributes:
+        prefix: C identifier that begins every exported name.
+        title: one line, the system and the method.
+        notes: lines for the header's comment: order, symmetry, symplecticity.
+        coordinate_names, parameter_names, parameter_defaults: for people and for Python.
+        blocks: number of unknown blocks B; the unknowns are B m numbers.
+        families: points and kernels.
+        momentum_rows: (B,) coefficient of p0 in each row.
+        end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
+        straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is zero.
+        extrapolation: (B, B) guess for the next step.
+        legendre: momenta and mass matrix at (q, v).
+        mass_entries: (i, j) of the slopes of ``legendre``.
+        lagrangian: L at (q, v).
+        action: name of the family whose weighted sum of L is the discrete Lagrangian, or ``None``.
+    """
+
+    prefix: str
+    title: str
+    notes: tuple[str, ...]
+    coordinate_names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+    parameter_defaults: tuple[float, ...]
+    blocks: int
+    families: tuple[Family, ...]
+    momentum_rows: tuple[float, ...]
+    end_position: tuple[float, ...]
+    straight: tuple[int, ...]
+    extrapolation: tuple[tuple[float, ...], ...]
+    legendre: Kernel
+    mass_entries: tuple[tuple[int, int], ...]
+    lagrangian: Kernel
+    action: str | None
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return len(self.coordinate_names)
+
+    @property
+    def unknowns(self) -> int:
+        """B m."""
+        return self.blocks * self.dimension
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Every kernel, in the order of emission."""
+        pairs = [kernel for family in self.families for kernel in (family.value, family.slope)]
+        return (*pairs, self.legendre, self.lagrangian)
+
+    def __str__(self) -> str:
+        """Readable text of the whole program."""
+        head = [f"program {self.prefix}: {self.title}", f"  {self.blocks} blocks of {self.dimension} unknowns"]
+        for family in self.families:
+            head.append(f"  family {family.name}: {family.points} points")
+            head += [
+                f"    gather  {loop.name}: {'q0 + ' if loop.from_state else ''}h^{loop.power} sum_b {loop.name}[n][b] z[b]"
+                for loop in family.gathers
+            ]
+            head += [f"    scatter {loop.name}: w[n] h^{loop.power} {loop.name}[n][r]" for loop in family.scatters]
+        return "\n".join([*head, *(str(kernel) for kernel in self.kernels)])
+
+
+def _occurs(source: str, expression: Expression) -> bool:
+    if isinstance(expression, Load):
+        return expression.source == source
+    return isinstance(expression, Operation) and any(_occurs(source, operand) for operand in expression.operands)
+
+
+def _count(expression: Expression, counts: dict[str, int]) -> None:
+    if isinstance(expression, Operation):
+        counts[expression.operator] = counts.get(expression.operator, 0) + 1
+        for operand in expression.operands:
+            _count(operand, counts)
+
+
+def _text(expression: Expression) -> str:
+    if isinstance(expression, Constant):
+        return repr(expression.value)
+    if isinstance(expression, Load):
+        return "t" if expression.source == "t" else f"{expression.source}{expression.index}"
+    return f"({expression.operator} {' '.join(_text(operand) for operand in expression.operands)})"

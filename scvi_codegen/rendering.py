@@ -1,0 +1,146 @@
+"""Program to text: the only room that knows Jinja.
+
+Entry templates are named after the file they make; parts live in ``templates/parts``. Templates hold shape only: loops
+over the program's tables and the C that does not depend on it. Arithmetic arrives lowered and is printed by
+:mod:`scvi_codegen.c_printer` through filters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from scvi_codegen.c_printer import print_expression, print_number
+from scvi_codegen.program import Kernel, Program
+
+__all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "Source", "render", "render_example", "template_folder"]
+
+DEFAULT_TOLERANCE = 2.0**-52
+"""Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
+
+MAX_ITERATIONS = 50
+ROUNDOFF_LEVEL = 1e-11
+KEEP_FACTORS = 1e-5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """C text of an integrator; file names are ``<prefix>.h`` and ``<prefix>.c``."""
+
+    prefix: str
+    header: str
+    code: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleRun:
+    """What the generated ``main.c`` runs: initial state, step, and how often it prints."""
+
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    parameters: tuple[float, ...]
+    t: float
+    h: float
+    every: int
+    outputs: int
+
+
+def template_folder() -> Path:
+    """The templates: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).parent
+    for folder in (package / "templates", package.parent / "templates"):
+        if (folder / "stepper.c.jinja").is_file():
+            return folder
+    raise FileNotFoundError("the C templates are missing: reinstall scvi-codegen")
+
+
+def render(program: Program) -> Source:
+    """Header and source of a program; equal programs give equal bytes."""
+    context = _context(program)
+    environment = _environment()
+    return Source(
+        prefix=program.prefix,
+        header=environment.get_template("stepper.h.jinja").render(context),
+        code=environment.get_template("stepper.c.jinja").render(context),
+    )
+
+
+def render_example(program: Program, start: ExampleRun) -> dict[str, str]:
+    """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
+    context = _context(program) | {"start": start}
+    environment = _environment()
+    return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
+
+
+def workspace_size(program: Program) -> int:
+    """Doubles of workspace: unknowns, Jacobian, update, pivots, rows."""
+    size = program.unknowns + (program.dimension if program.action else 0)
+    rows = program.unknowns + program.dimension
+    return program.unknowns + size * size + 2 * size + rows
+
+
+def _context(program: Program) -> dict[str, object]:
+    return {
+        "program": program,
+        "prefix": program.prefix,
+        "kernels": _named_kernels(program),
+        "legendre": program.legendre,
+        "lagrangian": program.lagrangian,
+        "workspace": workspace_size(program),
+        "tolerance": DEFAULT_TOLERANCE,
+        "max_iterations": MAX_ITERATIONS,
+        "roundoff_level": ROUNDOFF_LEVEL,
+        "keep_factors": KEEP_FACTORS,
+    }
+
+
+def _named_kernels(program: Program) -> Sequence[Kernel]:
+    return program.kernels
+
+
+def _signature(kernel: Kernel) -> str:
+    """C parameters of a kernel: only what it uses."""
+    parts = ["const double *u"] if kernel.uses_arguments else []
+    parts += ["double t"] if kernel.uses_time else []
+    parts += ["const double *parameters"] if kernel.uses_parameters else []
+    parts += ["double *value"]
+    parts += ["double *slope"] if len(kernel.results) > kernel.values else []
+    return ", ".join(parts)
+
+
+def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:
+    """The same parameters in a call."""
+    parts = [u] if kernel.uses_arguments else []
+    parts += [t] if kernel.uses_time else []
+    parts += [parameters] if kernel.uses_parameters else []
+    parts += [value]
+    parts += [slope] if slope is not None else []
+    return ", ".join(parts)
+
+
+def _counts(kernel: Kernel) -> str:
+    return ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(template_folder()),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.filters |= {
+        "number": print_number,
+        "expression": print_expression,
+        "signature": _signature,
+        "call_arguments": _call_arguments,
+        "counts": _counts,
+    }
+    return environment
