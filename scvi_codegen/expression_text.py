@@ -21,17 +21,19 @@ from typing import Any, NamedTuple, NoReturn
 
 import sympy
 from sympy import Add, Expr, Integer, Mul, Pow, Rational, S, Symbol
+from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.precision import Number, mp
 
-__all__ = ["FUNCTIONS", "closest", "evaluate", "format_expression", "parse_expression", "unsupported_part"]
+__all__ = ["FUNCTIONS", "closest", "evaluate", "evaluated", "format_expression", "parse_expression", "unsupported_part"]
 
 MAX_CHARACTERS = 100_000
 MAX_DEPTH = 100
 MAX_EXPONENT = 64
 MAX_EXPONENT_DENOMINATOR = 10_000
 MAX_BITS = 2048
+MAX_PASSES = 8
 LARGEST = 1.7976931348623157e308
 
 FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
@@ -104,10 +106,15 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
     parser = _Parser(text, symbols)
     try:
         return parser.parse()
+    except ExpressionError:
+        raise
     except RecursionError:
-        raise ExpressionError(
-            "the formula is nested too deeply: name a part of it, or write it as a sum", text, parser.column
-        ) from None
+        message = "the formula is nested too deeply: name a part of it, or write it as a sum"
+        raise ExpressionError(message, text, parser.column) from None
+    except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
+        # SymPy's own failures, for instance in sqrt(1e-300 - 9) and asin(sin(1e300)).
+        message = "SymPy cannot evaluate the constants of this formula: make them parameters"
+        raise ExpressionError(message, text, parser.column) from error
 
 
 def _tokens(text: str) -> list[_Token]:
@@ -140,6 +147,7 @@ class _Parser:
         result = self.sum()
         if self.tokens[self.position].kind != "end":
             self.refuse_leftover()
+        result = evaluated(result)
         problem = unsupported_part(result)
         if problem:
             self.refuse(problem, 0)
@@ -233,12 +241,9 @@ class _Parser:
             return base
         exponent_column = self.column
         exponent = self.sign() * self.atom()
-        if exponent.is_Rational and (abs(exponent) > MAX_EXPONENT or exponent.q > MAX_EXPONENT_DENOMINATOR):
-            self.refuse(
-                f"a constant exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most "
-                f"{MAX_EXPONENT_DENOMINATOR}",
-                exponent_column,
-            )
+        problem = _exponent_problem(exponent)
+        if problem:
+            self.refuse(problem, exponent_column)
         if base.is_zero and not exponent.is_positive:
             self.refuse("division by zero: 0 to a power that is not positive", operator.column)
         if exponent.is_Rational and _bits(base.as_coeff_Mul(rational=True)[0]) * abs(exponent) > MAX_BITS:
@@ -247,7 +252,7 @@ class _Parser:
 
     def supported(self, result: Expr, column: int) -> Expr:
         """Refuse what a constructor made of legal arguments: sqrt(-1), log(0), exp(10**9), sqrt(x**2) = Abs(x)."""
-        if not result.free_symbols or (result.args and result.func not in _NODES):
+        if not result.free_symbols or (result.args and result.func not in _NODES) or result.is_Pow:
             problem = unsupported_part(result)
             if problem:
                 self.refuse(problem, column)
@@ -353,14 +358,22 @@ def _node_problem(node: Any) -> str | None:
         if node in (S.NaN, S.ComplexInfinity, S.Infinity, S.NegativeInfinity):
             return f"a part of the formula is not finite ({node})"
     elif node.func in _NODES:
-        exponent = node.exp if node.is_Pow else S.One
-        if exponent.is_Rational and (abs(exponent) > MAX_EXPONENT or exponent.q > MAX_EXPONENT_DENOMINATOR):
-            return f"the constant exponent {exponent} lies beyond {MAX_EXPONENT}, or its denominator is too large"
-        return None
+        return _exponent_problem(node.exp) if node.is_Pow else None
     kind = type(node).__name__
     reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
     known = ", ".join([*FUNCTIONS, *_CONSTANTS])
     return f"{kind} ('{_shortened(node)}') is not supported{reason}. Use + - * / ** and {known}"
+
+
+def _exponent_problem(exponent: Expr) -> str | None:
+    """Bound the rational part of an exponent: SymPy takes 2**1000000000 out of 2**(x + 1000000000), digit by digit."""
+    constant = exponent.as_coeff_Add(rational=True)[0]
+    if abs(constant) <= MAX_EXPONENT and constant.q <= MAX_EXPONENT_DENOMINATOR:
+        return None
+    return (
+        f"the constant in an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most "
+        f"{MAX_EXPONENT_DENOMINATOR}, not {_shortened(constant)}"
+    )
 
 
 def _shortened(node: Any) -> str:
@@ -381,6 +394,36 @@ def _constant_problem(expression: Expr) -> str | None:
             except ArithmeticError:
                 return f"the constant '{_shortened(node)}' is not a finite real number"
     return None
+
+
+def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None) -> Expr:
+    """Replace parts, make floating-point numbers rational and call every constructor anew until nothing changes.
+
+    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``); after
+    this, an expression is the one its text means. A float becomes the rational of its shortest decimal form, 0.1 -> 1/10.
+    """
+    rules = dict(replacements or {})
+    for _ in range(MAX_PASSES):
+        result = _rebuilt(expression, rules)
+        if result == expression:
+            break
+        expression, rules = result, {}
+    return expression
+
+
+def _rebuilt(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression not in known:
+        known[expression] = _rebuilt_node(expression, known)
+    return known[expression]
+
+
+def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression.is_Float:
+        value = float(expression)
+        return Rational(repr(value) if expression == value else str(expression))
+    if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
+        return expression
+    return expression.func(*(_rebuilt(argument, known) for argument in expression.args))
 
 
 def evaluate(expression: Expr, values: Mapping[Symbol, Number], known: dict[Expr, Number] | None = None) -> Number:

@@ -59,6 +59,8 @@ FUNCTIONS = {
 }
 LARGEST_UNROLLED_POWER = 64
 CONSTANT_DIGITS = 30
+DEEPEST_EXPRESSION = 24
+"""Longest chain of operations written as one C expression; longer sums are cut into temporaries."""
 
 
 class _Graph:
@@ -213,7 +215,7 @@ def lower_kernel(
 
 
 def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, ...], tuple[Expression, ...]]:
-    """Nodes used more than once become temporaries, in order of definition; others are written where they are used."""
+    """Nodes used more than once become temporaries, in order of definition; others stand where they are used."""
     uses = [0] * len(graph.nodes)
     reachable = _reachable(graph, roots)
     for k in reachable:
@@ -224,16 +226,17 @@ def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, .
     for root in roots:
         uses[root] += 1
     texts: dict[int, Expression] = {}
+    depths: dict[int, int] = {}
     temporaries: list[Expression] = []
     for k in sorted(reachable):
         content = graph.nodes[k]
         if not isinstance(content, tuple):
-            texts[k] = content
+            texts[k], depths[k] = content, 0
             continue
         expression = Operation(content[0], tuple(texts[operand] for operand in content[1]))
-        texts[k] = expression
-        if uses[k] > 1:
-            texts[k] = Load("w", len(temporaries))
+        texts[k], depths[k] = expression, 1 + max(depths[operand] for operand in content[1])
+        if uses[k] > 1 or depths[k] > DEEPEST_EXPRESSION:
+            texts[k], depths[k] = Load("w", len(temporaries)), 0
             temporaries.append(expression)
     return tuple(temporaries), tuple(texts[root] for root in roots)
 

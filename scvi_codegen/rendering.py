@@ -7,7 +7,6 @@ over the program's tables and the C that does not depend on it. Arithmetic arriv
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,8 +15,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from scvi_codegen.c_printer import print_expression, print_number
 from scvi_codegen.program import Kernel, Program
+from scvi_codegen.source import Source
 
-__all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "Source", "render", "render_example", "template_folder"]
+__all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "render", "render_example", "template_folder"]
 
 DEFAULT_TOLERANCE = 2.0**-52
 """Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
@@ -25,15 +25,6 @@ DEFAULT_TOLERANCE = 2.0**-52
 MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
 KEEP_FACTORS = 1e-5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
-    """C text of an integrator; file names are ``<prefix>.h`` and ``<prefix>.c``."""
-
-    prefix: str
-    header: str
-    code: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +57,7 @@ def render(program: Program) -> Source:
         prefix=program.prefix,
         header=environment.get_template("stepper.h.jinja").render(context),
         code=environment.get_template("stepper.c.jinja").render(context),
+        declarations=environment.get_template("parts/declarations.h.jinja").render(context),
     )
 
 
@@ -77,29 +69,32 @@ def render_example(program: Program, start: ExampleRun) -> dict[str, str]:
 
 
 def workspace_size(program: Program) -> int:
-    """Doubles of workspace: unknowns, Jacobian, update, pivots, rows."""
+    """Doubles of workspace: scratch, unknowns, Jacobian, update, pivots, rows."""
     size = program.unknowns + (program.dimension if program.action else 0)
     rows = program.unknowns + program.dimension
-    return program.unknowns + size * size + 2 * size + rows
+    return scratch_size(program) + program.unknowns + size * size + 2 * size + rows
+
+
+def scratch_size(program: Program) -> int:
+    """Doubles for the slopes of one kernel, or for the mass matrix with its slopes."""
+    mass = program.dimension**2 + len(program.mass_entries)
+    return max(mass, *(len(family.slope.results) - family.slope.values for family in program.families))
 
 
 def _context(program: Program) -> dict[str, object]:
     return {
         "program": program,
         "prefix": program.prefix,
-        "kernels": _named_kernels(program),
+        "kernels": program.kernels,
         "legendre": program.legendre,
         "lagrangian": program.lagrangian,
         "workspace": workspace_size(program),
+        "scratch": scratch_size(program),
         "tolerance": DEFAULT_TOLERANCE,
         "max_iterations": MAX_ITERATIONS,
         "roundoff_level": ROUNDOFF_LEVEL,
         "keep_factors": KEEP_FACTORS,
     }
-
-
-def _named_kernels(program: Program) -> Sequence[Kernel]:
-    return program.kernels
 
 
 def _signature(kernel: Kernel) -> str:
@@ -122,6 +117,14 @@ def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str,
     return ", ".join(parts)
 
 
+def _power_of_h(k: int) -> str:
+    """C text of h^k as a factor."""
+    product = "*".join(["h"] * abs(k))
+    if k == 0:
+        return "1.0"
+    return product if k > 0 else f"1.0/({product})"
+
+
 def _counts(kernel: Kernel) -> str:
     return ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
 
@@ -136,6 +139,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
         autoescape=False,
     )
+    environment.globals["power_of_h"] = _power_of_h
     environment.filters |= {
         "number": print_number,
         "expression": print_expression,

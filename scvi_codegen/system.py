@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy
-from sympy import Expr, Matrix, Rational, Symbol
+from sympy import Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.derivatives import hessian
@@ -29,6 +29,7 @@ from scvi_codegen.expression_text import (
     FUNCTIONS,
     closest,
     evaluate,
+    evaluated,
     format_expression,
     parse_expression,
     unsupported_part,
@@ -234,7 +235,7 @@ def _number(name: str, value: Any) -> float:
 def _identifier(name: str) -> str:
     r"""Spell a name with letters, digits and underscores where that is harmless: ``\theta_{1}`` -> ``theta_1``."""
     spelled = "".join(_letter(character) for character in name.strip())
-    return re.sub(r"\s+", "_", spelled.replace("{", "").replace("}", "").removeprefix("\\"))
+    return re.sub(r"\s+", "_", spelled.replace("{", "").replace("}", "").replace("\\", ""))
 
 
 def _letter(character: str) -> str:
@@ -284,7 +285,7 @@ class _Translation:
 
     def apply(self, lagrangian: Expr) -> Expr:
         unfolded = {derivative: derivative.doit() for derivative in lagrangian.atoms(sympy.Derivative)}
-        result = _rebuilt(lagrangian.xreplace(unfolded), self.rules)
+        result = evaluated(lagrangian.xreplace(unfolded), self.rules)
         leftover = sorted(result.atoms(sympy.Derivative) or result.atoms(AppliedUndef), key=str)
         if leftover:
             raise SystemDefinitionError(
@@ -346,18 +347,6 @@ class _Translation:
             if symbol.name == parameter and symbol not in self.rules:
                 self._add(symbol, name)
         return _symbol(name)
-
-
-def _rebuilt(expression: Expr, rules: Mapping[Expr, Expr]) -> Expr:
-    """Replace symbols, make floating-point numbers rational, and evaluate every node anew."""
-    if expression in rules:
-        return rules[expression]
-    if expression.is_Float:
-        value = float(expression)
-        return Rational(repr(value) if expression == value else str(expression))
-    if not expression.args or isinstance(expression, (AppliedUndef, sympy.Derivative)):
-        return expression
-    return expression.func(*(_rebuilt(argument, rules) for argument in expression.args))
 
 
 def _check_name(name: object) -> None:

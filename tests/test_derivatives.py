@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import pytest
 import sympy
@@ -62,13 +63,13 @@ def test_jacobian_takes_rows_as_sequence_or_by_index() -> None:
 
 
 def test_an_unknown_node_is_refused_not_guessed() -> None:
-    with pytest.raises(TypeError, match="Piecewise"):
+    with pytest.raises(TypeError, match="cannot differentiate"):
         gradient(sympy.Piecewise((X, X > 0), (0, True)), [X])
 
 
 def test_a_long_lattice_is_quick_and_sparse() -> None:
     q = [Symbol(f"q{index}", real=True) for index in range(257)]
-    energy = sympy.Add(*((b - a) ** 2 / 2 + (b - a) ** 4 / 4 for a, b in zip(q, q[1:], strict=False)))
+    energy = sympy.Add(*((b - a) ** 2 / 2 + (b - a) ** 4 / 4 for a, b in pairwise(q)))
     start = time.perf_counter()
     entries = hessian(energy, q)
     assert time.perf_counter() - start < 5

@@ -72,7 +72,7 @@ def test_every_function(name: str) -> None:
     ("text", "column", "message"),
     [
         ("", 0, "empty"),
-        ("  \n ", 1, "empty"),
+        ("  \n ", 0, "empty"),
         ("x +", 3, "ends where a value"),
         ("(x", 2, "missing"),
         ("x)", 1, r"'\)'"),
@@ -115,7 +115,9 @@ def test_every_function(name: str) -> None:
         ("x**65", 3, "exponent"),
         ("x**-65", 3, "exponent"),
         ("x**0.00001", 3, "denominator"),
-        ("(x**64)**2", 0, "exponent 128"),
+        ("(x**64)**2", 7, "not 128"),
+        ("2**(x + 1e300)", 3, "constant in an exponent"),
+        ("asin(sin(1e300))", 16, "SymPy cannot evaluate"),
         ("1/0", 2, "division by zero"),
         ("x/(y - y)", 2, "division by zero"),
         ("0**-1", 1, "division by zero"),
@@ -129,7 +131,6 @@ def test_every_function(name: str) -> None:
         ("asin(2)", 0, "finite real"),
         ("log(-2)", 0, "real"),
         ("sqrt(x**2)", 0, "absolute value"),
-        ("atan2(0, x)", 0, "Heaviside"),
         ("9" * 400, 0, "too many digits"),
         ("1e400", 0, "range of a C double"),
         ("1e-400", 0, "range of a C double"),
@@ -167,6 +168,16 @@ def test_long_sums_and_products_do_not_recurse() -> None:
     assert parse("*".join(["x", "y"] * 20)) == X**20 * Y**20
     assert parse("-" * 50_000 + "x") == X
     assert time.perf_counter() - start < 10
+
+
+def test_nesting_up_to_the_limit_is_read_or_refused_but_never_crashes() -> None:
+    assert parse("(" * 100 + "x" + ")" * 100) == X
+    for name in FUNCTIONS:
+        text = f"{name}(x+y, " * 100 + "x" + ")" * 100 if name == "atan2" else f"{name}(x+" * 100 + "y" + ")" * 100
+        try:
+            parse(text)
+        except ExpressionError as error:
+            assert "nested too deeply" in str(error)  # noqa: PT017  (either outcome is right)
 
 
 def test_coefficients_of_like_terms_cannot_grow_without_bound() -> None:
@@ -215,7 +226,7 @@ def test_round_trip_of_random_expressions(expression: sympy.Expr) -> None:
     ("expression", "text"),
     [
         (X / (3 * Y), "x/(3*y)"),
-        (X / (2 * (Y + 1)), "x/2/(y + 1)"),
+        (X / 2 / (Y + 1), "x/2/(y + 1)"),
         (-X / 3, "-x/3"),
         (S.Half, "1/2"),
         (-S.Half, "-1/2"),
@@ -224,7 +235,7 @@ def test_round_trip_of_random_expressions(expression: sympy.Expr) -> None:
         (2 ** (-Y), "2**(-y)"),
         ((-X) ** Y, "(-x)**y"),
         ((X**Y) ** Z, "(x**y)**z"),
-        (S.Exp1 * sympy.exp(2 * X), "exp(2*x + 1)"),
+        (S.Exp1 * sympy.exp(2 * X), "exp(1)*exp(2*x)"),
         (S.Exp1, "exp(1)"),
         (X - Y, "x - y"),
         (sympy.sqrt(2) / 2, "sqrt(2)/2"),
@@ -261,7 +272,7 @@ def test_not_written(expression: sympy.Expr, message: str) -> None:
         format_expression(expression)
 
 
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=4000, deadline=None)
 @given(
     st.one_of(
         st.text(max_size=30),

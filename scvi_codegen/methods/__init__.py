@@ -1,0 +1,89 @@
+"""Methods as data. Each knows its order, symmetry and symplecticity, and gives its stage equations for a system."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Any
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.methods.collocation import (
+    TABLEAU_METHODS,
+    ChebyshevGauss,
+    ChebyshevLobatto,
+    CollocationRK,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    RungeKutta,
+    SpectralCollocation,
+)
+from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
+from scvi_codegen.methods.method import Method, Specification
+from scvi_codegen.methods.shooting import SCVI
+
+__all__ = [
+    "METHODS",
+    "SCVI",
+    "SVI",
+    "ChebyshevGauss",
+    "ChebyshevLobatto",
+    "CollocationRK",
+    "ExplicitEuler",
+    "Gauss",
+    "LobattoIIIA",
+    "Method",
+    "RadauIA",
+    "RadauIIA",
+    "RungeKutta",
+    "Specification",
+    "SpectralCollocation",
+    "StoermerVerlet",
+    "method_from_specification",
+]
+
+METHODS: dict[str, Callable[..., Method]] = {
+    "svi": SVI,
+    "scvi": SCVI,
+    "sc": SpectralCollocation,
+    **TABLEAU_METHODS,
+    "collocation": CollocationRK,
+    "stoermer-verlet": StoermerVerlet,
+    "explicit-euler": ExplicitEuler,
+}
+"""Constructors by the name used in model files and on the command line."""
+
+ARGUMENTS: dict[str, tuple[str, ...]] = {
+    "svi": ("degree", "quadrature", "nodes"),
+    "scvi": ("degree", "quadrature", "nodes", "variational"),
+    "sc": ("degree", "nodes", "form"),
+    **{name: ("stages", "form") for name in TABLEAU_METHODS},
+    "collocation": ("abscissae", "form"),
+    "stoermer-verlet": (),
+    "explicit-euler": ("form",),
+}
+REQUIRED = ("degree", "stages", "abscissae")
+
+
+def method_from_specification(specification: Specification) -> Method:
+    """The method described by plain data such as ``{"method": "svi", "degree": 8, "quadrature": "gauss-legendre:8"}``.
+
+    Raises:
+        MethodError: on an unknown method, an argument it does not take, or one it needs.
+    """
+    arguments: dict[str, Any] = dict(specification)
+    name = arguments.pop("method", None)
+    if name not in METHODS:
+        near = difflib.get_close_matches(str(name), METHODS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise MethodError(f"there is no method {name!r} among {', '.join(METHODS)}{hint}")
+    accepted = ARGUMENTS[name]
+    for argument in arguments:
+        if argument not in accepted:
+            raise MethodError(f"{name} takes no {argument!r}; it takes {', '.join(accepted) or 'no arguments'}")
+    for argument in accepted:
+        if argument in REQUIRED and argument not in arguments:
+            raise MethodError(f"{name} needs {argument!r}")
+    return METHODS[name](**arguments)

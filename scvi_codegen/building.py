@@ -1,0 +1,223 @@
+"""C text to a loaded module: compilers, the cache, cffi.
+
+An integrator is compiled once with its cffi binding (API mode) into one shared library, kept in the user's cache folder
+under a name made from everything that determines it: text, compiler, flags, Python ABI, processor. It is built in a
+temporary folder inside the cache and renamed into place, so processes may race without locks; what does not match its
+recorded checksum is built anew. An unwritable cache falls back to a temporary folder.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import platformdirs
+
+from scvi_codegen.errors import BuildError
+from scvi_codegen.source import Source
+
+__all__ = ["PORTABLE_FLAGS", "TUNED_FLAGS", "cache_folder", "find_compiler", "load"]
+
+TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
+"""For a stepper used on the machine it is compiled on; no ``-ffast-math``: NaN, infinities and order of sums are kept."""
+
+PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
+"""For code that must give the same bits on every IEEE 754 machine with the same libm."""
+
+CACHE_VARIABLE = "SCVI_CODEGEN_CACHE"
+COMPILE_SECONDS = 600
+_loaded: dict[str, ModuleType] = {}
+
+
+def cache_folder() -> Path:
+    """Where compiled steppers are kept: ``$SCVI_CODEGEN_CACHE``, else the user's cache folder."""
+    chosen = os.environ.get(CACHE_VARIABLE)
+    return Path(chosen) if chosen else platformdirs.user_cache_path("scvi-codegen")
+
+
+def find_compiler() -> tuple[str, ...]:
+    """The command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel.
+
+    Raises:
+        BuildError: if there is none.
+    """
+    chosen = os.environ.get("CC")
+    if chosen:
+        command = tuple(shlex.split(chosen))
+        if not command or shutil.which(command[0]) is None:
+            raise BuildError(f"the compiler named by the environment variable CC ({chosen!r}) was not found")
+        return command
+    for name in ("cc", "gcc", "clang"):
+        if shutil.which(name):
+            return (name,)
+    if importlib.util.find_spec("ziglang"):
+        return (sys.executable, "-m", "ziglang", "cc")
+    raise BuildError(
+        "no C compiler was found; install one (Debian, Ubuntu: apt install gcc libc6-dev; macOS: xcode-select --install), "
+        "or take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
+    )
+
+
+def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
+    """The compiled module of a source, from memory, from the cache or built now.
+
+    Returns:
+        A cffi module with attributes ``lib`` and ``ffi``.
+
+    Raises:
+        BuildError: without a compiler, or if it refuses the text.
+    """
+    compiler = find_compiler()
+    key = _key(source, compiler, flags)
+    if key not in _loaded:
+        _loaded[key] = _load_or_build(source, compiler, flags, f"_scvi_{key}")
+    return _loaded[key]
+
+
+def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
+    parts = [
+        source.header,
+        source.code,
+        source.declarations,
+        " ".join(compiler),
+        _compiler_version(compiler),
+        " ".join(flags),
+        str(sysconfig.get_config_var("SOABI")),
+        _processor() if "-march=native" in flags else platform.machine(),
+    ]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+@cache
+def _compiler_version(compiler: tuple[str, ...]) -> str:
+    try:
+        result = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BuildError(f"the compiler {' '.join(compiler)!r} does not run: {error}") from error
+    return result.stdout
+
+
+@cache
+def _processor() -> str:
+    """What ``-march=native`` depends on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+    wanted = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
+
+
+def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> ModuleType:
+    for root in (cache_folder(), None):
+        if root is None:
+            root = Path(tempfile.mkdtemp(prefix="scvi-codegen-"))
+            atexit.register(shutil.rmtree, root, ignore_errors=True)
+        entry = root / name
+        if _is_intact(entry):
+            try:
+                return _import(entry, name)
+            except ImportError:
+                pass  # a foreign or damaged library: build it anew
+        try:
+            _publish(source, compiler, flags, entry)
+        except OSError:
+            continue  # the folder cannot be written
+        return _import(entry, name)
+    raise BuildError("neither the cache folder nor the temporary folder can be written")
+
+
+def _library(entry: Path) -> Path:
+    return entry / f"{entry.name}.so"
+
+
+def _is_intact(entry: Path) -> bool:
+    """Whether the library is there and is the one that was recorded."""
+    try:
+        recorded = json.loads((entry / "manifest.json").read_text())
+        found = hashlib.sha256(_library(entry).read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return False
+    return isinstance(recorded, dict) and recorded.get("sha256") == found
+
+
+def _import(entry: Path, name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, _library(entry))
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{entry} cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], entry: Path) -> None:
+    """Build beside the entry and rename into place; a racing process that was first wins."""
+    entry.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".building-", dir=entry.parent, ignore_cleanup_errors=True) as folder:
+        built = Path(folder) / entry.name
+        built.mkdir()
+        _compile(source, compiler, flags, built)
+        checksum = hashlib.sha256(_library(built).read_bytes()).hexdigest()
+        (built / "manifest.json").write_text(json.dumps({"sha256": checksum, "prefix": source.prefix}))
+        try:
+            built.replace(entry)
+        except OSError:
+            if _is_intact(entry):
+                return
+            shutil.rmtree(entry, ignore_errors=True)
+            built.replace(entry)
+
+
+def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
+    from cffi import FFI  # only building needs the parser; loading does not
+    from cffi.recompiler import make_c_source  # what FFI.emit_c_code calls, without its message on stdout
+
+    (folder / f"{source.prefix}.h").write_text(source.header)
+    (folder / f"{source.prefix}.c").write_text(source.code)
+    binding = FFI()
+    binding.cdef(source.declarations)
+    preamble = f'#include "{source.prefix}.h"'
+    binding.set_source(folder.name, preamble)
+    make_c_source(binding, folder.name, preamble, str(folder / "binding.c"), verbose=False)
+    include = sysconfig.get_paths()["include"]
+    python = [] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
+    shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
+    _run([*compiler, *shared, "-O1", "-c", "binding.c", "-o", "binding.o"], folder)
+    _run([*compiler, *shared, *flags, "-c", f"{source.prefix}.c", "-o", "integrator.o"], folder)
+    _run([*compiler, "-shared", *python, "binding.o", "integrator.o", "-lm", "-o", _library(folder).name], folder)
+    for name in ("binding.o", "integrator.o", "binding.c"):
+        (folder / name).unlink()
+
+
+def _run(command: list[str], folder: Path) -> None:
+    try:
+        result = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
+    except FileNotFoundError as error:
+        raise BuildError(f"the compiler {command[0]!r} does not run: {error}") from error
+    if result.returncode:
+        hint = _header_hint(result.stderr)
+        shown = "\n".join(result.stderr.splitlines()[:30])
+        raise BuildError(f"the C compiler refused the text{hint}\n{' '.join(command)}\n{shown}")
+
+
+def _header_hint(message: str) -> str:
+    if "Python.h" not in message:
+        return ""
+    return "; the headers of Python are missing (Debian, Ubuntu: apt install python3-dev)"

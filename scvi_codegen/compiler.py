@@ -1,0 +1,76 @@
+"""The whole tour: a system and a method go in, a stepper comes out.
+
+    LagrangianSystem, Method
+      -> derive    StepEquations   the equations as the paper prints them, to look at (:mod:`scvi_codegen.equations`)
+      -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)
+      -> render    Source          header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering`)
+      -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
+      -> Stepper                   step, integrate (:mod:`scvi_codegen.stepper`)
+
+Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk.
+"""
+
+from __future__ import annotations
+
+import re
+
+from scvi_codegen.building import TUNED_FLAGS
+from scvi_codegen.lowering import lower
+from scvi_codegen.methods.method import Method
+from scvi_codegen.program import Program
+from scvi_codegen.rendering import render, workspace_size
+from scvi_codegen.source import Interface, Source
+from scvi_codegen.stepper import Stepper
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
+
+LONGEST_PREFIX = 64
+
+
+def compile_stepper(
+    system: LagrangianSystem, method: Method, *, flags: tuple[str, ...] = TUNED_FLAGS, prefix: str | None = None
+) -> Stepper:
+    """Derive, generate, compile and load the integrator of ``system`` by ``method``.
+
+    Args:
+        system: what moves.
+        method: how its motion is discretised.
+        flags: for the C compiler; by default tuned to this processor.
+        prefix: of the C names; by default made from the names of system and method.
+
+    Raises:
+        BuildError: if there is no C compiler.
+    """
+    source, interface = generate_source(system, method, prefix=prefix)
+    return Stepper(source, interface, flags=flags)
+
+
+def generate_source(
+    system: LagrangianSystem, method: Method, *, prefix: str | None = None
+) -> tuple[Source, Interface]:
+    """C text of the integrator, and what a caller must know of it."""
+    program = lower(system, method, prefix=c_identifier(prefix or f"{system.name}_{method.name}"))
+    return render(program), describe(program, system, method)
+
+
+def describe(program: Program, system: LagrangianSystem, method: Method) -> Interface:
+    """The interface of a program."""
+    return Interface(
+        prefix=program.prefix,
+        title=program.title,
+        system=system.name,
+        method=method.name,
+        coordinates=program.coordinate_names,
+        parameters=program.parameter_names,
+        defaults=program.parameter_defaults,
+        unknowns=program.unknowns,
+        workspace=workspace_size(program),
+        has_action=program.action is not None,
+    )
+
+
+def c_identifier(name: str) -> str:
+    """Lower-case letters, digits and underscores, beginning with a letter, of limited length."""
+    cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
+    return cleaned if cleaned[:1].isalpha() else f"integrator_{cleaned}".rstrip("_")

@@ -1,0 +1,61 @@
+"""C text and what is needed to call it: all that a stepper remembers of the symbolic world."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+__all__ = ["Interface", "Source"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """C text of an integrator, files ``<prefix>.h`` and ``<prefix>.c``; ``declarations`` is the header's inner part."""
+
+    prefix: str
+    header: str
+    code: str
+    declarations: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interface:
+    """What a caller must know of a compiled integrator.
+
+    Attributes:
+        prefix: beginning of every exported C name.
+        title: system and method, one line.
+        system, method: their names.
+        coordinates, parameters: names in order.
+        defaults: parameter values used unless others are given.
+        unknowns: length of the run's memory of its last stages.
+        workspace: doubles of workspace per call.
+        has_action: whether the method has a discrete Lagrangian.
+    """
+
+    prefix: str
+    title: str
+    system: str
+    method: str
+    coordinates: tuple[str, ...]
+    parameters: tuple[str, ...]
+    defaults: tuple[float, ...]
+    unknowns: int
+    workspace: int
+    has_action: bool
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return len(self.coordinates)
+
+    def to_json(self) -> str:
+        """Text read back by :meth:`from_json`."""
+        return json.dumps(asdict(self), indent=2, ensure_ascii=True) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Interface:
+        """The interface written by :meth:`to_json`."""
+        fields: dict[str, Any] = json.loads(text)
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()})

@@ -1,0 +1,539 @@
+"""A compiled integrator in Python: step, integrate, Legendre transforms. Imports neither SymPy nor Jinja.
+
+``step`` depends on its arguments alone. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory: it
+guesses each step by extrapolating the one before and carries along what rounding cut off the state. The whole memory is
+one plain C struct; :meth:`Run.save` gives its bytes and :meth:`Stepper.restore` goes on from them, bit for bit.
+
+All calls into C release the GIL and share nothing, so one stepper may be used from many threads.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen import building
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.source import Interface, Source
+from scvi_codegen.trajectory import Trajectory
+
+__all__ = ["NewtonOptions", "Run", "Stepper"]
+
+Array = NDArray[np.float64]
+Parameters = Mapping[str, float] | Sequence[float] | Array | None
+
+STATUS = {1: "not converged", 2: "singular", 3: "not finite"}
+ADVICE = {
+    "not converged": "try a smaller step, or more iterations",
+    "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
+    "not finite": "the Lagrangian is undefined there, or the step is far too large",
+}
+SLICE_SECONDS = 0.1
+"""Time between looks at the keyboard (and calls of ``progress``) during an integration."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewtonOptions:
+    """When the iteration on the stage equations has converged.
+
+    Attributes:
+        tolerance: size of the last update relative to the state (default: round-off), or absolute.
+        max_iterations: after which a step fails.
+        absolute: compare the update itself, the paper's rule max(|dQ|, |dP|) < TOL.
+    """
+
+    tolerance: float = 2.0**-52
+    max_iterations: int = 50
+    absolute: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0.0:
+            raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
+        if self.max_iterations < 1:
+            raise StateError(f"max_iterations must be at least 1, not {self.max_iterations!r}")
+
+
+class Stepper:
+    """One method for one system, compiled.
+
+    Attributes:
+        title: system and method, one line.
+        coordinates, parameters: names in order.
+        defaults: (k,) default parameter values.
+        dimension: degrees of freedom m.
+        source: the C text it was compiled from.
+    """
+
+    def __init__(self, source: Source, interface: Interface, *, flags: tuple[str, ...] = building.TUNED_FLAGS) -> None:
+        self.source, self.interface, self.flags = source, interface, flags
+        module = building.load(source, flags=flags)
+        self._ffi, self._lib = module.ffi, module.lib
+
+    def __repr__(self) -> str:
+        return f"<Stepper {self.title}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_rebuild, (self.source, self.interface, self.flags))
+
+    @property
+    def title(self) -> str:
+        """System and method, one line."""
+        return self.interface.title
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Coordinate names."""
+        return self.interface.coordinates
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Parameter names."""
+        return self.interface.parameters
+
+    @property
+    def defaults(self) -> Array:
+        """(k,) default parameter values."""
+        return np.array(self.interface.defaults, dtype=float)
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return self.interface.dimension
+
+    def step(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: NewtonOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """One step from (q, p) at t to t + h, a function of its arguments alone.
+
+        Args:
+            q, p: (m,) positions and momenta.
+            h: step size, negative to go back.
+            t: time.
+            parameters: by name (others keep their defaults) or all in order.
+            options: convergence of the stage equations.
+
+        Returns:
+            (q1, p1), each (m,).
+
+        Raises:
+            StateError: on wrong shapes, names or non-finite numbers.
+            StepFailedError: if the stage equations cannot be solved.
+        """
+        q0, p0, values = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
+        q1, p1 = np.empty_like(q0), np.empty_like(p0)
+        report = self._new("report *")
+        status = self._call("step")(
+            float(t),
+            _step_size(h),
+            self._pointer(q0),
+            self._pointer(p0),
+            self._pointer(values),
+            self._options(options),
+            self._pointer(q1),
+            self._pointer(p1),
+            report,
+            self._workspace(),
+        )
+        if status:
+            self._fail(status, report, step=0, h=h, trajectory=None)
+        return q1, p1
+
+    def integrate(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float,
+        steps: int,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: NewtonOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Trajectory:
+        """Run ``steps`` steps and keep every ``every``-th state, the initial one first.
+
+        Args:
+            q, p: (m,) initial positions and momenta.
+            h: step size, negative to go back.
+            steps: number of steps.
+            every: distance between kept states.
+            t: initial time.
+            parameters, options: as in :meth:`step`.
+            progress: called now and then with the number of steps done.
+
+        Returns:
+            A :class:`Trajectory` of steps // every + 1 states.
+
+        Raises:
+            StateError: on wrong shapes, names or numbers.
+            StepFailedError: if a step fails; its ``trajectory`` holds the states before.
+        """
+        count = _whole_number(steps, "steps", least=0)
+        run = self.start(q, p, h=h, t=t, parameters=parameters, options=options)
+        return run.record(count, every=every, progress=progress)
+
+    def start(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: NewtonOptions | None = None,
+    ) -> Run:
+        """A run from (q, p) at t with step h, to be advanced at will."""
+        q0, p0 = self._vector(q, "q"), self._vector(p, "p")
+        memory = self._new("run *")
+        self._call("start")(memory, _finite(t, "t"), _step_size(h), self._pointer(q0), self._pointer(p0))
+        return Run(self, memory, self._parameters(parameters), options)
+
+    def restore(self, saved: bytes, *, parameters: Parameters = None, options: NewtonOptions | None = None) -> Run:
+        """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have."""
+        memory = self._new("run *")
+        buffer = self._ffi.buffer(memory)
+        if len(saved) != len(buffer):
+            raise StateError(f"{len(saved)} bytes are not a saved run of this stepper, which has {len(buffer)}")
+        buffer[:] = saved
+        return Run(self, memory, self._parameters(parameters), options)
+
+    def momentum(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
+        """(m,) momenta p = dL/dv at (q, v, t), the Legendre transform."""
+        return self._transform("momentum", self._vector(q, "q"), self._vector(v, "v"), t, parameters)
+
+    def velocity(self, q: ArrayLike, p: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
+        """(m,) velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from rest)."""
+        return self._transform("velocity", self._vector(q, "q"), self._vector(p, "p"), t, parameters)
+
+    def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
+        """Energy p.v - L: a float for (m,) states, (n,) for (n, m) states with one time or (n,) times."""
+        positions, momenta = np.asarray(q, dtype=float), np.asarray(p, dtype=float)
+        if positions.ndim == 1:
+            positions, momenta = self._vector(q, "q"), self._vector(p, "p")
+        elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != self.dimension:
+            raise StateError(
+                f"states must have shape (n, {self.dimension}), not q {positions.shape} and p {momenta.shape}"
+            )
+        count = positions.size // self.dimension
+        times = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=float), (count,)))
+        positions, momenta = np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
+        result = np.empty(count)
+        status = self._call("energies")(
+            count,
+            self._pointer(times),
+            self._pointer(positions),
+            self._pointer(momenta),
+            self._pointer(self._parameters(parameters)),
+            self._pointer(result),
+            self._workspace(),
+        )
+        if status:
+            raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
+        return float(result[0]) if np.ndim(q) == 1 else result
+
+    def discrete_lagrangian(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: NewtonOptions | None = None,
+    ) -> float:
+        """L_d(q0, q1), the approximate action of the curve from q0 at t to q1 at t + h; paper (25), (33).
+
+        Raises:
+            MethodError: for methods without a discrete Lagrangian.
+            StepFailedError: if no curve is found.
+        """
+        return self._discrete_legendre(q0, q1, h, t, parameters, options)[2]
+
+    def discrete_legendre_minus(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: NewtonOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
+        return self._vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
+
+    def discrete_legendre_plus(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: NewtonOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
+        return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
+
+    def step_positions(
+        self,
+        q_previous: ArrayLike,
+        q_current: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: NewtonOptions | None = None,
+    ) -> Array:
+        """The discrete Euler-Lagrange equation (4): (q_{k-1} at t, q_k at t + h) -> q_{k+1} at t + 2 h.
+
+        Raises as :meth:`discrete_lagrangian`.
+        """
+        q, p = self.discrete_legendre_plus(q_previous, q_current, h, t, parameters, options=options)
+        return self.step(q, p, h, t + h, parameters, options=options)[0]
+
+    def _discrete_legendre(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float,
+        parameters: Parameters,
+        options: NewtonOptions | None,
+    ) -> tuple[Array, Array, float]:
+        if not self.interface.has_action:
+            raise MethodError(f"{self.interface.method} has no discrete Lagrangian; SVI, SCVI and Gauss methods have")
+        start, end = self._vector(q0, "q0"), self._vector(q1, "q1")
+        p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
+        report = self._new("report *")
+        status = self._call("discrete_legendre")(
+            _finite(t, "t"),
+            _step_size(h),
+            self._pointer(start),
+            self._pointer(end),
+            self._pointer(self._parameters(parameters)),
+            self._options(options),
+            self._pointer(p0),
+            self._pointer(p1),
+            self._pointer(action),
+            report,
+            self._workspace(),
+        )
+        if status:
+            self._fail(status, report, step=0, h=h, trajectory=None)
+        return p0, p1, float(action[0])
+
+    def _transform(self, name: str, q: Array, other: Array, t: float, parameters: Parameters) -> Array:
+        result = np.empty_like(other)
+        status = self._call(name)(
+            _finite(t, "t"),
+            self._pointer(q),
+            self._pointer(other),
+            self._pointer(self._parameters(parameters)),
+            self._pointer(result),
+            self._workspace(),
+        )
+        if status:
+            raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]})")
+        return result
+
+    def _call(self, name: str) -> Callable[..., Any]:
+        function: Callable[..., Any] = getattr(self._lib, f"{self.interface.prefix}_{name}")
+        return function
+
+    def _new(self, what: str) -> Any:
+        return self._ffi.new(f"{self.interface.prefix}_{what}")
+
+    def _pointer(self, array: NDArray[Any]) -> Any:
+        kind = "int[]" if array.dtype == np.int32 else "double[]"
+        return self._ffi.from_buffer(kind, array) if array.size else self._ffi.NULL
+
+    def _workspace(self) -> Any:
+        return self._pointer(np.empty(self.interface.workspace))
+
+    def _options(self, options: NewtonOptions | None) -> Any:
+        if options is None:
+            return self._ffi.NULL
+        values = [options.tolerance, options.max_iterations, int(options.absolute)]
+        return self._ffi.new(f"{self.interface.prefix}_options *", values)
+
+    def _vector(self, value: ArrayLike, name: str) -> Array:
+        """A finite, contiguous (m,) copy."""
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise StateError(f"{name} must be {self.dimension} real numbers: {error}") from error
+        if array.shape != (self.dimension,):
+            names = ", ".join(self.coordinates[:6]) + (", ..." if self.dimension > 6 else "")
+            raise StateError(f"{name} must have shape ({self.dimension},) for ({names}), not {array.shape}")
+        if not np.isfinite(array).all():
+            worst = int(np.flatnonzero(~np.isfinite(array))[0])
+            raise StateError(f"{name}[{worst}] ({self.coordinates[worst]}) is {array[worst]}")
+        return array
+
+    def _parameters(self, parameters: Parameters) -> Array:
+        values = self.defaults
+        if parameters is None:
+            return values
+        if isinstance(parameters, Mapping):
+            for name, value in parameters.items():
+                values[self._parameter_index(name)] = value
+        else:
+            given = np.array(parameters, dtype=float)
+            if given.shape != values.shape:
+                names = ", ".join(self.parameters) or "none"
+                raise StateError(f"there are {len(values)} parameters ({names}), not {given.size}")
+            values = given
+        if not np.isfinite(values).all():
+            worst = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise StateError(f"the parameter {self.parameters[worst]} is {values[worst]}")
+        return values
+
+    def _parameter_index(self, name: str) -> int:
+        if name in self.parameters:
+            return self.parameters.index(name)
+        near = difflib.get_close_matches(name, self.parameters, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise StateError(f"there is no parameter {name!r} among {', '.join(self.parameters) or 'none'}{hint}")
+
+    def _fail(self, status: int, report: Any, *, step: int, h: float, trajectory: Trajectory | None) -> NoReturn:
+        word = STATUS[status]
+        message = (
+            f"step {step} at t = {report.t:.17g} with h = {h:g} failed: {word} "
+            f"(last update {report.change:.3g}, {report.iterations} iterations in all); {ADVICE[word]}"
+        )
+        raise StepFailedError(
+            message, status=word, step=step, t=report.t, residual=report.change, trajectory=trajectory
+        )
+
+
+class Run:
+    """An integration under way: a state, and the memory that makes the next step cheap and the sums exact."""
+
+    def __init__(self, stepper: Stepper, memory: Any, parameters: Array, options: NewtonOptions | None) -> None:
+        self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
+
+    @property
+    def t(self) -> float:
+        """Time t0 + step h."""
+        return float(self._memory.t0 + self._memory.step * self._memory.h)
+
+    @property
+    def steps(self) -> int:
+        """Steps done since the start."""
+        return int(self._memory.step)
+
+    @property
+    def q(self) -> Array:
+        """(m,) positions."""
+        return np.array(list(self._memory.q))
+
+    @property
+    def p(self) -> Array:
+        """(m,) momenta."""
+        return np.array(list(self._memory.p))
+
+    def save(self) -> bytes:
+        """The whole memory of the run, for :meth:`Stepper.restore` on the same kind of machine."""
+        return bytes(self.stepper._ffi.buffer(self._memory))
+
+    def record(self, steps: int, *, every: int = 1, progress: Callable[[int], None] | None = None) -> Trajectory:
+        """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``every``.
+
+        Raises:
+            StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
+        """
+        every = _whole_number(every, "every", least=1)
+        first = self.steps
+        capacity = (first + steps) // every - first // every
+        m = self.stepper.dimension
+        t, q, p = np.empty(capacity + 1), np.empty((capacity + 1, m)), np.empty((capacity + 1, m))
+        iterations = np.zeros(capacity + 1, dtype=np.int32)
+        t[0], q[0], p[0] = self.t, self.q, self.p
+        filled, done, portion = 1, 0, every * max(1, 256 // every)
+        while done < steps:
+            size = min(portion, steps - done)
+            began = time.perf_counter()
+            status, report = self._advance(size, every, t[filled:], q[filled:], p[filled:], iterations[filled:])
+            done += report.steps
+            filled = 1 + (first + done) // every - first // every
+            if status:
+                kept = self._trajectory(t[:filled], q[:filled], p[:filled], iterations[:filled])
+                self.stepper._fail(status, report, step=self.steps, h=self._memory.h, trajectory=kept)
+            if progress is not None:
+                progress(done)
+            elapsed = max(time.perf_counter() - began, 1e-6)
+            portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
+        return self._trajectory(t, q, p, iterations)
+
+    def _advance(
+        self, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
+    ) -> tuple[int, Any]:
+        stepper = self.stepper
+        report = stepper._new("report *")
+        status = stepper._call("advance")(
+            self._memory,
+            steps,
+            every,
+            stepper._pointer(self._parameters),
+            stepper._options(self._options),
+            stepper._pointer(t),
+            stepper._pointer(q),
+            stepper._pointer(p),
+            stepper._pointer(iterations),
+            report,
+            stepper._workspace(),
+        )
+        return status, report
+
+    def _trajectory(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]) -> Trajectory:
+        return Trajectory(
+            t=t,
+            q=q,
+            p=p,
+            iterations=iterations,
+            h=float(self._memory.h),
+            parameters=self._parameters,
+            stepper=self.stepper,
+        )
+
+
+def _rebuild(source: Source, interface: Interface, flags: tuple[str, ...]) -> Stepper:
+    return Stepper(source, interface, flags=flags)
+
+
+def _finite(value: float, name: str) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise StateError(f"{name} is {number}")
+    return number
+
+
+def _step_size(h: float) -> float:
+    number = _finite(h, "the step h")
+    if number == 0.0:
+        raise StateError("the step h is 0")
+    return number
+
+
+def _whole_number(value: int, name: str, *, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise StateError(f"{name} must be a whole number, not {value!r}")
+    if value < least:
+        raise StateError(f"{name} must be at least {least}, not {value}")
+    return int(value)
