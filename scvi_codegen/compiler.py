@@ -46,9 +46,7 @@ def compile_stepper(
     return Stepper(source, interface, flags=flags)
 
 
-def generate_source(
-    system: LagrangianSystem, method: Method, *, prefix: str | None = None
-) -> tuple[Source, Interface]:
+def generate_source(system: LagrangianSystem, method: Method, *, prefix: str | None = None) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it."""
     program = lower(system, method, prefix=c_identifier(prefix or f"{system.name}_{method.name}"))
     return render(program), describe(program, system, method)

@@ -209,9 +209,7 @@ def lower_kernel(
     graph = _Graph(loads)
     roots = [graph.read(expression) for expression in (*values, *slopes)]
     temporaries, results = _linearise(graph, roots)
-    return Kernel(
-        name=name, arguments=len(arguments), temporaries=temporaries, results=results, values=len(values)
-    )
+    return Kernel(name=name, arguments=len(arguments), temporaries=temporaries, results=results, values=len(values))
 
 
 def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, ...], tuple[Expression, ...]]:

@@ -11,7 +11,7 @@ import sympy
 from scvi_codegen.derivatives import gradient, jacobian
 from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["accelerations", "energy", "euler_lagrange", "force", "momentum", "multipliers", "multiplied_residual"]
+__all__ = ["accelerations", "energy", "euler_lagrange", "force", "momentum", "multiplied_residual", "multipliers"]
 
 
 def accelerations(system: LagrangianSystem) -> tuple[sympy.Symbol, ...]:
@@ -29,7 +29,7 @@ def _dense(entries: dict[int, sympy.Expr], size: int) -> tuple[sympy.Expr, ...]:
 
 
 def momentum(system: LagrangianSystem) -> tuple[sympy.Expr, ...]:
-    """p = dL/dv, m expressions."""
+    """P = dL/dv, m expressions."""
     return _dense(gradient(system.lagrangian, system.velocities), system.dimension)
 
 
@@ -56,7 +56,7 @@ def euler_lagrange(system: LagrangianSystem) -> tuple[sympy.Expr, ...]:
 
 
 def multiplied_residual(system: LagrangianSystem) -> sympy.Expr:
-    """lambda . E: the scalar whose stationarity makes a collocation residual vanish, with its multipliers."""
+    """Lambda . E: the scalar whose stationarity makes a collocation residual vanish, with its multipliers."""
     terms = []
     for multiplier, residual in zip(multipliers(system), euler_lagrange(system), strict=True):
         terms.extend(multiplier * term for term in sympy.Add.make_args(residual))

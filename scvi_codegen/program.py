@@ -11,7 +11,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
-__all__ = ["Constant", "Expression", "Family", "GatherLoop", "Kernel", "Load", "Operation", "Program", "ScatterLoop", "SlopeBlock"]
+__all__ = [
+    "Constant",
+    "Expression",
+    "Family",
+    "GatherLoop",
+    "Kernel",
+    "Load",
+    "Operation",
+    "Program",
+    "ScatterLoop",
+    "SlopeBlock",
+]
 
 
 @dataclass(frozen=True, slots=True)

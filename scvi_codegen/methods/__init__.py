@@ -59,7 +59,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {
     "svi": ("degree", "quadrature", "nodes"),
     "scvi": ("degree", "quadrature", "nodes", "variational"),
     "sc": ("degree", "nodes", "form"),
-    **{name: ("stages", "form") for name in TABLEAU_METHODS},
+    **dict.fromkeys(TABLEAU_METHODS, ("stages", "form")),
     "collocation": ("abscissae", "form"),
     "stoermer-verlet": (),
     "explicit-euler": ("form",),

@@ -23,7 +23,13 @@ from scvi_codegen import tableau as tableaux
 from scvi_codegen.basis import differentiation_matrix, extrapolation, matrix_product
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics import accelerations, euler_lagrange, momentum
-from scvi_codegen.methods.galerkin import EXTRAPOLATION_DEGREE, galerkin_system, identity_matrix, position_block, resolve_nodes
+from scvi_codegen.methods.galerkin import (
+    EXTRAPOLATION_DEGREE,
+    galerkin_system,
+    identity_matrix,
+    position_block,
+    resolve_nodes,
+)
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters
 from scvi_codegen.nodes import Nodes
 from scvi_codegen.precision import Matrix, Number, Vector, mp
@@ -245,9 +251,7 @@ def position_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
     end_row = Table.joined(ones, ones, Table.named("bA", matrix_product((b,), tableau.A)))
     start = _single_point(system, "start", mp.zero, Table.joined(ones, Table.constant(1, 1), none))
     end = _single_point(system, "end", mp.one, end_row)
-    end_velocity = Gather(
-        arguments=system.velocities, table=Table.joined(Table.constant(1, 1), ones, b_row), power=-1
-    )
+    end_velocity = Gather(arguments=system.velocities, table=Table.joined(Table.constant(1, 1), ones, b_row), power=-1)
     end = replace(end, gathers=(end.gathers[0], end_velocity))
     minus = Table.constant(1, 1, -1)
     start_table = Table.joined(minus, none, minus)
@@ -340,7 +344,11 @@ def nodal_collocation(system: LagrangianSystem, nodes: Nodes) -> StageSystem:
         ),
     )
     start = _single_point(
-        system, "start", mp.zero, Table.joined(Table.constant(1, 1, 1), Table.constant(1, size + 1)), velocity_block=size
+        system,
+        "start",
+        mp.zero,
+        Table.joined(Table.constant(1, 1, 1), Table.constant(1, size + 1)),
+        velocity_block=size,
     )
     start_table = Table.joined(Table.constant(1, size), Table.constant(1, 1, -1), Table.constant(1, 1))
     return StageSystem(
@@ -373,7 +381,10 @@ def nodal_gathers(system: LagrangianSystem, nodes: Nodes, *, other_blocks: int =
     acceleration = Table.joined(
         Table.named("DD", matrix_product(inner, first), column=0),
         Table.named("DD", matrix_product(inner, inner)),
-        Table.named("d", [(x / 2,) for (x,) in first], column=0),
+        Table(
+            entries=tuple((x / 2,) for (x,) in first),
+            names=tuple((f"{name}/2",) for (name, *_) in slope.names),
+        ),
     )
     return (
         Gather(
@@ -429,9 +440,7 @@ def _transposed(tableau: Tableau) -> Table:
 
 
 def _transposed_row(column: Table) -> Table:
-    return Table(
-        entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),)
-    )
+    return Table(entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),))
 
 
 def _extrapolation(abscissae: Vector) -> Matrix:
