@@ -131,12 +131,15 @@ def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, 
             try:
                 return _import(entry, name)
             except ImportError:
-                pass  # a foreign or damaged library: build it anew
+                _discard(entry)  # a foreign library: build it anew
         try:
             _publish(source, compiler, flags, entry)
         except OSError:
             continue  # the folder cannot be written
-        return _import(entry, name)
+        try:
+            return _import(entry, name)
+        except ImportError as error:
+            raise BuildError(f"what the compiler {' '.join(compiler)!r} made cannot be loaded here: {error}") from error
     raise BuildError("neither the cache folder nor the temporary folder can be written")
 
 
@@ -177,16 +180,22 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
         except OSError:
             if _is_intact(entry):
                 return
-            shutil.rmtree(entry, ignore_errors=True)
+            _discard(entry)
             built.replace(entry)
+
+
+def _discard(entry: Path) -> None:
+    shutil.rmtree(entry, ignore_errors=True)
+    if entry.is_file():
+        entry.unlink()
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
     from cffi import FFI  # only building needs the parser; loading does not
     from cffi.recompiler import make_c_source  # what FFI.emit_c_code calls, without its message on stdout
 
-    (folder / f"{source.prefix}.h").write_text(source.header)
-    (folder / f"{source.prefix}.c").write_text(source.code)
+    (folder / f"{source.prefix}.h").write_text(source.header, encoding="utf-8")
+    (folder / f"{source.prefix}.c").write_text(source.code, encoding="utf-8")
     binding = FFI()
     binding.cdef(source.declarations)
     preamble = f'#include "{source.prefix}.h"'
@@ -196,10 +205,27 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     python = [] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
     shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
     _run([*compiler, *shared, "-O1", "-c", "binding.c", "-o", "binding.o"], folder)
-    _run([*compiler, *shared, *flags, "-c", f"{source.prefix}.c", "-o", "integrator.o"], folder)
-    _run([*compiler, "-shared", *python, "binding.o", "integrator.o", "-lm", "-o", _library(folder).name], folder)
+    objects = ["-shared", *python, "binding.o", "integrator.o"]
+    for define, libraries in _mathematics(flags):
+        _run([*compiler, *shared, *flags, *define, "-c", f"{source.prefix}.c", "-o", "integrator.o"], folder)
+        try:
+            _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
+            break
+        except BuildError:
+            if not define:
+                raise
     for name in ("binding.o", "integrator.o", "binding.c"):
         (folder / name).unlink()
+
+
+def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
+    """Definitions and libraries to try in turn: glibc's vector functions for a tuned build where they should be, libm."""
+    plain: tuple[list[str], list[str]] = ([], ["-lm"])
+    name, version = platform.libc_ver()
+    modern = name == "glibc" and tuple(int(part) for part in version.split(".")[:2]) >= (2, 22)
+    if modern and platform.machine() == "x86_64" and "-march=native" in flags:
+        return [(["-DSCVI_LIBMVEC"], ["-lmvec", "-lm"]), plain]
+    return [plain]
 
 
 def _run(command: list[str], folder: Path) -> None:
@@ -218,6 +244,6 @@ def _run(command: list[str], folder: Path) -> None:
 
 
 def _header_hint(message: str) -> str:
-    if "Python.h" not in message:
+    if "Python.h" not in message and "pyconfig.h" not in message:
         return ""
     return "; the headers of Python are missing (Debian, Ubuntu: apt install python3-dev)"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from scvi_codegen.program import Constant, Expression, Load
+from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, Sweep
 
-__all__ = ["print_expression", "print_number"]
+__all__ = ["lane_functions", "print_expression", "print_lane_results", "print_lane_temporaries", "print_number"]
 
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
 
@@ -47,3 +47,77 @@ def _load(load: Load) -> str:
     if load.source == "t":
         return "t"
     return f"w{load.index}" if load.source == "w" else f"{load.source}[{load.index}]"
+
+
+def lane_functions(kernel: Kernel) -> set[str]:
+    """The elementary functions a kernel applies to vectors of points."""
+    vectors = _vectors(kernel)
+    found: set[str] = set()
+    for expression in (*kernel.temporaries, *kernel.results):
+        _collect_functions(expression, vectors, found)
+    return found
+
+
+def print_lane_temporaries(kernel: Kernel) -> list[tuple[str, str, str]]:
+    """(type, name, text) of the temporaries with points as lanes; what does not depend on the point stays a number."""
+    vectors = _vectors(kernel)
+    return [
+        ("lanes" if k in vectors else "double", f"w{k}", _print_lanes(expression, vectors))
+        for k, expression in enumerate(kernel.temporaries)
+    ]
+
+
+def print_lane_results(kernel: Kernel, sweep: Sweep) -> list[str]:
+    """Statements that store the results as vectors; slopes go to their places in the (lower) mass matrix."""
+    vectors = _vectors(kernel)
+    targets = [f"value[{k}]" for k in range(kernel.values)]
+    targets += [f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]" for i, j in sweep.mass_entries]
+    statements = []
+    for target, expression in zip(targets, kernel.results, strict=False):
+        text = _print_lanes(expression, vectors)
+        statements.append(f"{target} = {text};" if _is_vector(expression, vectors) else f"{target} = lanes_of({text});")
+    return statements
+
+
+def _vectors(kernel: Kernel) -> set[int]:
+    """Indices of the temporaries that differ from point to point."""
+    vectors: set[int] = set()
+    for k, expression in enumerate(kernel.temporaries):
+        if _is_vector(expression, vectors):
+            vectors.add(k)
+    return vectors
+
+
+def _is_vector(expression: Expression, vectors: set[int]) -> bool:
+    if isinstance(expression, Load):
+        return expression.source in ("u", "t") or (expression.source == "w" and expression.index in vectors)
+    return isinstance(expression, Operation) and any(_is_vector(operand, vectors) for operand in expression.operands)
+
+
+def _collect_functions(expression: Expression, vectors: set[int], found: set[str]) -> None:
+    if not isinstance(expression, Operation):
+        return
+    if expression.operator not in PRECEDENCE and _is_vector(expression, vectors):
+        found.add(expression.operator)
+    for operand in expression.operands:
+        _collect_functions(operand, vectors, found)
+
+
+def _print_lanes(expression: Expression, vectors: set[int]) -> str:
+    return print_expression(_with_lane_calls(expression, vectors))
+
+
+def _with_lane_calls(expression: Expression, vectors: set[int]) -> Expression:
+    """The same with ``f`` of a vector renamed ``lanes_f``, its plain arguments made vectors."""
+    if not isinstance(expression, Operation):
+        return expression
+    operands = tuple(_with_lane_calls(operand, vectors) for operand in expression.operands)
+    if expression.operator in PRECEDENCE or not _is_vector(expression, vectors):
+        return Operation(expression.operator, operands)
+    return Operation(
+        f"lanes_{expression.operator}",
+        tuple(
+            new if _is_vector(old, vectors) else Operation("lanes_of", (new,))
+            for old, new in zip(expression.operands, operands, strict=True)
+        ),
+    )

@@ -21,34 +21,50 @@ from scvi_codegen.program import Program
 from scvi_codegen.rendering import render, workspace_size
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
+from scvi_codegen.sweeps import check_solver, sweep_of
 from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
 
 LONGEST_PREFIX = 64
+SOLVERS = ("auto", "newton", "fixed-point")
 
 
 def compile_stepper(
-    system: LagrangianSystem, method: Method, *, flags: tuple[str, ...] = TUNED_FLAGS, prefix: str | None = None
+    system: LagrangianSystem,
+    method: Method,
+    *,
+    solver: str = "auto",
+    flags: tuple[str, ...] = TUNED_FLAGS,
+    prefix: str | None = None,
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
     Args:
         system: what moves.
         method: how its motion is discretised.
+        solver: of the stage equations: ``"fixed-point"`` (fast, points as vector lanes; for SVI with as many points as
+            the degree, Runge-Kutta methods, and every SVI and SC of a separable system), ``"newton"`` (always, also for
+            stiff systems and large steps) or ``"auto"``: fixed point where there is one, Newton where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 
     Raises:
         BuildError: if there is no C compiler.
+        MethodError: for a solver that the method does not have.
     """
-    source, interface = generate_source(system, method, prefix=prefix)
+    source, interface = generate_source(system, method, solver=solver, prefix=prefix)
     return Stepper(source, interface, flags=flags)
 
 
-def generate_source(system: LagrangianSystem, method: Method, *, prefix: str | None = None) -> tuple[Source, Interface]:
-    """C text of the integrator, and what a caller must know of it."""
-    program = lower(system, method, prefix=c_identifier(prefix or f"{system.name}_{method.name}"))
+def generate_source(
+    system: LagrangianSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
+) -> tuple[Source, Interface]:
+    """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
+    sweep = None if solver == "newton" else sweep_of(system, method)
+    check_solver(solver, sweep, method, SOLVERS)
+    name = c_identifier(prefix or f"{system.name}_{method.name}")
+    program = lower(system, method, prefix=name, sweep=sweep, newton=solver != "fixed-point")
     return render(program), describe(program, system, method)
 
 

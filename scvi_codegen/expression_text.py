@@ -399,8 +399,8 @@ def _constant_problem(expression: Expr) -> str | None:
 def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None) -> Expr:
     """Replace parts, make floating-point numbers rational and call every constructor anew until nothing changes.
 
-    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``); after
-    this, an expression is the one its text means. A float becomes the rational of its shortest decimal form, 0.1 -> 1/10.
+    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``);
+    after this, an expression is the one its text means. A float becomes the rational its shortest decimal form says.
     """
     rules = dict(replacements or {})
     for _ in range(MAX_PASSES):

@@ -34,11 +34,12 @@ from scvi_codegen.program import (
     Program,
     ScatterLoop,
     SlopeBlock,
+    Sweep,
 )
 from scvi_codegen.stage_system import PointFamily, StageSystem
 from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["lower", "lower_kernel"]
+__all__ = ["lower", "lower_kernel", "lower_matrix", "lower_vector"]
 
 FUNCTIONS = {
     sympy.sin: "sin",
@@ -253,8 +254,17 @@ def _reachable(graph: _Graph, roots: Sequence[int]) -> set[int]:
     return seen
 
 
-def lower(system: LagrangianSystem, method: Method, *, prefix: str) -> Program:
-    """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``."""
+def lower(
+    system: LagrangianSystem, method: Method, *, prefix: str, sweep: Sweep | None = None, newton: bool = True
+) -> Program:
+    """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
+
+    Args:
+        system, method: what is lowered.
+        prefix: a C identifier.
+        sweep: the fixed-point iteration to try first (:func:`scvi_codegen.sweeps.sweep_of`).
+        newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
+    """
     stages = method.stage_system(system)
     common = {"time": system.time, "parameters": system.parameters}
     momenta = momentum(system)
@@ -264,22 +274,30 @@ def lower(system: LagrangianSystem, method: Method, *, prefix: str) -> Program:
     lagrangian = lower_kernel("lagrangian", arguments=state, values=(system.lagrangian,), **common)
     return Program(
         prefix=prefix,
-        title=f"{system.name}: {method.title}",
+        title=_comment(f"{system.name}: {method.title}"),
         notes=_notes(method),
         coordinate_names=tuple(q.name for q in system.coordinates),
         parameter_names=tuple(parameter.name for parameter in system.parameters),
         parameter_defaults=system.defaults,
         blocks=len(stages.blocks),
         families=tuple(_family(system, family) for family in stages.families),
-        momentum_rows=_doubles(tuple(row.momentum for row in stages.rows)),
-        end_position=_doubles(stages.end_position.entries[0][1:]),
+        momentum_rows=lower_vector(tuple(row.momentum for row in stages.rows)),
+        end_position=lower_vector(stages.end_position.entries[0][1:]),
         straight=tuple(int(block.straight[1]) for block in stages.blocks),
-        extrapolation=_matrix(_required_extrapolation(stages)),
+        extrapolation=lower_matrix(_required_extrapolation(stages)),
         legendre=legendre,
         mass_entries=tuple(mass),
         lagrangian=lagrangian,
-        action=stages.action[0] if stages.action else None,
+        action=stages.action[0] if stages.action and newton else None,
+        sweep=sweep,
+        newton=newton,
     )
+
+
+def _comment(text: str) -> str:
+    """One printable line that neither ends nor begins a C comment."""
+    line = "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
+    return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")
 
 
 def _notes(method: Method) -> tuple[str, ...]:
@@ -302,8 +320,8 @@ def _family(system: LagrangianSystem, family: PointFamily) -> Family:
     slopes, blocks = _slope_blocks(family)
     return Family(
         name=family.name,
-        abscissae=_doubles(family.abscissae),
-        weights=_doubles(family.weights),
+        abscissae=lower_vector(family.abscissae),
+        weights=lower_vector(family.weights),
         gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
         scatters=tuple(_scatter_loop(family, s) for s in range(len(family.scatters))),
         value=lower_kernel(f"{family.name}_value", values=family.results, **common),
@@ -332,7 +350,7 @@ def _gather_loop(family: PointFamily, index: int) -> GatherLoop:
         offset=sum(len(other.arguments) for other in family.gathers[:index]),
         from_state=bool(gather.table.entries[0][0]),
         power=gather.power + 1,
-        table=_matrix(tuple(line[1:] for line in gather.table.entries)),
+        table=lower_matrix(tuple(line[1:] for line in gather.table.entries)),
     )
 
 
@@ -342,13 +360,13 @@ def _scatter_loop(family: PointFamily, index: int) -> ScatterLoop:
         name=f"{family.name}_scatter_{index}",
         offset=sum(len(other.results) for other in family.scatters[:index]),
         power=scatter.power,
-        table=_matrix(scatter.table.entries),
+        table=lower_matrix(scatter.table.entries),
     )
 
 
-def _doubles(numbers: Vector) -> tuple[float, ...]:
+def lower_vector(numbers: Vector) -> tuple[float, ...]:
     return tuple(float(x) for x in numbers)
 
 
-def _matrix(entries: Matrix) -> tuple[tuple[float, ...], ...]:
-    return tuple(_doubles(line) for line in entries)
+def lower_matrix(entries: Matrix) -> tuple[tuple[float, ...], ...]:
+    return tuple(lower_vector(line) for line in entries)

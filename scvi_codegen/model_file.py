@@ -42,7 +42,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError
-from scvi_codegen.methods import Method, method_from_specification
+from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.problems import Problem, problem
 from scvi_codegen.system import LagrangianSystem
@@ -303,7 +303,9 @@ def _read_vector(value: Any, names: Sequence[str], key: str) -> tuple[float, ...
 
 
 def _read_method(section: Section) -> Method:
-    _text(section, "method", "[method]")
+    name = _text(section, "method", "[method]")
+    if name in ARGUMENTS:
+        _check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")
     if not isinstance(section.get("variational", True), bool):
         raise ModelFileError(f"[method] variational must be true or false, not {section['variational']!r}")
     if not isinstance(section.get("abscissae", []), list):

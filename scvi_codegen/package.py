@@ -17,11 +17,12 @@ import keyword
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from string import Template
+from typing import IO, TYPE_CHECKING
 
-from scvi_codegen.errors import ModelFileError, ScviCodegenError
+from scvi_codegen.errors import ModelFileError, ScviCodegenError, StateError
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.trajectory import write_atomically
@@ -65,7 +66,7 @@ def generate_package(model: Model, folder: str | os.PathLike[str], *, force: boo
 
     Raises:
         PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
-        BuildError: if the initial velocities are to be turned into momenta and there is no C compiler.
+        StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
     prefix = _prefix(target)
@@ -75,8 +76,7 @@ def generate_package(model: Model, folder: str | os.PathLike[str], *, force: boo
         if not force:
             _refuse_to_lose(target, texts)
         for name, text in texts.items():
-            data = text.encode()
-            write_atomically(target / name, lambda file, data=data: file.write(data))  # type: ignore[misc]
+            write_atomically(target / name, partial(_write, text))
     except OSError as error:
         raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error
     return target
@@ -106,6 +106,10 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
     return Stepper(Source(prefix=interface.prefix, header=header, code=code, declarations=declarations), interface)
 
 
+def _write(text: str, file: IO[bytes]) -> None:
+    file.write(text.encode())
+
+
 def _prefix(folder: Path) -> str:
     """The name of the folder, fit to begin C names and to be imported."""
     from scvi_codegen.compiler import c_identifier  # here, because it imports SymPy
@@ -124,18 +128,128 @@ def _prefix(folder: Path) -> str:
 
 def _texts(model: Model, prefix: str) -> dict[str, str]:
     """Text by file name, ``interface.json`` last."""
-    from scvi_codegen.compiler import describe
+    from scvi_codegen.compiler import generate_source
     from scvi_codegen.lowering import lower
-    from scvi_codegen.model_file import dump_model
-    from scvi_codegen.rendering import render, render_example, render_package
+    from scvi_codegen.rendering import render_example
 
+    source, interface = generate_source(model.system, model.method, prefix=prefix)
     program = lower(model.system, model.method, prefix=prefix)
-    source, interface = render(program), describe(program, model.system, model.method)
     texts = {f"{prefix}.h": source.header, f"{prefix}.c": source.code}
-    texts |= render_example(program, _example(model, Stepper(source, interface)))
-    texts |= _package_texts(interface)
-    try:
-        texts["model.toml"] = dump_model(model)
-    except ModelFileError:
-        texts["model.toml"] = ""
+    texts |= render_example(program, _example(model))
+    described = _model_text(model)
+    if described is not None:
+        texts["model.toml"] = described
+    texts["README.md"] = _readme(interface, program.notes, with_model=described is not None)
+    texts["__init__.py"] = _template("__init__.py")
     return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
+
+
+def _example(model: Model) -> ExampleRun:
+    """The whole run of the model in at most about twenty lines of output."""
+    from scvi_codegen.rendering import ExampleRun
+
+    steps = max(1, model.step_count)
+    every = max(1, steps // OUTPUTS)
+    return ExampleRun(
+        q=model.q,
+        p=model.p if model.p is not None else _momenta(model),
+        parameters=model.system.defaults,
+        t=model.t,
+        h=model.h,
+        every=every,
+        outputs=steps // every,
+    )
+
+
+def _momenta(model: Model) -> tuple[float, ...]:
+    """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
+    from scvi_codegen.expression_text import evaluate
+    from scvi_codegen.mechanics import momentum
+    from scvi_codegen.precision import mp
+
+    system = model.system
+    symbols = (*system.coordinates, *system.velocities, system.time, *system.parameters)
+    numbers = (*model.q, *(model.velocity or ()), model.t, *system.defaults)
+    point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))
+    try:
+        return tuple(float(evaluate(expression, point)) for expression in momentum(system))
+    except ArithmeticError as error:
+        raise StateError(f"the initial velocities have no momenta: {error}") from error
+
+
+def _model_text(model: Model) -> str | None:
+    """The model file, or ``None`` for a method that a file cannot hold (a quadrature of the user's own)."""
+    from scvi_codegen.model_file import dump_model
+
+    try:
+        return dump_model(model)
+    except ModelFileError:
+        return None
+
+
+def _readme(interface: Interface, notes: tuple[str, ...], *, with_model: bool) -> str:
+    defaults = zip(interface.parameters, interface.defaults, strict=True)
+    listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
+    return (
+        Template(_template("README.md"))
+        .substitute(
+            prefix=interface.prefix,
+            macro=interface.prefix.upper(),
+            title=" ".join(interface.title.split()),
+            notes=", ".join(notes),
+            coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
+            parameters=f"Parameters, with default values: {listed}." if listed else "There are no parameters.",
+            origin="`model.toml` is what it was generated from." if with_model else "",
+        )
+        .rstrip("\n")
+        + "\n"
+    )
+
+
+def _template(name: str) -> str:
+    from scvi_codegen.rendering import template_folder
+
+    return (template_folder() / "package" / name).read_text(encoding="utf-8")
+
+
+def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
+    record = {
+        "format": FORMAT,
+        "interface": json.loads(interface.to_json()),
+        "declarations": source.declarations.split("\n"),
+        "files": {name: _checksum(text.encode()) for name, text in texts.items()},
+    }
+    return json.dumps(record, indent=1) + "\n"
+
+
+def _checksum(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _refuse_to_lose(folder: Path, texts: Mapping[str, str]) -> None:
+    """Raise :class:`PackageError` if a file to be written exists and was neither written by us nor is the same."""
+    known = _recorded(folder)
+    for name, text in texts.items():
+        try:
+            found = _checksum((folder / name).read_bytes())
+        except FileNotFoundError:
+            continue
+        if name == INTERFACE_FILE:
+            ours = known is not None
+        else:
+            ours = found in (_checksum(text.encode()), (known or {}).get(name))
+        if not ours:
+            raise PackageError(
+                f"{folder / name} was edited, or not written by this program: move it away, choose another folder, "
+                "or overwrite it with --force (from Python: force=True)"
+            )
+
+
+def _recorded(folder: Path) -> dict[str, str] | None:
+    """Checksums by file name from ``interface.json``, or ``None`` if that is missing or not ours."""
+    try:
+        record = json.loads((folder / INTERFACE_FILE).read_text(encoding="utf-8"))
+        files = record["files"] if isinstance(record["format"], int) else None
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return None
+    return files if isinstance(files, dict) else None

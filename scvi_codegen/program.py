@@ -22,6 +22,7 @@ __all__ = [
     "Program",
     "ScatterLoop",
     "SlopeBlock",
+    "Sweep",
 ]
 
 
@@ -163,6 +164,53 @@ class Family:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Sweep:
+    """A fixed-point iteration whose points are the lanes of a vector; all tables are padded to ``lanes`` rows.
+
+    With V the velocities and F = L_q at the points,
+
+        q_n = q0 + sum_j position[n][j] (h position_weights[j] V_j),    q1 = q0 + sum_j end_position[j] (h .. V_j),
+        P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j).
+
+    Separable systems (constant diagonal mass, forces of position and time) iterate on the points,
+    q_n = q0 + h c_n v0 + h^2 sum_j product[n][j] F_j / mass; others on the velocities, V += L_vv^-1 (P - L_v).
+
+    Attributes:
+        separable: which of the two.
+        points: real points; lanes beyond repeat the last one and have weight 0.
+        lanes: a power of two.
+        abscissae: (lanes,) c_n.
+        extrapolation: (lanes, lanes), of F or of V, to the next step.
+        kernel: F at (q, t); or F, L_v and the mass at (q, V, t).
+        force: F alone.
+        mass: constant diagonal (no arguments), separable only.
+        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+    """
+
+    separable: bool
+    points: int
+    lanes: int
+    abscissae: tuple[float, ...]
+    position: tuple[tuple[float, ...], ...]
+    position_weights: tuple[float, ...]
+    momentum: tuple[tuple[float, ...], ...]
+    momentum_weights: tuple[float, ...]
+    end_position: tuple[float, ...]
+    end_momentum: tuple[float, ...]
+    product: tuple[tuple[float, ...], ...]
+    extrapolation: tuple[tuple[float, ...], ...]
+    kernel: Kernel
+    force: Kernel
+    mass: Kernel | None
+    mass_entries: tuple[tuple[int, int], ...]
+
+    @property
+    def diagonal(self) -> bool:
+        """Whether the mass matrix is diagonal."""
+        return all(i == j for i, j in self.mass_entries)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """All of an integrator but its syntax.
 
@@ -181,6 +229,8 @@ class Program:
         mass_entries: (i, j) of the slopes of ``legendre``.
         lagrangian: L at (q, v).
         action: name of the family whose weighted sum of L is the discrete Lagrangian, or ``None``.
+        sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
+        newton: whether Newton's iteration is there at all.
     """
 
     prefix: str
@@ -199,6 +249,8 @@ class Program:
     mass_entries: tuple[tuple[int, int], ...]
     lagrangian: Kernel
     action: str | None
+    sweep: Sweep | None
+    newton: bool
 
     @property
     def dimension(self) -> int:
@@ -213,8 +265,14 @@ class Program:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Every kernel, in the order of emission."""
-        pairs = [kernel for family in self.families for kernel in (family.value, family.slope)]
+        pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
         return (*pairs, self.legendre, self.lagrangian)
+
+    @property
+    def memory(self) -> int:
+        """Numbers a run remembers of its last step to guess the next."""
+        points = self.dimension * self.sweep.lanes if self.sweep else 0
+        return max(points, self.unknowns if self.newton else 0)
 
     def __str__(self) -> str:
         """Readable text of the whole program."""

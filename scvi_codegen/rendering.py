@@ -13,8 +13,14 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from scvi_codegen.c_printer import print_expression, print_number
-from scvi_codegen.program import Kernel, Program
+from scvi_codegen.c_printer import (
+    lane_functions,
+    print_expression,
+    print_lane_results,
+    print_lane_temporaries,
+    print_number,
+)
+from scvi_codegen.program import Kernel, Program, Sweep
 from scvi_codegen.source import Source
 
 __all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "render", "render_example", "template_folder"]
@@ -25,6 +31,8 @@ DEFAULT_TOLERANCE = 2.0**-52
 MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
 KEEP_FACTORS = 1e-5
+VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
+"""What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,15 +77,19 @@ def render_example(program: Program, start: ExampleRun) -> dict[str, str]:
 
 
 def workspace_size(program: Program) -> int:
-    """Doubles of workspace: scratch, unknowns, Jacobian, update, pivots, rows."""
+    """Doubles of workspace: scratch and memory; for Newton also memory, unknowns, Jacobian, update, pivots and rows."""
+    if not program.newton:
+        return scratch_size(program) + program.memory
     size = program.unknowns + (program.dimension if program.action else 0)
     rows = program.unknowns + program.dimension
-    return scratch_size(program) + program.unknowns + size * size + 2 * size + rows
+    return scratch_size(program) + 2 * program.memory + program.unknowns + size * size + 2 * size + rows
 
 
 def scratch_size(program: Program) -> int:
     """Doubles for the slopes of one kernel, or for the mass matrix with its slopes."""
     mass = program.dimension**2 + len(program.mass_entries)
+    if not program.newton:
+        return mass
     return max(mass, *(len(family.slope.results) - family.slope.values for family in program.families))
 
 
@@ -94,7 +106,17 @@ def _context(program: Program) -> dict[str, object]:
         "max_iterations": MAX_ITERATIONS,
         "roundoff_level": ROUNDOFF_LEVEL,
         "keep_factors": KEEP_FACTORS,
+        **_lane_context(program.sweep),
     }
+
+
+def _lane_context(sweep: Sweep | None) -> dict[str, object]:
+    """What the templates of the fixed-point solver need; nothing without one."""
+    if sweep is None:
+        return {}
+    kernels = [sweep.kernel] if sweep.separable else [sweep.kernel, sweep.force]
+    functions = sorted(set().union(*(lane_functions(kernel) for kernel in kernels)))
+    return {"sweep": sweep, "lane_kernels": kernels, "lane_functions": functions, "vector_library": VECTOR_LIBRARY}
 
 
 def _signature(kernel: Kernel) -> str:
@@ -105,6 +127,17 @@ def _signature(kernel: Kernel) -> str:
     parts += ["double *value"]
     parts += ["double *slope"] if len(kernel.results) > kernel.values else []
     return ", ".join(parts)
+
+
+def _lane_signature(kernel: Kernel) -> str:
+    """The same with vectors of points in place of numbers."""
+    return (
+        _signature(kernel)
+        .replace("const double *u", "const lanes *u")
+        .replace("double t", "lanes t")
+        .replace("double *value", "lanes *value")
+        .replace("double *slope", "lanes *slope")
+    )
 
 
 def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:
@@ -146,5 +179,9 @@ def _environment() -> Environment:
         "signature": _signature,
         "call_arguments": _call_arguments,
         "counts": _counts,
+        "transposed": lambda rows: tuple(zip(*rows, strict=True)),
+        "lane_signature": _lane_signature,
+        "lane_temporaries": print_lane_temporaries,
+        "lane_results": print_lane_results,
     }
     return environment

@@ -1,4 +1,4 @@
-"""A slow integrator that shares nothing with the package: formulas written out, 50 digits, Newton by finite differences.
+"""A slow integrator that shares nothing with the package: formulas written out, 50 digits, finite differences.
 
 Every method is one short function from (t, q0, p0), h to (q1, p1). A system enters through its Lagrangian alone: SymPy
 differentiates it, mpmath evaluates it. Points are on [0, 1]; arrays hold mpmath numbers, one row a point, one column a
@@ -54,7 +54,12 @@ def cardinals(points: np.ndarray) -> list[np.ndarray]:
 
 def table(points: np.ndarray, at: np.ndarray, operation: Callable[[np.ndarray], np.ndarray] = np.array) -> np.ndarray:
     """Values (slopes, integrals from 0) of the cardinal polynomials on ``points``, one row for each of ``at``."""
-    polynomials = [operation(polynomial) for polynomial in cardinals(points)]
+    return _table(tuple(points), tuple(at), operation)
+
+
+@cache
+def _table(points: tuple[Any, ...], at: tuple[Any, ...], operation: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    polynomials = [operation(polynomial) for polynomial in cardinals(np.array(points, dtype=object))]
     return np.array([[value(polynomial, x) for polynomial in polynomials] for x in at], dtype=object)
 
 
@@ -179,9 +184,8 @@ class Mechanics:
 
     def _each(self, name: str, t: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray | None = None) -> np.ndarray:
         function, a = self._functions[name], numbers(np.zeros(q.shape)) if a is None else a
-        return np.array(
-            [function(*q[n], *v[n], *a[n], t[n], *self.constants) for n in range(len(q))], dtype=object
-        ) * mp.one
+        results = [function(*q[n], *v[n], *a[n], t[n], *self.constants) for n in range(len(q))]
+        return mp.one * np.array(results, dtype=object)
 
     def lagrangian(self, t: Any, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return self._each("L", t, q, v)[:, 0]
@@ -311,9 +315,7 @@ def sc_phase_space(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes
 # Runge-Kutta.
 
 
-def partitioned(
-    system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, A: Any, A_hat: Any, b: Any, c: Any
-) -> State:
+def partitioned(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, A: Any, A_hat: Any, b: Any, c: Any) -> State:
     """(22) on Hamilton's equations, A for q and A_hat for p."""
     times = t + c * h
 

@@ -15,6 +15,7 @@ from scvi_codegen.expression_text import (
     FUNCTIONS,
     MAX_CHARACTERS,
     evaluate,
+    evaluated,
     format_expression,
     parse_expression,
     unsupported_part,
@@ -197,7 +198,7 @@ def numbers() -> st.SearchStrategy[sympy.Expr]:
 def grown(children: st.SearchStrategy[sympy.Expr]) -> st.SearchStrategy[sympy.Expr]:
     exponents = st.sampled_from([Integer(n) for n in (-3, -2, -1, 2, 3)] + [Rational(k, 2) for k in (-3, -1, 1, 3, 5)])
     unary = st.sampled_from([function for name, function in FUNCTIONS.items() if name != "atan2"])
-    return st.one_of(
+    built = st.one_of(
         st.lists(children, min_size=2, max_size=4).map(lambda parts: sympy.Add(*parts)),
         st.lists(children, min_size=2, max_size=4).map(lambda parts: sympy.Mul(*parts)),
         st.tuples(children, exponents).map(lambda pair: sympy.Pow(*pair)),
@@ -206,6 +207,8 @@ def grown(children: st.SearchStrategy[sympy.Expr]) -> st.SearchStrategy[sympy.Ex
         st.tuples(unary, children).map(lambda pair: pair[0](pair[1])),
         st.tuples(children, children).map(lambda pair: sympy.atan2(*pair)),
     )
+    # SymPy can take for ever over towers of non-real constants: grow on supported expressions only.
+    return built.map(lambda expression: X if unsupported_part(expression) else expression)
 
 
 EXPRESSIONS = st.recursive(st.one_of(st.sampled_from([X, Y, Z]), numbers()), grown, max_leaves=10)
@@ -214,12 +217,8 @@ EXPRESSIONS = st.recursive(st.one_of(st.sampled_from([X, Y, Z]), numbers()), gro
 @settings(max_examples=400, deadline=None)
 @given(EXPRESSIONS)
 def test_round_trip_of_random_expressions(expression: sympy.Expr) -> None:
-    try:
-        text = format_expression(expression)
-    except SystemDefinitionError as error:
-        assert str(error) == unsupported_part(expression)  # noqa: PT017  (either outcome is right)
-        return
-    assert parse(text) == expression, text
+    text = format_expression(expression)
+    assert parse(text) == evaluated(expression), text
 
 
 @pytest.mark.parametrize(
@@ -294,7 +293,7 @@ def test_random_text_gives_an_expression_or_an_expression_error(text: str) -> No
 
 
 @settings(max_examples=100, deadline=None)
-@given(EXPRESSIONS.filter(lambda expression: unsupported_part(expression) is None))
+@given(EXPRESSIONS)
 def test_evaluation_agrees_with_sympy(expression: sympy.Expr) -> None:
     point = {X: Rational(3, 7), Y: Rational(5, 11), Z: Rational(13, 9)}
     try:

@@ -1,0 +1,262 @@
+"""The command line. SymPy, NumPy and the rest are imported by the commands that need them: ``--help`` is quick."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import click
+
+from scvi_codegen.cli.choices import Choices, model_arguments, read_model
+
+if TYPE_CHECKING:
+    from scvi_codegen.cli.running import Outcome
+
+__all__ = ["main"]
+
+FAILURE, USAGE, INTERRUPTED = 1, 2, 130
+"""Exit statuses: numerical failure or no compiler; faulty input; Ctrl-C."""
+
+OVERVIEW = """Compile a Lagrangian into a variational integrator in C, run it, look at its equations.
+
+MODEL is a model file (TOML) or a name of the catalogue ('scvi-codegen systems'). Options override what it says.
+
+\b
+Examples:
+  scvi-codegen run kepler                              integrate it, print what was conserved
+  scvi-codegen run kepler --step 0.1 -o orbit.npz --plot orbit.png
+  scvi-codegen run kepler --method gauss --stages 4 --parameter mu=2 --q 1,0 --velocity 0,1.2
+  scvi-codegen systems kepler > mine.toml              a model file to start from
+  scvi-codegen run mine.toml --span 1000 --every 10 -o orbit.csv
+  scvi-codegen derive planar-pendulum --method svi --degree 2 --quadrature gauss-legendre:2
+  scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
+
+Exit status: 0; 2 if the command line or a model is at fault; 1 if a step failed, there is no C compiler or a file
+cannot be written; 130 after Ctrl-C.
+"""
+
+
+class _Failure(click.ClickException):
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+    @property
+    def exit_code(self) -> int:  # type: ignore[override]  # click's is a class variable
+        return self.status
+
+
+class _Commands(click.Group):
+    """Turns the errors a user can meet into one message and an exit status."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        from scvi_codegen.errors import BuildError, ScviCodegenError, StepFailedError
+
+        try:
+            with _warnings_as_lines():
+                return super().invoke(ctx)
+        except (StepFailedError, BuildError) as error:
+            raise _Failure(str(error), FAILURE) from error
+        except ScviCodegenError as error:
+            raise _Failure(str(error), USAGE) from error
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise _Failure(str(error), FAILURE) from error
+        except MemoryError as error:
+            raise _Failure("there is not enough memory for that", FAILURE) from error
+
+
+@click.group(cls=_Commands, help=OVERVIEW, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="scvi-codegen", prog_name="scvi-codegen")
+def main() -> None:
+    """Entry point of the command ``scvi-codegen``."""
+
+
+@main.command(short_help="Integrate MODEL and sum up what was conserved.")
+@model_arguments
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory, .npz or .csv.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Picture, .png or .svg (needs matplotlib).")
+@click.option("--tolerance", type=float, metavar="X", help="Relative size of the last Newton update [round-off].")
+@click.option("--max-iterations", type=int, metavar="N", help="Newton iterations after which a step fails [50].")
+def run(
+    model_name: str,
+    output: str | None,
+    plot: str | None,
+    tolerance: float | None,
+    max_iterations: int | None,
+    **choices: Any,
+) -> None:
+    """Integrate MODEL and print what was conserved and where it ended.
+
+    A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
+    asked for.
+
+    \b
+    Examples:
+      scvi-codegen run outer-solar-system --plot orbits.png
+      scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
+    """  # noqa: D301  (click wants the character \b)
+    _check_outputs(output, plot)
+    model = read_model(model_name, Choices(**choices))
+    from scvi_codegen.cli.running import integrate_model, summary
+    from scvi_codegen.stepper import NewtonOptions
+
+    given = {"tolerance": tolerance, "max_iterations": max_iterations}
+    options = NewtonOptions(**{key: value for key, value in given.items() if value is not None})  # type: ignore[arg-type]
+    outcome = integrate_model(model, options)
+    click.echo(summary(model, outcome))
+    written = _write_outputs(outcome, output, plot)
+    if outcome.failure is not None:
+        raise _Failure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
+    if outcome.interrupted:
+        raise _Failure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
+    for path in written:
+        click.echo(f"wrote {path}")
+
+
+@main.command(short_help="Write MODEL as C and as a Python package.")
+@model_arguments
+@click.option(
+    "-o", "--output", type=click.Path(), required=True, metavar="DIR", help="Folder; its name is the C prefix."
+)
+@click.option("--force", is_flag=True, help="Overwrite files of the same names that were edited or are not ours.")
+def generate(model_name: str, output: str, force: bool, **choices: Any) -> None:
+    """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
+
+    \b
+    Example:
+      scvi-codegen generate planar-pendulum -o pendulum_svi
+      make -C pendulum_svi run
+      python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
+    """  # noqa: D301  (click wants the character \b)
+    model = read_model(model_name, Choices(**choices))
+    from scvi_codegen.package import generate_package
+
+    folder = generate_package(model, output, force=force)
+    click.echo(f"{model.system.name}: {model.method.title}")
+    click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run', or 'import {folder.resolve().name}'")
+
+
+@main.command(short_help="Print the equations of one step of MODEL.")
+@model_arguments
+@click.option("--latex", is_flag=True, help="LaTeX instead of text.")
+@click.option("--radicals", is_flag=True, help="Table entries as rationals and radicals where they are short.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write here instead of to the screen.")
+def derive(model_name: str, latex: bool, radicals: bool, output: str | None, **choices: Any) -> None:
+    """Print the equations of one step of MODEL: unknowns, stage equations, end state.
+
+    \b
+    Example:
+      scvi-codegen derive planar-pendulum --method svi --degree 1 --quadrature gauss-lobatto:2 --radicals
+    """  # noqa: D301  (click wants the character \b)
+    model = read_model(model_name, Choices(**choices))
+    from scvi_codegen.equations import derive as derive_equations
+
+    equations = derive_equations(model.system, model.method, radicals=radicals)
+    _emit(equations.to_latex() if latex else equations.to_text(), output)
+
+
+@main.command(short_help="List the catalogue, or print an entry as a file.")
+@click.argument("name", required=False)
+def systems(name: str | None) -> None:
+    """List the systems of the catalogue, or print the one called NAME as a model file.
+
+    \b
+    Example:
+      scvi-codegen systems double-pendulum > mine.toml
+    """  # noqa: D301  (click wants the character \b)
+    if name is None:
+        from scvi_codegen.cli.listings import systems_table
+
+        click.echo(systems_table())
+    else:
+        from scvi_codegen.model_file import Model, dump_model
+        from scvi_codegen.problems import problem
+
+        click.echo(dump_model(Model.from_problem(problem(name))), nl=False)
+
+
+@main.command(short_help="List the methods and their properties.")
+@click.option("--tableau", metavar="NAME:S", help="Print a Butcher tableau instead, as in gauss:3.")
+def methods(tableau: str | None) -> None:
+    """List the methods with their arguments, and order, symplecticity and symmetry of an example of each."""
+    from scvi_codegen.cli.listings import methods_table, tableau_text
+
+    click.echo(methods_table() if tableau is None else tableau_text(tableau))
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Show the warnings of this package as one line each, once."""
+    from scvi_codegen.errors import MethodWarning
+
+    shown: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            click.echo(f"Warning: {message}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", MethodWarning)
+        warnings.showwarning = show
+        yield
+
+
+def _check_outputs(output: str | None, plot: str | None) -> None:
+    """Find out before a long run whether its results can be written."""
+    if output is not None and Path(output).suffix.lower() not in (".npz", ".csv"):
+        raise click.BadParameter(f"a trajectory is written as .npz or .csv, not as '{output}'", param_hint="'-o'")
+    for path, hint in ((output, "'-o'"), (plot, "'--plot'")):
+        if path is not None:
+            _check_writable(Path(path), hint)
+    if plot is not None:
+        from scvi_codegen.plotting import check_plot_path
+
+        check_plot_path(plot)
+
+
+def _check_writable(path: Path, hint: str) -> None:
+    if path.is_dir():
+        raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)
+    if not path.parent.is_dir():
+        raise click.BadParameter(f"there is no folder '{path.parent}'", param_hint=hint)
+    if not os.access(path.parent, os.W_OK):
+        raise click.BadParameter(f"the folder '{path.parent}' cannot be written", param_hint=hint)
+
+
+def _write_outputs(outcome: Outcome, output: str | None, plot: str | None) -> list[str]:
+    if output is not None:
+        outcome.trajectory.save(output)
+    if plot is not None:
+        from scvi_codegen.plotting import plot_trajectory
+
+        plot_trajectory(outcome.trajectory, plot)
+    return [path for path in (output, plot) if path is not None]
+
+
+def _kept(outcome: Outcome, written: list[str]) -> str:
+    count = len(outcome.trajectory)
+    states = "the initial state was" if count == 1 else f"the {count} states up to there were"
+    return f"{states} kept: {' and '.join(written)}" if written else f"{states} not written to a file (-o, --plot)"
+
+
+def _emit(text: str, output: str | None) -> None:
+    if output is None:
+        click.echo(text)
+        return
+    from scvi_codegen.trajectory import write_atomically
+
+    _check_writable(Path(output), "'-o'")
+    write_atomically(output, partial(_write, text.rstrip("\n") + "\n"))
+    click.echo(f"wrote {output}", err=True)
+
+
+def _write(text: str, file: IO[bytes]) -> None:
+    file.write(text.encode())

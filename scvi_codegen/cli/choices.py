@@ -1,0 +1,177 @@
+"""MODEL and the options that override it: from the words of a command line to a :class:`Model`."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from scvi_codegen.methods import Method
+    from scvi_codegen.model_file import Model
+
+__all__ = ["Choices", "model_arguments", "read_model"]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+INHERITED = ("degree", "quadrature", "nodes", "stages")
+"""Arguments that a method named on the command line takes over from the method of the model, if it has them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """What the command line says beside MODEL; ``None`` (or nothing) where it is silent."""
+
+    method: str | None
+    degree: int | None
+    stages: int | None
+    nodes: str | None
+    quadrature: str | None
+    form: str | None
+    variational: bool | None
+    abscissae: tuple[float, ...] | None
+    parameter: tuple[tuple[str, float], ...]
+    q: tuple[float, ...] | None
+    p: tuple[float, ...] | None
+    velocity: tuple[float, ...] | None
+    time: float | None
+    step: float | None
+    span: float | None
+    steps: int | None
+    every: int | None
+
+
+def _numbers(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    if value is None:
+        return None
+    try:
+        return tuple(float(word) for word in re.split(r"[,\s]+", value.strip()))
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; write numbers with commas between them, as in 0.5,-1.2e-3") from error
+
+
+def _assignments(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[tuple[str, float], ...]:
+    result = []
+    for text in values:
+        name, equals, number = (part.strip() for part in text.partition("="))
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not name or not equals or not math.isfinite(value):
+            raise click.BadParameter(f"'{text}' is not of the form NAME=VALUE, as in g=9.81")
+        result.append((name, value))
+    return tuple(result)
+
+
+def _option(*names: str, **settings: Any) -> Callable[[Command], Command]:
+    return click.option(*names, **settings)
+
+
+METHOD_OPTIONS = (
+    _option("--method", metavar="NAME", help="Method: svi, scvi, sc, gauss, ... (see 'scvi-codegen methods')."),
+    _option("--degree", type=int, metavar="N", help="Degree of the trial curve (svi, scvi, sc)."),
+    _option("--stages", type=int, metavar="N", help="Number of stages (gauss, radau-iia, lobatto-iiia, ...)."),
+    _option("--quadrature", metavar="NAME:N", help="Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
+    _option("--nodes", metavar="NAME", help="Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
+    _option("--form", metavar="NAME", help="phase-space or position (sc and Runge-Kutta methods)."),
+    _option(
+        "--variational/--printed",
+        default=None,
+        help="SCVI: the variational method, or the form printed in the paper, which is not symplectic.",
+    ),
+    _option("--abscissae", metavar="C1,C2,..", callback=_numbers, help="Abscissae in [0, 1] (collocation)."),
+)
+STATE_OPTIONS = (
+    _option(
+        "--parameter",
+        multiple=True,
+        metavar="NAME=VALUE",
+        callback=_assignments,
+        help="Value of a parameter; may be repeated.",
+    ),
+    _option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
+    _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
+    _option("--velocity", metavar="V1,V2,..", callback=_numbers, help="Initial velocities, instead of momenta."),
+    _option("--time", type=float, metavar="T", help="Initial time."),
+    _option("--step", type=float, metavar="H", help="Step size; negative to go back."),
+    _option("--span", type=float, metavar="T", help="Length of time to cover."),
+    _option("--steps", type=int, metavar="N", help="Number of steps, instead of --span."),
+    _option("--every", type=int, metavar="N", help="Keep each N-th state."),
+)
+
+
+def model_arguments(command: Command) -> Command:
+    """Give a command the argument MODEL and the options of :class:`Choices`."""
+    for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
+        command = option(command)
+    return click.argument("model_name", metavar="MODEL")(command)
+
+
+def read_model(name: str, choices: Choices) -> Model:
+    """The model of a file or of the catalogue, with the choices of the command line.
+
+    Raises:
+        click.UsageError: if choices exclude each other.
+        ScviCodegenError: as reading and building the model do.
+    """
+    from dataclasses import replace
+
+    if choices.p is not None and choices.velocity is not None:
+        raise click.UsageError("--p and --velocity exclude each other")
+    if choices.span is not None and choices.steps is not None:
+        raise click.UsageError("--span and --steps exclude each other")
+    model = _named_model(name)
+    changes: dict[str, Any] = {
+        "system": model.system.with_parameters(**dict(choices.parameter)) if choices.parameter else model.system,
+        "method": _chosen_method(model.method, choices),
+    }
+    direct = {"q": choices.q, "t": choices.time, "h": choices.step, "every": choices.every}
+    changes |= {field: value for field, value in direct.items() if value is not None}
+    if choices.p is not None or choices.velocity is not None:
+        changes |= {"p": choices.p, "velocity": choices.velocity}
+    if choices.span is not None or choices.steps is not None:
+        changes |= {"span": choices.span, "steps": choices.steps}
+    return replace(model, **changes)
+
+
+def _named_model(name: str) -> Model:
+    from scvi_codegen.errors import SystemDefinitionError
+    from scvi_codegen.model_file import Model, load_model
+    from scvi_codegen.problems import PROBLEMS, problem
+
+    path = Path(name)
+    if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
+        return load_model(path)
+    try:
+        return Model.from_problem(problem(name))
+    except SystemDefinitionError as error:
+        if name.partition(":")[0] in PROBLEMS:
+            raise
+        raise SystemDefinitionError(f"{error} (There is no model file '{name}', either.)") from error
+
+
+def _chosen_method(method: Method, choices: Choices) -> Method:
+    """The method of the model with what the command line changes of it."""
+    from scvi_codegen.methods import ARGUMENTS, method_from_specification
+
+    fields = ("degree", "stages", "quadrature", "nodes", "form", "variational", "abscissae")
+    given = {field: getattr(choices, field) for field in fields if getattr(choices, field) is not None}
+    if choices.method is None and not given:
+        return method
+    base = dict(method.specification())
+    if base.get("quadrature") == f"gauss-legendre:{base.get('degree')}":
+        del base["quadrature"]  # the default for its degree: another degree has another default
+    if choices.method is not None and choices.method != base["method"]:
+        accepted = ARGUMENTS.get(choices.method, ())
+        base = {field: value for field, value in base.items() if field in INHERITED and field in accepted}
+        base["method"] = choices.method
+    return method_from_specification(base | given)

@@ -1,0 +1,185 @@
+"""``scvi-codegen run``: integrate in short portions, so that Ctrl-C and a failing step lose nothing, and sum it up."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from types import FrameType
+
+import click
+import numpy as np
+
+from scvi_codegen.cli.conservation import energy_report, momentum_maps
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.model_file import Model
+from scvi_codegen.stepper import NewtonOptions, Run
+from scvi_codegen.trajectory import Trajectory
+
+__all__ = ["Outcome", "integrate_model", "summary"]
+
+PORTION_SECONDS = 0.2
+SHOWN_COORDINATES = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What came of a run.
+
+    Attributes:
+        trajectory: the states kept, up to the last one computed.
+        run: as it stands after the last step completed.
+        preparation: seconds to derive, compile and load the stepper.
+        seconds: spent in steps.
+        failure: the error of the step that failed, or ``None``.
+        interrupted: whether the user or the system stopped the run.
+    """
+
+    trajectory: Trajectory
+    run: Run
+    preparation: float
+    seconds: float
+    failure: StepFailedError | None
+    interrupted: bool
+
+
+def integrate_model(model: Model, options: NewtonOptions | None = None) -> Outcome:
+    """Run a model with a progress bar, as far as it goes.
+
+    Raises:
+        BuildError: without a C compiler.
+        StateError: if the initial state is unfit.
+    """
+    began = time.perf_counter()
+    run = model.start(compile_stepper(model.system, model.method), options=options)
+    preparation, seconds = time.perf_counter() - began, 0.0
+    pieces, failure = [run.record(0, every=model.every)], None
+    with _interruptions() as caught, _progress(model.step_count) as advance:
+        portion = 1
+        while run.steps < model.step_count and not caught and failure is None:
+            before, started = run.steps, time.perf_counter()
+            try:
+                piece = run.record(min(portion, model.step_count - before), every=model.every)
+            except StepFailedError as error:
+                if error.trajectory is None:
+                    raise
+                failure, piece = error, error.trajectory
+            elapsed = time.perf_counter() - started
+            pieces.append(piece)
+            seconds += elapsed
+            advance(run.steps - before)
+            portion = max(1, int(portion * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
+    return Outcome(
+        trajectory=_joined(pieces),
+        run=run,
+        preparation=preparation,
+        seconds=seconds,
+        failure=failure,
+        interrupted=bool(caught) and run.steps < model.step_count,
+    )
+
+
+def summary(model: Model, outcome: Outcome) -> str:
+    """The run in a few lines; little if not one step was made."""
+    run, trajectory, method = outcome.run, outcome.trajectory, model.method
+    order = "no order claimed" if method.order is None else f"order {method.order}"
+    lines = [
+        model.system.name,
+        f"{method.title}; {order}, {'' if method.symplectic else 'not '}symplectic, "
+        f"{'' if method.symmetric else 'not '}symmetric",
+        f"{_counted(run.steps, 'step')} of {model.h:g} from t = {model.t:g} to t = {run.t:g}; "
+        f"{_counted(len(trajectory), 'state')} kept",
+    ]
+    if run.steps:
+        lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")
+        with np.errstate(all="ignore"):
+            lines += _conserved(model, trajectory)
+    return "\n".join([*lines, *_final_state(model, run)])
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _speed(outcome: Outcome, every: int) -> str:
+    text = f"{outcome.seconds:.3g} s, {_duration(outcome.seconds / outcome.run.steps)} a step"
+    counted = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
+    if not counted:
+        return text
+    return f"{text}, {int(outcome.trajectory.iterations.sum()) / counted:.2f} Newton iterations a step"
+
+
+def _conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
+    try:
+        yield energy_report(model.system, trajectory)
+    except StateError as error:
+        yield f"energy: {error}"
+    for quantity in momentum_maps(model.system):
+        yield f"relative error of {quantity.name}: {quantity.error(trajectory):.2e} at most"
+
+
+def _final_state(model: Model, run: Run) -> Iterator[str]:
+    names = [coordinate.name for coordinate in model.system.coordinates]
+    width = max(map(len, names[:SHOWN_COORDINATES]))
+    yield "final state"
+    for name, q, p in list(zip(names, run.q, run.p, strict=True))[:SHOWN_COORDINATES]:
+        yield f"  {name:{width}} = {q: .17g}   p_{name:{width}} = {p: .17g}"
+    if len(names) > SHOWN_COORDINATES:
+        yield f"  and {len(names) - SHOWN_COORDINATES} coordinates more"
+
+
+def _duration(seconds: float) -> str:
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if seconds >= scale:
+            return f"{seconds / scale:.3g} {unit}"
+    return f"{seconds / 1e-9:.3g} ns"
+
+
+def _joined(pieces: list[Trajectory]) -> Trajectory:
+    """One trajectory; each piece but the first begins with a state that is there already, or was not to be kept."""
+    first, *rest = pieces
+    return replace(
+        first,
+        t=np.concatenate([first.t, *(piece.t[1:] for piece in rest)]),
+        q=np.concatenate([first.q, *(piece.q[1:] for piece in rest)]),
+        p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
+        iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
+    )
+
+
+@contextlib.contextmanager
+def _interruptions() -> Iterator[list[int]]:
+    """Note the first SIGINT or SIGTERM instead of dying of it; a second one acts as always."""
+    caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield caught  # only the main thread may handle signals
+        return
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {int(number): signal.getsignal(number) for number in signals}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
+        signal.signal(number, before[number])
+
+    try:
+        for number in signals:
+            signal.signal(number, note)
+        yield caught
+    finally:
+        for number in signals:
+            signal.signal(number, before[number])
+
+
+@contextlib.contextmanager
+def _progress(steps: int) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr if that is a terminal; the function given adds steps done."""
+    if not sys.stderr.isatty() or steps == 0:
+        yield lambda count: None
+        return
+    with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:
+        yield bar.update

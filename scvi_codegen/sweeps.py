@@ -1,0 +1,229 @@
+"""The fixed-point solver of stage equations: no Newton matrix, points as lanes of one vector.
+
+It exists where the unknowns are velocities V_n at the points themselves, so that the stage equations read
+
+    L_v(q_n, V_n) = P_n = p0 + h sum_j A_nj L_q(q_j, V_j),      q_n = q0 + h sum_j a_nj V_j,
+
+that is for SVI with as many points as its degree, every Runge-Kutta method in phase space, and Stoermer-Verlet; and for
+*separable* systems (constant diagonal mass, forces of position and time) also for every SVI, spectral collocation and
+Runge-Kutta in position form, whose stage equations collapse to q_n = q0 + h c_n v0 + h^2 sum_j Ahat_nj f(q_j).
+
+For a variational method the two matrices belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
+rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51, the
+rounded map still has a generating function: its energy error does not drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy
+
+from scvi_codegen.basis import extrapolation, matrix_product, transpose
+from scvi_codegen.derivatives import jacobian
+from scvi_codegen.errors import MethodError
+from scvi_codegen.lowering import lower_kernel, lower_matrix, lower_vector
+from scvi_codegen.mechanics import force, momentum
+from scvi_codegen.methods.collocation import phase_space_system
+from scvi_codegen.methods.galerkin import EXTRAPOLATION_DEGREE
+from scvi_codegen.methods.method import Method
+from scvi_codegen.precision import Matrix, Vector, mp
+from scvi_codegen.program import Kernel, Sweep
+from scvi_codegen.stage_system import PointFamily, StageSystem
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["is_separable", "sweep_of"]
+
+MOST_POINTS = 32
+FRACTION_BITS = 51
+
+
+def is_separable(system: LagrangianSystem) -> bool:
+    """Whether L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, as seen in the structure of its derivatives."""
+    momenta = momentum(system)
+    mass = jacobian(momenta, system.velocities)
+    constant = set(system.parameters)
+    if any(i != j or not entry.free_symbols <= constant for (i, j), entry in mass.items()):
+        return False
+    at_rest = {v: sympy.S.Zero for v in system.velocities}
+    return all(p.xreplace(at_rest) == 0 for p in momenta) and not jacobian(force(system), system.velocities)
+
+
+def sweep_of(system: LagrangianSystem, method: Method) -> Sweep | None:
+    """The fixed-point iteration of a method for a system, or ``None`` where there is none."""
+    separable = is_separable(system)
+    stages = _velocity_stages(system, method, separable=separable)
+    if stages is None:
+        return None
+    family = stages.families[0]
+    tables = _variational_tables(family, stages) if _is_variational(stages) else _tableau_tables(family, stages)
+    if tables is None or (not separable and len(tables.position) != len(tables.momentum)):
+        return None
+    if len(family.abscissae) > MOST_POINTS:
+        return None
+    return _padded(system, family, tables, separable=separable)
+
+
+class _Tables:
+    """Unpadded tables, in 60 digits."""
+
+    def __init__(
+        self,
+        *,
+        position: Matrix,
+        position_weights: Vector,
+        momentum: Matrix,
+        momentum_weights: Vector,
+        end_position: Vector,
+        end_momentum: Vector,
+    ) -> None:
+        self.position, self.position_weights = position, position_weights
+        self.momentum, self.momentum_weights = momentum, momentum_weights
+        self.end_position, self.end_momentum = end_position, end_momentum
+
+
+def _velocity_stages(system: LagrangianSystem, method: Method, *, separable: bool) -> StageSystem | None:
+    """Stage equations with one family whose kernel is (L_q, L_v) and whose unknowns are velocities."""
+    if getattr(method, "form", None) == "position":
+        return phase_space_system(system, method.tableau) if separable else None  # type: ignore[attr-defined]
+    stages = method.stage_system(system)
+    family = stages.families[0]
+    plain = len(stages.families) == 1 and len(family.gathers) == len(family.scatters) == 2
+    if not plain:
+        return None
+    return stages if separable or _is_identity(family.gathers[1].table.entries) else None
+
+
+def _is_identity(entries: Matrix) -> bool:
+    """Of a table whose first column multiplies q0."""
+    square = len(entries) == len(entries[0]) - 1
+    return square and all(x == int(n + 1 == b) for n, line in enumerate(entries) for b, x in enumerate(line))
+
+
+def _is_variational(stages: StageSystem) -> bool:
+    return stages.action is not None
+
+
+def _variational_tables(family: PointFamily, stages: StageSystem) -> _Tables | None:
+    """mu and its partner; for other velocity tables the partner by the (constant) stiffness matrix."""
+    beta = stages.end_position.entries[0][1:]
+    if any(x == 0 for x in beta):
+        return None
+    position = tuple(line[1:] for line in family.gathers[0].table.entries)
+    velocity = tuple(line[1:] for line in family.gathers[1].table.entries)
+    unit = mp.ldexp(1, FRACTION_BITS)
+    mu = tuple(tuple(mp.nint(x / b * unit) / unit for x, b in zip(line, beta, strict=True)) for line in position)
+    partner: Matrix
+    if _is_identity(family.gathers[1].table.entries):
+        partner = transpose(tuple(tuple(1 - x for x in line) for line in mu))
+    else:
+        partner = _stiffness_partner(position, velocity, beta, family.weights)
+    return _Tables(
+        position=mu,
+        position_weights=beta,
+        momentum=partner,
+        momentum_weights=family.weights,
+        end_position=(mp.one,) * len(beta),
+        end_momentum=(mp.one,) * len(family.weights),
+    )
+
+
+def _stiffness_partner(position: Matrix, velocity: Matrix, beta: Vector, weights: Vector) -> Matrix:
+    """K^-1 (beta - a)^T, K = l^T w l: the rows beta_b p1 - sum_n w_n (h a_nb L_q + l_nb L_v) solved for constant mass."""
+    weighted = tuple(tuple(w * x for x in line) for w, line in zip(weights, velocity, strict=True))
+    stiffness = mp.matrix(matrix_product(transpose(velocity), weighted))
+    right = mp.matrix([[b - x for x in column] for b, column in zip(beta, transpose(position), strict=True)])
+    solved = mp.inverse(stiffness) * right
+    return tuple(tuple(solved[b, n] for n in range(solved.cols)) for b in range(solved.rows))
+
+
+def _tableau_tables(family: PointFamily, stages: StageSystem) -> _Tables:
+    """(A, b) for positions and momenta alike."""
+    A = tuple(line[1:] for line in family.gathers[0].table.entries)
+    b = stages.end_position.entries[0][1:]
+    ones = (mp.one,) * len(b)
+    return _Tables(
+        position=A, position_weights=ones, momentum=A, momentum_weights=ones, end_position=b, end_momentum=b
+    )
+
+
+def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, separable: bool) -> Sweep:
+    points, blocks = len(family.abscissae), len(tables.momentum)
+    lanes = 2
+    while lanes < max(points, blocks):
+        lanes *= 2
+    degree = min(points - 1, EXTRAPOLATION_DEGREE)
+    weighted = tuple(tuple(x * w for x, w in zip(line, tables.position_weights, strict=True)) for line in tables.position)
+    product = tuple(
+        tuple(x * w for x, w in zip(line, tables.momentum_weights, strict=True))
+        for line in matrix_product(weighted, tables.momentum)
+    )
+    kernel, mass, entries = _separable_kernels(system) if separable else _coupled_kernel(system)
+    return Sweep(
+        separable=separable,
+        points=points,
+        lanes=lanes,
+        abscissae=_vector(tuple(mp.fsum(line) for line in weighted), lanes, repeat=True),
+        position=_matrix(tables.position, lanes),
+        position_weights=_vector(tables.position_weights, lanes),
+        momentum=_matrix(tables.momentum, lanes),
+        momentum_weights=_vector(tables.momentum_weights, lanes),
+        end_position=_vector(tables.end_position, lanes),
+        end_momentum=_vector(tables.end_momentum, lanes),
+        product=_matrix(product, lanes),
+        extrapolation=_matrix(extrapolation(family.abscissae, 1, degree), lanes),
+        kernel=kernel,
+        force=_force_kernel(system, separable=separable),
+        mass=mass,
+        mass_entries=entries,
+    )
+
+
+def _matrix(entries: Matrix, lanes: int) -> tuple[tuple[float, ...], ...]:
+    """Rows beyond the last repeat it, columns beyond are zero: a lane too many is the last point again."""
+    wide = [(*line, *(mp.zero,) * (lanes - len(line))) for line in entries]
+    return lower_matrix((*wide, *(wide[-1],) * (lanes - len(wide))))
+
+
+def _vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[float, ...]:
+    return lower_vector((*entries, *((entries[-1] if repeat else mp.zero),) * (lanes - len(entries))))
+
+
+def _force_kernel(system: LagrangianSystem, *, separable: bool) -> Kernel:
+    arguments = system.coordinates if separable else (*system.coordinates, *system.velocities)
+    return lower_kernel(
+        "force_lanes", arguments=arguments, time=system.time, parameters=system.parameters, values=force(system)
+    )
+
+
+def _separable_kernels(system: LagrangianSystem) -> tuple[Kernel, Kernel, tuple[tuple[int, int], ...]]:
+    mass = jacobian(momentum(system), system.velocities)
+    kernel = lower_kernel(
+        "mass", arguments=(), time=system.time, parameters=system.parameters, values=tuple(mass.values())
+    )
+    return _force_kernel(system, separable=True), kernel, tuple(mass)
+
+
+def _coupled_kernel(system: LagrangianSystem) -> tuple[Kernel, None, tuple[tuple[int, int], ...]]:
+    momenta = momentum(system)
+    mass = {key: entry for key, entry in jacobian(momenta, system.velocities).items() if key[0] >= key[1]}
+    kernel = lower_kernel(
+        "point_lanes",
+        arguments=(*system.coordinates, *system.velocities),
+        time=system.time,
+        parameters=system.parameters,
+        values=(*force(system), *momenta),
+        slopes=tuple(mass.values()),
+    )
+    return kernel, None, tuple(mass)
+
+
+def check_solver(solver: str, sweep: Sweep | None, method: Method, names: Sequence[str]) -> None:
+    """Raise :class:`MethodError` for a solver that does not exist, or not for this method and system."""
+    if solver not in names:
+        raise MethodError(f"there is no solver {solver!r}; there are {', '.join(names)}")
+    if solver == "fixed-point" and sweep is None:
+        raise MethodError(
+            f"{method.name} has no fixed-point iteration for this system; use solver='auto' or 'newton', or an SVI with "
+            "as many quadrature points as its degree"
+        )

@@ -1,0 +1,123 @@
+"""The order that a method claims is the slope of its global error in the step size."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    ChebyshevGauss,
+    ChebyshevLobatto,
+    CollocationRK,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+
+PLATEAU = 1e-11
+"""Errors below are left out; round-off and the reference contribute up to 1e-13."""
+SPANS = {"kepler": 6.0, "pumped-cart-pole": 1.0, "planar-pendulum": 6.0}
+LOW_ORDER = 2
+LOW_ORDER_SPAN = 1.0
+"""Longer runs of a first-order method fall into the centre of attraction."""
+COUNTS = tuple(int(12 * 1.25**k) for k in range(27))
+
+
+@cache
+def reference(compiled, sample, name, span):
+    """Gauss's method of order 16, with steps so short that its error is round-off."""
+    run = compiled(name, Gauss(8)).integrate(*sample(name).state, h=span / 300, steps=300, t=0.3)
+    return np.concatenate([run.q[-1], run.p[-1]])
+
+
+def global_error(compiled, sample, name, method, span, count):
+    run = compiled(name, method).integrate(*sample(name).state, h=span / count, steps=count, every=count, t=0.3)
+    return np.linalg.norm(np.concatenate([run.q[-1], run.p[-1]]) - reference(compiled, sample, name, span))
+
+
+def measured_order(compiled, sample, name, method):
+    """The slope through the shortest steps (three, if there are as many) whose error is above the plateau."""
+    span = LOW_ORDER_SPAN if (method.order or 1) <= LOW_ORDER else SPANS[name]
+    errors = []
+    for count in COUNTS:
+        error = global_error(compiled, sample, name, method, span, count)
+        if error < PLATEAU:
+            break
+        errors.append(error)
+    used = slice(max(0, len(errors) - 3), len(errors))
+    assert len(errors) >= 2
+    return -np.polyfit(np.log(COUNTS[used]), np.log(errors[used]), 1)[0]
+
+
+METHODS = (
+    *(SVI(s, f"gauss-legendre:{g}") for s in (1, 2, 3, 4, 5) for g in (s, s + 1)),
+    *(SVI(s, f"gauss-lobatto:{g}") for s in (2, 3, 4) for g in (s, s + 1)),
+    SVI(1, "gauss-lobatto:2"),
+    SVI(3, "clenshaw-curtis:4"),
+    SVI(3, "clenshaw-curtis:5"),
+    SVI(3, "fejer:4"),
+    SVI(3, "gauss-radau-left:3"),
+    SVI(2, "gauss-radau-right:2"),
+    *(SCVI(s) for s in (1, 2, 3, 4, 5)),
+    SCVI(2, "gauss-legendre:3"),
+    SCVI(3, "gauss-legendre:2"),
+    SCVI(3, "gauss-lobatto:3"),
+    SCVI(3, nodes="equispaced"),
+    *(SpectralCollocation(s, form=form) for s in (1, 2, 3, 4, 5) for form in ("position", "phase-space")),
+    SpectralCollocation(3, nodes="legendre-lobatto"),
+    *(Gauss(s) for s in (1, 2, 3, 4, 5)),
+    *(RadauIIA(s) for s in (1, 2, 3, 4, 5)),
+    *(RadauIA(s) for s in (1, 2, 3, 4, 5)),
+    *(LobattoIIIA(s) for s in (2, 3, 4, 5)),
+    *(ChebyshevGauss(s) for s in (1, 2, 3, 4, 5)),
+    *(ChebyshevLobatto(s) for s in (2, 3, 4, 5)),
+    Gauss(2, form="position"),
+    RadauIA(2, form="position"),
+    CollocationRK([0.2, 0.9]),
+    StoermerVerlet(),
+    ExplicitEuler(),
+    ExplicitEuler(form="position"),
+)
+LOW = tuple(method for method in METHODS if method.order <= 6)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_global_error_on_kepler_shrinks_with_the_order_claimed(compiled, sample, method):
+    assert measured_order(compiled, sample, "kepler", method) == pytest.approx(method.order, abs=0.15)
+
+
+@pytest.mark.parametrize("method", LOW[::4], ids=lambda method: method.name)
+def test_global_error_on_a_coupled_time_dependent_system_does_too(compiled, sample, method):
+    assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.15)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", LOW, ids=lambda method: method.name)
+def test_global_error_of_every_low_order_method_on_that_system(compiled, sample, method):
+    assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.25)
+
+
+@pytest.mark.parametrize("name", ["kepler", "planar-pendulum"])
+@pytest.mark.parametrize("s", [2, 3, 4, 5])
+def test_the_printed_shooting_equations_have_order_one_less_than_their_degree(compiled, sample, name, s):
+    method = SCVI(s, variational=False)
+    assert method.order is None
+    assert measured_order(compiled, sample, name, method) == pytest.approx(s - 1, abs=0.2)
+
+
+@pytest.mark.parametrize("method", [SVI(2), RadauIIA(3), SCVI(2)], ids=lambda method: method.name)
+def test_the_reference_is_the_exact_solution_where_there_is_one(compiled, sample, method):
+    """q'' = -q: the same slope from the closed form, so that a fault of the reference cannot hide."""
+    q, p = sample("harmonic-oscillator").state
+    exact = q[0] * np.cos(6.0) + p[0] * np.sin(6.0)
+    stepper = compiled("harmonic-oscillator", method)
+    errors = [abs(stepper.integrate(q, p, h=6.0 / n, steps=n).q[-1, 0] - exact) for n in (60, 90)]
+    assert np.log(errors[0] / errors[1]) / np.log(1.5) == pytest.approx(method.order, abs=0.15)
