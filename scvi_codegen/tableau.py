@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count as count_from
-from itertools import pairwise
+from itertools import count as count_from, zip_longest
+from itertools import pairwise, zip_longest
 from typing import Any, TypeAlias
 
 from scvi_codegen.basis import cardinal_integrals, matrix_product, transpose
@@ -284,7 +284,7 @@ def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
     for multiplicity in count_from(1):
         if len(rest) <= 1:
             return odd
-        pairs = [(a, b) for a, b in zip(other, derivative(rest), strict=True)]
+        pairs = list(zip_longest(other, derivative(rest), fillvalue=mp.zero))
         gap = trimmed([a - b for a, b in pairs], [abs(a) + abs(b) for a, b in pairs])
         factor = common_factor(rest, gap)
         if multiplicity % 2 == 1:

@@ -1,7 +1,7 @@
 """The README does what it says, from top to bottom, in a temporary folder with the examples in it.
 
-Blocks marked ``python`` run in one namespace. Blocks marked ``console`` or ``sh`` that begin with ``$ scvi-codegen`` run
-line by line, each line that begins with ``$ ``.
+Blocks marked ``python`` run in one namespace. Blocks marked ``console`` or ``sh`` that begin with ``$ scvi-codegen``
+run line by line, each line that begins with ``$ ``.
 """
 
 import os

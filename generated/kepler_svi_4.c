@@ -1,0 +1,953 @@
+/* Kepler problem: Galerkin spectral variational integrator, degree 4, gauss-legendre:4; see kepler_svi_4.h. */
+#include "kepler_svi_4.h"
+
+#include <float.h>
+#include <math.h>
+#include <string.h>
+
+enum {
+  M = 2, /* coordinates */
+  B = 4, /* blocks of M unknowns */
+  N = B * M,
+  MEMORY = 8, /* numbers kept from step to step */
+  SCRATCH = 6 /* slopes of the largest kernel, or the mass matrix with its slopes */
+};
+
+/* Everything a step is made from. */
+typedef struct {
+  double t, h;
+  const double *q0, *p0, *carry_q, *carry_p, *parameters;
+  double *scratch; /* SCRATCH numbers */
+} step_data;
+
+/* fmax and fmin without their care for NaN, and without a call. */
+static inline double larger(double a, double b)
+{
+  return a > b ? a : b;
+}
+
+static inline double smaller(double a, double b)
+{
+  return a < b ? a : b;
+}
+
+/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b] v0,
+ * the guess from the step before sum_c EXTRAPOLATION[b][c] z_c. */
+static const double END_POSITION[4] = {
+  0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684
+};
+
+static const double MOMENTUM_ROW[4] = {
+  0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684
+};
+
+static const double STRAIGHT[4] = {
+  1.0, 1.0, 1.0, 1.0
+};
+
+static const double EXTRAPOLATION[4][4] = {
+  {-0.3043475322896335, 1.0425440204501055, -1.929896390297009, 2.191699902136537},
+  {-1.956342611081263, 6.246427614654768, -9.46401244076669, 6.173927437193185},
+  {-7.352359801851611, 22.244205449220566, -29.80681363156252, 15.914967984193565},
+  {-14.971892910590412, 44.09613181879383, -55.9889724574008, 27.864733549197386}
+};
+
+
+/* Quadrature: 4 points.
+ * Gather tables have one column a block, scatter tables one column a row and a last one for p1. */
+static const double QUADRATURE_WEIGHT[4] = {
+  0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684
+};
+
+static const double QUADRATURE_GATHER_0[4][4] = {
+  {0.08696371128436353, -0.026604180084998763, 0.012627462689404734, -0.003555149685795733},
+  {0.18811811749986806, 0.16303628871563647, -0.027880428602470975, 0.006735500594538202},
+  {0.16719192197418886, 0.3539530060337439, 0.16303628871563647, -0.014190694931141223},
+  {0.17748257225452257, 0.3134451147418684, 0.3526767575162719, 0.08696371128436353}
+};
+
+static const double QUADRATURE_GATHER_1[4][4] = {
+  {1.0, 0.0, 0.0, 0.0},
+  {0.0, 1.0, 0.0, 0.0},
+  {0.0, 0.0, 1.0, 0.0},
+  {0.0, 0.0, 0.0, 1.0}
+};
+
+static const double QUADRATURE_SCATTER_0[4][5] = {
+  {0.08696371128436331, 0.3526767575162719, 0.3134451147418684, 0.17748257225452257, 1.0},
+  {-0.014190694931141223, 0.1630362887156367, 0.35395300603374413, 0.16719192197418864, 1.0},
+  {0.00673550059453798, -0.027880428602470753, 0.1630362887156367, 0.18811811749986806, 1.0},
+  {-0.003555149685795733, 0.012627462689404734, -0.026604180084998763, 0.08696371128436331, 1.0}
+};
+
+static const double QUADRATURE_SCATTER_1[4][5] = {
+  {-1.0, 0.0, 0.0, 0.0, 0.0},
+  {0.0, -1.0, 0.0, 0.0, 0.0},
+  {0.0, 0.0, -1.0, 0.0, 0.0},
+  {0.0, 0.0, 0.0, -1.0, 0.0}
+};
+
+static const int QUADRATURE_SLOPE_0[4][2] = { /* {i, j}: d value_i / d u_j */
+{0, 0}, {0, 1}, {1, 0}, {1, 1}
+};
+static const int QUADRATURE_SLOPE_1[2][2] = { /* {i, j}: d value_i / d u_j */
+{0, 0}, {1, 1}
+};
+
+/* 4 values; 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+static void quadrature_value(const double *u, const double *parameters, double *value)
+{
+  const double w0 = u[0]*u[0] + u[1]*u[1];
+  const double w1 = 1.0/w0;
+  const double w2 = parameters[0] * (w1*w1 * sqrt(w0));
+  value[0] = -(w2*u[0]);
+  value[1] = -(w2*u[1]);
+  value[2] = u[2];
+  value[3] = u[3];
+}
+
+/* 4 values, 6 slopes; 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
+static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
+{
+  const double w0 = u[0]*u[0];
+  const double w1 = u[1]*u[1];
+  const double w2 = w0 + w1;
+  const double w3 = sqrt(w2);
+  const double w4 = 1.0/w2;
+  const double w5 = w4*w4;
+  const double w6 = parameters[0] * (w5*w3);
+  const double w7 = w5*w4 * w3;
+  const double w8 = 3.0*parameters[0];
+  const double w9 = w8*w7 * u[0] * u[1];
+  value[0] = -(w6*u[0]);
+  value[1] = -(w6*u[1]);
+  value[2] = u[2];
+  value[3] = u[3];
+  slope[0] = -(w6 - w8*w0 * w7);
+  slope[1] = w9;
+  slope[2] = w9;
+  slope[3] = -(w6 - w8*w1 * w7);
+  slope[4] = 1.0;
+  slope[5] = 1.0;
+}
+
+/* 2 values, 2 slopes; constants. */
+static void legendre(const double *u, double *value, double *slope)
+{
+  value[0] = u[2];
+  value[1] = u[3];
+  slope[0] = 1.0;
+  slope[1] = 1.0;
+}
+
+/* 1 value; 8 *, 3 +, 1 /, 1 sqrt. */
+static void lagrangian(const double *u, const double *parameters, double *value)
+{
+  const double w0 = u[0]*u[0] + u[1]*u[1];
+  value[0] = 0.5 * (u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0] * (1.0/w0 * sqrt(w0)));
+}
+
+/* LU factors of the n x n matrix a, rows exchanged so that every pivot is the largest of its column. Returns 0 if one
+ * vanishes or is not a number; pivot[k] is the row exchanged with k. */
+static int factorise(double *a, int n, double *pivot)
+{
+  for (int k = 0; k < n; k++) {
+    int best = k;
+    for (int i = k + 1; i < n; i++)
+      if (fabs(a[i * n + k]) > fabs(a[best * n + k]))
+        best = i;
+    pivot[k] = (double)best;
+    if (!(fabs(a[best * n + k]) > 0.0))
+      return 0;
+    for (int j = 0; best != k && j < n; j++) {
+      const double exchanged = a[k * n + j];
+      a[k * n + j] = a[best * n + j];
+      a[best * n + j] = exchanged;
+    }
+    for (int i = k + 1; i < n; i++) {
+      const double factor = a[i * n + k] / a[k * n + k];
+      a[i * n + k] = factor;
+      if (factor != 0.0)
+        for (int j = k + 1; j < n; j++)
+          a[i * n + j] -= factor * a[k * n + j];
+    }
+  }
+  return 1;
+}
+
+/* x = a^-1 x with the factors of a. */
+static void back_substitute(const double *a, int n, const double *pivot, double *x)
+{
+  for (int k = 0; k < n; k++) {
+    const int best = (int)pivot[k];
+    const double exchanged = x[best];
+    x[best] = x[k];
+    x[k] = exchanged;
+  }
+  for (int i = 1; i < n; i++)
+    for (int j = 0; j < i; j++)
+      x[i] -= a[i * n + j] * x[j];
+  for (int i = n - 1; i >= 0; i--) {
+    for (int j = i + 1; j < n; j++)
+      x[i] -= a[i * n + j] * x[j];
+    x[i] /= a[i * n + i];
+  }
+}
+
+static const int MASS_ENTRY[2][2] = { /* {i, j}: d p_i / d v_j */
+{0, 0}, {1, 1}
+};
+
+static int all_finite(const double *x, int n)
+{
+  double sum = 0.0;
+  for (int i = 0; i < n; i++)
+    sum += 0.0 * x[i];
+  return sum == 0.0;
+}
+
+/* Momenta at u = (q, v), and the mass matrix dp/dv in the first M M numbers of scratch. */
+static void momentum_and_mass(double t, const double *u, const double *parameters, double *value, double *scratch)
+{
+  double *mass = scratch, *slope = scratch + M * M;
+  (void)t;
+  (void)parameters;
+  legendre(u, value, slope);
+  memset(mass, 0, sizeof(double) * (size_t)(M * M));
+  for (int e = 0; e < 2; e++)
+    mass[MASS_ENTRY[e][0] * M + MASS_ENTRY[e][1]] = slope[e];
+}
+
+static double largest_misfit(const double *value, const double *p)
+{
+  double largest = 0.0;
+  for (int i = 0; i < M; i++)
+    largest = fabs(value[i] - p[i]) > largest ? fabs(value[i] - p[i]) : largest;
+  return largest;
+}
+
+int kepler_svi_4_momentum(double t, const double *q, const double *v, const double *parameters, double *p,
+    double *workspace)
+{
+  double u[2 * M], value[M];
+  memcpy(u, q, sizeof(double) * M);
+  memcpy(u + M, v, sizeof(double) * M);
+  momentum_and_mass(t, u, parameters, value, workspace);
+  if (!all_finite(value, M))
+    return KEPLER_SVI_4_NOT_FINITE;
+  memcpy(p, value, sizeof(double) * M);
+  return KEPLER_SVI_4_OK;
+}
+
+/* Newton's iteration for L_v(q, v) = p from the velocity in u, halving updates that leave the domain or do not bring p
+ * nearer. */
+static int invert_momentum(double t, double *u, const double *p, const double *parameters, double *mass)
+{
+  double value[M], update[M], pivot[M], misfit;
+  momentum_and_mass(t, u, parameters, value, mass);
+  misfit = largest_misfit(value, p);
+  for (int k = 0; k < 50; k++) {
+    double scale = 1.0, nearer, start[M], largest = 0.0;
+    if (!all_finite(value, M) || !all_finite(mass, M * M))
+      return KEPLER_SVI_4_NOT_FINITE;
+    if (misfit == 0.0)
+      return KEPLER_SVI_4_OK;
+    if (!factorise(mass, M, pivot))
+      return KEPLER_SVI_4_SINGULAR;
+    for (int i = 0; i < M; i++)
+      update[i] = p[i] - value[i];
+    back_substitute(mass, M, pivot, update);
+    memcpy(start, u + M, sizeof(double) * M);
+    do {
+      for (int i = 0; i < M; i++)
+        u[M + i] = start[i] + scale * update[i];
+      momentum_and_mass(t, u, parameters, value, mass);
+      nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
+      scale *= 0.5;
+    } while (!(nearer < misfit) && scale > DBL_EPSILON);
+    for (int i = 0; i < M; i++)
+      largest = fabs(p[i]) > largest ? fabs(p[i]) : largest;
+    if (!(nearer < misfit)) { /* round-off: keep the better velocity */
+      memcpy(u + M, start, sizeof(double) * M);
+      return misfit <= 64.0 * DBL_EPSILON * largest ? KEPLER_SVI_4_OK : KEPLER_SVI_4_NOT_CONVERGED;
+    }
+    misfit = nearer;
+  }
+  return KEPLER_SVI_4_NOT_CONVERGED;
+}
+
+int kepler_svi_4_velocity(double t, const double *q, const double *p, const double *parameters, double *v,
+    double *workspace)
+{
+  int status = KEPLER_SVI_4_SINGULAR;
+  for (int attempt = 0; attempt < 3; attempt++) { /* from rest, from v = p, from v = 1 */
+    double u[2 * M];
+    for (int i = 0; i < M; i++) {
+      u[i] = q[i];
+      u[M + i] = attempt == 0 ? 0.0 : attempt == 1 ? p[i] : 1.0;
+    }
+    status = invert_momentum(t, u, p, parameters, workspace);
+    if (status == KEPLER_SVI_4_OK) {
+      memcpy(v, u + M, sizeof(double) * M);
+      return status;
+    }
+  }
+  return status;
+}
+
+int kepler_svi_4_energy(double t, const double *q, const double *p, const double *parameters, double *energy,
+    double *workspace)
+{
+  double u[2 * M], value[1], sum;
+  const int status = kepler_svi_4_velocity(t, q, p, parameters, u + M, workspace);
+  if (status != KEPLER_SVI_4_OK)
+    return status;
+  memcpy(u, q, sizeof(double) * M);
+  lagrangian(u, parameters, value);
+  sum = -value[0];
+  for (int i = 0; i < M; i++)
+    sum += p[i] * u[M + i];
+  if (!all_finite(&sum, 1))
+    return KEPLER_SVI_4_NOT_FINITE;
+  *energy = sum;
+  return KEPLER_SVI_4_OK;
+}
+
+int kepler_svi_4_energies(long long count, const double *t, const double *q, const double *p, const double *parameters,
+    double *energy, double *workspace)
+{
+  for (long long k = 0; k < count; k++) {
+    const int status = kepler_svi_4_energy(t[k], q + k * M, p + k * M, parameters, energy + k, workspace);
+    if (status != KEPLER_SVI_4_OK)
+      return status;
+  }
+  return KEPLER_SVI_4_OK;
+}
+
+/* u = scale sum_b row[b] z_b, M numbers. */
+static void gather(const double *row, double scale, const double *z, double *u)
+{
+  for (int i = 0; i < M; i++) {
+    double sum = 0.0;
+    for (int b = 0; b < B; b++)
+      sum += row[b] * z[b * M + i];
+    u[i] = scale * sum;
+  }
+}
+
+/* u = q0 + u, with what rounding cut off q0 before. */
+static void offset(const step_data *step, double *u)
+{
+  for (int i = 0; i < M; i++)
+    u[i] = step->q0[i] + (step->carry_q[i] + u[i]);
+}
+
+/* rows_r += scale row[r] value; the last row is p1, whose terms are also summed without sign into size. */
+static void scatter(const double *row, double scale, const double *value, double *rows, double *size)
+{
+  for (int r = 0; r <= B; r++)
+    for (int i = 0; i < M; i++)
+      rows[r * M + i] += row[r] * (scale * value[i]);
+  for (int i = 0; i < M; i++)
+    size[i] += fabs(row[B] * (scale * value[i]));
+}
+
+/* Adds scale row[r] slope_e column[b] to the Jacobian entry of row (r, i_e) and column (b, j_e). */
+static void scatter_slope(const double *row, const double *column, double scale, const int (*entry)[2], int count,
+    const double *slope, double *jacobian, int stride)
+{
+  for (int r = 0; r < B; r++) {
+    for (int b = 0; b < B; b++) {
+      const double factor = scale * row[r] * column[b];
+      double *block = jacobian + (r * M) * stride + b * M;
+      if (factor != 0.0)
+        for (int e = 0; e < count; e++)
+          block[entry[e][0] * stride + entry[e][1]] += factor * slope[e];
+    }
+  }
+}
+
+/* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */
+static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian, int stride)
+{
+  const double h = step->h;
+  for (int n = 0; n < 4; n++) {
+    double u[4], value[4];
+    gather(QUADRATURE_GATHER_0[n], h, z, u + 0);
+    offset(step, u + 0);
+    gather(QUADRATURE_GATHER_1[n], 1.0, z, u + 2);
+    if (jacobian) {
+      double *slope = step->scratch;
+      quadrature_slope(u, step->parameters, value, slope);
+      scatter_slope(QUADRATURE_SCATTER_0[n], QUADRATURE_GATHER_0[n], QUADRATURE_WEIGHT[n] * h*h,
+          QUADRATURE_SLOPE_0, 4, slope + 0, jacobian, stride);
+      scatter_slope(QUADRATURE_SCATTER_1[n], QUADRATURE_GATHER_1[n], QUADRATURE_WEIGHT[n] * 1.0,
+          QUADRATURE_SLOPE_1, 2, slope + 4, jacobian, stride);
+    } else {
+      quadrature_value(u, step->parameters, value);
+    }
+    scatter(QUADRATURE_SCATTER_0[n], QUADRATURE_WEIGHT[n] * h, value + 0, rows, size);
+    scatter(QUADRATURE_SCATTER_1[n], QUADRATURE_WEIGHT[n] * 1.0, value + 2, rows, size);
+  }
+}
+
+/* The stage equations: rows (B M residuals, then p1 - p0), the sizes of p1 and q1 before cancellation, the Jacobian. */
+static void evaluate(const step_data *step, const double *z, double *rows, double *size_p, double *size_q,
+    double *jacobian, int stride)
+{
+  for (int r = 0; r < B; r++)
+    for (int i = 0; i < M; i++)
+      rows[r * M + i] = MOMENTUM_ROW[r] * step->p0[i];
+  for (int i = 0; i < M; i++) {
+    rows[N + i] = 0.0;
+    size_p[i] = fabs(step->p0[i]);
+    size_q[i] = fabs(step->q0[i]);
+    for (int b = 0; b < B; b++)
+      size_q[i] += fabs(step->h * END_POSITION[b] * z[b * M + i]);
+  }
+  if (jacobian)
+    memset(jacobian, 0, sizeof(double) * (size_t)(stride * stride));
+  add_quadrature(step, z, rows, size_p, jacobian, stride);
+}
+
+/* How far the last update moved the stages and the end momentum: the largest ratio to its own size, the ratio of the
+ * largest to the largest size, and the largest itself. */
+typedef struct {
+  double relative, overall, absolute;
+} movement;
+
+static movement no_movement(void)
+{
+  const movement none = {0.0, 0.0, 0.0};
+  return none;
+}
+
+static void measure(movement *moved, const double *change, const double *size)
+{
+  double largest_change = 0.0, largest_size = 0.0;
+  for (int i = 0; i < M; i++) {
+    const double ratio = change[i] != 0.0 ? fabs(change[i]) / size[i] : 0.0;
+    moved->relative = larger(moved->relative, ratio);
+    largest_change = larger(largest_change, fabs(change[i]));
+    largest_size = larger(largest_size, size[i]);
+  }
+  if (largest_change > moved->overall * largest_size)
+    moved->overall = largest_change / largest_size;
+  moved->absolute = larger(moved->absolute, largest_change);
+}
+
+static void measure_stages(movement *moved, const step_data *step, const double *update, const double *size_q)
+{
+  double change[M];
+  for (int i = 0; i < M; i++) {
+    change[i] = 0.0;
+    for (int b = 0; b < B; b++)
+      change[i] = larger(change[i], fabs(step->h * update[b * M + i]));
+  }
+  measure(moved, change, size_q);
+}
+
+static void measure_momentum(movement *moved, const double *increment, const double *last_increment,
+    const double *size_p)
+{
+  double change[M];
+  for (int i = 0; i < M; i++)
+    change[i] = increment[i] - last_increment[i];
+  measure(moved, change, size_p);
+}
+
+/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
+ * longer shrinking. */
+static int has_converged(const kepler_svi_4_options *options, const movement *moved, double last)
+{
+  if (options->absolute)
+    return moved->absolute < options->tolerance;
+  return moved->relative <= options->tolerance
+      || (moved->overall <= 1e-11 && moved->relative >= 0.25 * last);
+}
+
+/* The rows q0 + h sum_b beta_b z_b = q1 behind the stage equations, with p0 as further unknown. */
+static void add_boundary(const step_data *step, const double *z, const double *q1, double *rows, double *jacobian)
+{
+  for (int i = 0; i < M; i++) {
+    rows[N + i] = -(q1[i] - step->q0[i]) / step->h;
+    for (int b = 0; b < B; b++)
+      rows[N + i] += END_POSITION[b] * z[b * M + i];
+  }
+  if (jacobian)
+    for (int b = 0; b < B; b++)
+      for (int i = 0; i < M; i++) {
+        jacobian[(b * M + i) * (N + M) + N + i] = MOMENTUM_ROW[b];
+        jacobian[(N + i) * (N + M) + b * M + i] = END_POSITION[b];
+      }
+}
+
+/* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. Once the
+ * updates are small the factors are kept. With an end position q1, p0 is unknown too and found in place. */
+static int newton(const step_data *step, double *z, const double *q1, double *p0, double *increment,
+    const kepler_svi_4_options *options, kepler_svi_4_report *report, double *workspace)
+{
+  const int size = q1 ? N + M : N;
+  double *jacobian = workspace, *update = jacobian + size * size, *pivot = update + size, *rows = pivot + size;
+  double size_q[M], size_p[M], last_increment[M], last = INFINITY;
+  movement moved = no_movement();
+  int keep = 0;
+  for (int k = 0;; k++) {
+    evaluate(step, z, rows, size_p, size_q, keep ? NULL : jacobian, size);
+    memcpy(last_increment, increment, sizeof(double) * M);
+    memcpy(increment, rows + N, sizeof(double) * M);
+    if (q1)
+      add_boundary(step, z, q1, rows, keep ? NULL : jacobian);
+    if (!all_finite(rows, size) || !all_finite(increment, M))
+      return KEPLER_SVI_4_NOT_FINITE;
+    if (k > 0) {
+      measure_momentum(&moved, increment, last_increment, size_p);
+      report->change = options->absolute ? moved.absolute : moved.relative;
+      if (has_converged(options, &moved, last))
+        return KEPLER_SVI_4_OK;
+      last = moved.relative;
+    }
+    if (k >= options->max_iterations)
+      return KEPLER_SVI_4_NOT_CONVERGED;
+    if (!keep && !factorise(jacobian, size, pivot))
+      return KEPLER_SVI_4_SINGULAR;
+    memcpy(update, rows, sizeof(double) * (size_t)size);
+    back_substitute(jacobian, size, pivot, update);
+    for (int i = 0; i < N; i++)
+      z[i] -= update[i];
+    moved = no_movement();
+    measure_stages(&moved, step, update, size_q);
+    for (int i = 0; q1 && i < M; i++)
+      p0[i] -= update[N + i];
+    if (q1)
+      measure(&moved, update + N, size_p);
+    keep = moved.overall < 1e-05 && moved.relative < 0.1 * last;
+    report->iterations++;
+  }
+}
+
+#ifdef __GNUC__
+/* Vectors of points. GCC and Clang map them to whatever the processor has; other compilers have Newton's iteration only. */
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
+#endif
+
+enum { LANES = 4 };
+typedef double lanes __attribute__((vector_size(8 * 4)));
+typedef union {
+  lanes all;
+  double lane[LANES];
+} lane_view;
+
+/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 4 repeat it. */
+static const lanes POINT_ABSCISSA = {0.06943184420297373, 0.33000947820757165, 0.6699905217924279, 0.9305681557970265};
+static const lanes POINT_POSITION[4] = {
+  {0.5000000000000004, 1.0815897500322804, 0.961274073432115, 1.0204404206840407},
+  {-0.08158975003227997, 0.49999999999999956, 1.0855037514105188, 0.9612740734321141},
+  {0.03872592656788587, -0.08550375141051969, 0.49999999999999956, 1.08158975003228},
+  {-0.020440420684040728, 0.03872592656788587, -0.08158975003228042, 0.5000000000000004}
+};
+static const lanes POINT_POSITION_WEIGHT = {0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684};
+static const lanes POINT_MOMENTUM[4] = {
+  {0.49999999999999956, 1.08158975003228, 0.9612740734321141, 1.0204404206840407},
+  {-0.08158975003228042, 0.5000000000000004, 1.0855037514105197, 0.9612740734321141},
+  {0.03872592656788498, -0.0855037514105188, 0.5000000000000004, 1.0815897500322804},
+  {-0.020440420684040728, 0.03872592656788587, -0.08158975003227997, 0.49999999999999956}
+};
+static const lanes POINT_MOMENTUM_WEIGHT = {0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684};
+static const lanes POINT_END_POSITION = {1.0, 1.0, 1.0, 1.0};
+static const lanes POINT_END_MOMENTUM = {1.0, 1.0, 1.0, 1.0};
+static const lanes POINT_PRODUCT[4] = {
+  {0.004038191450846721, 0.04356358090239619, 0.1058643526335763, 0.14879849619263774},
+  {-0.003295860944944712, 0.013818951406296064, 0.10651836096505306, 0.19847049885237736},
+  {0.002644782952066832, -0.004340134194435029, 0.013818951406296128, 0.0816713597958777},
+  {-0.000976722963255885, 0.0014107297391595358, -0.001758015359080553, 0.004038191450846721}
+};
+static const lanes POINT_EXTRAPOLATION[4] = {
+  {-0.3043475322896335, -1.956342611081263, -7.352359801851611, -14.971892910590412},
+  {1.0425440204501055, 6.246427614654768, 22.244205449220566, 44.09613181879383},
+  {-1.929896390297009, -9.46401244076669, -29.80681363156252, -55.9889724574008},
+  {2.191699902136537, 6.173927437193185, 15.914967984193565, 27.864733549197386}
+};
+
+static inline lanes lanes_of(double x)
+{
+  const lanes zero = {0.0};
+  return zero + x;
+}
+
+/* sum_j table[j] x_j, in four sums that do not wait for each other. */
+static inline lanes lanes_apply(const lanes *table, lanes x)
+{
+  const lane_view view = {x};
+  lanes a = table[0] * view.lane[0];
+  for (int j = 1; j < LANES; j++)
+    a += table[j] * view.lane[j];
+  return a;
+}
+
+static inline double lanes_total(lanes x)
+{
+  lane_view view = {x};
+  for (int half = LANES / 2; half > 0; half /= 2)
+    for (int j = 0; j < half; j++)
+      view.lane[j] += view.lane[j + half];
+  return view.lane[0];
+}
+
+static inline void lanes_load(const double *memory, lanes *x)
+{
+  memcpy(x, memory, sizeof(double) * M * LANES);
+}
+
+static inline void lanes_store(const lanes *x, double *memory)
+{
+  memcpy(memory, x, sizeof(double) * M * LANES);
+}
+
+static inline lanes lanes_sqrt(lanes x)
+{
+  lane_view view = {x};
+  for (int j = 0; j < LANES; j++)
+    view.lane[j] = sqrt(view.lane[j]);
+  return view.all;
+}
+
+/* 7 *, 1 +, 1 /, 2 neg, 1 sqrt, at all points. */
+static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
+{
+  const lanes w0 = u[0]*u[0] + u[1]*u[1];
+  const lanes w1 = 1.0/w0;
+  const lanes w2 = parameters[0] * (w1*w1 * lanes_sqrt(w0));
+  value[0] = -(w2*u[0]);
+  value[1] = -(w2*u[1]);
+}
+
+/* The constant masses. */
+static void mass(double *value)
+{
+  value[0] = 1.0;
+  value[1] = 1.0;
+}
+
+/* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */
+typedef struct {
+  lanes position_weight, momentum_weight; /* h beta, h w: the same rounded numbers everywhere */
+  lanes abscissa, product[LANES]; /* h c, h^2 (a A) */
+  double inverse_mass[M];
+} sweep_data;
+
+static void prepare_sweep(const step_data *step, sweep_data *sweep)
+{
+  const double h = step->h;
+  sweep->position_weight = h * POINT_POSITION_WEIGHT;
+  sweep->momentum_weight = h * POINT_MOMENTUM_WEIGHT;
+  sweep->abscissa = h * POINT_ABSCISSA;
+  for (int j = 0; j < LANES; j++)
+    sweep->product[j] = h * (h * POINT_PRODUCT[j]);
+  mass(sweep->inverse_mass);
+  for (int i = 0; i < M; i++)
+    sweep->inverse_mass[i] = 1.0 / sweep->inverse_mass[i];
+}
+
+/* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
+ * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
+ * contracts too slowly or not at all. */
+static int sweep_status(double change, double last, const kepler_svi_4_options *options, int k)
+{
+  const double ratio = smaller(larger(change / last, 1e-6), 0.25); /* squares, too */
+  const double expected = options->absolute ? change : 4.0 * ratio * change * ratio;
+  if (!(change < INFINITY))
+    return -1;
+  if (change == 0.0)
+    return 1;
+  if (k > 0 && expected <= options->tolerance * options->tolerance)
+    return 1;
+  if (k > 1 && change >= last * 0.0625 && change < 1e-25)
+    return 1;
+  if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
+    return -1;
+  return 0;
+}
+
+/* One step of a separable system. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; a last sweep in the
+ * two-table form, whose rounding keeps a generating function, gives the increments. The forces stay in memory. */
+static int sweep(const step_data *step, const sweep_data *data, double *memory, int guess, double *dq, double *dp,
+    const kepler_svi_4_options *options, kepler_svi_4_report *report)
+{
+  lanes X[M], base[M], F[M];
+  double inverse_size[M], last = INFINITY, largest = 0.0;
+  int status = 0;
+  for (int i = 0; i < M; i++) {
+    const double v = data->inverse_mass[i] * step->p0[i];
+    base[i] = step->q0[i] + (data->abscissa * v + step->carry_q[i]);
+    inverse_size[i] = fabs(step->q0[i]) + fabs(step->h * v);
+    largest = larger(largest, inverse_size[i]);
+    X[i] = base[i];
+  }
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = options->absolute ? 1.0 : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
+  if (guess) {
+    lanes_load(memory, F);
+    for (int i = 0; i < M; i++) {
+      F[i] = lanes_apply(POINT_EXTRAPOLATION, F[i]);
+      X[i] = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
+    }
+  }
+  force_lanes(X, step->parameters, F);
+  for (int k = 0; status == 0; k++) {
+    lanes change = lanes_of(0.0);
+    double total;
+    for (int i = 0; i < M; i++) {
+      const lanes x = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
+      const lanes moved = (x - X[i]) * inverse_size[i];
+      change += moved * moved;
+      X[i] = x;
+    }
+    force_lanes(X, step->parameters, F);
+    total = lanes_total(change);
+    status = sweep_status(total, last, options, k + guess);
+    last = total;
+    report->iterations++;
+  }
+  report->change = sqrt(last);
+  if (status < 0)
+    return last < INFINITY ? KEPLER_SVI_4_NOT_CONVERGED : KEPLER_SVI_4_NOT_FINITE;
+  for (int i = 0; i < M; i++) {
+    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, data->momentum_weight * F[i]));
+    X[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, data->position_weight * (P * data->inverse_mass[i])));
+  }
+  force_lanes(X, step->parameters, F);
+  for (int i = 0; i < M; i++) {
+    const lanes impulse = data->momentum_weight * F[i];
+    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, impulse));
+    dq[i] = lanes_total(POINT_END_POSITION * (data->position_weight * (P * data->inverse_mass[i])));
+    dp[i] = lanes_total(POINT_END_MOMENTUM * impulse);
+  }
+  if (!all_finite(dq, M) || !all_finite(dp, M))
+    return KEPLER_SVI_4_NOT_FINITE;
+  lanes_store(F, memory);
+  return KEPLER_SVI_4_OK;
+}
+#endif
+
+kepler_svi_4_options kepler_svi_4_default_options(void)
+{
+  const kepler_svi_4_options options = {2.220446049250313e-16, 50, 0};
+  return options;
+}
+
+/* The guess that q moves on a straight line with its initial velocity. */
+static int guess_straight(const step_data *step, double *z)
+{
+  double v[M];
+  const int status = kepler_svi_4_velocity(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
+  for (int b = 0; status == KEPLER_SVI_4_OK && b < B; b++)
+    for (int i = 0; i < M; i++)
+      z[b * M + i] = STRAIGHT[b] * v[i];
+  return status;
+}
+
+/* The guess that the curve of the step before goes on. */
+static void guess_extrapolated(const double *memory, double *z)
+{
+  for (int b = 0; b < B; b++)
+    gather(EXTRAPOLATION[b], 1.0, memory, z + b * M);
+}
+
+/* The increments by Newton's iteration, from the extrapolated guess if there is one, and from the straight line if there
+ * is none or it leads nowhere. */
+static int solve_newton(const step_data *step, double *memory, int guess, double *dq, double *dp,
+    const kepler_svi_4_options *options, kepler_svi_4_report *report, double *workspace)
+{
+  double *z = workspace;
+  int status = KEPLER_SVI_4_NOT_CONVERGED;
+  if (guess) {
+    guess_extrapolated(memory, z);
+    status = newton(step, z, NULL, NULL, dp, options, report, z + N);
+  }
+  if (status != KEPLER_SVI_4_OK) {
+    status = guess_straight(step, z);
+    if (status == KEPLER_SVI_4_OK)
+      status = newton(step, z, NULL, NULL, dp, options, report, z + N);
+  }
+  if (status == KEPLER_SVI_4_OK) {
+    gather(END_POSITION, step->h, z, dq);
+    memcpy(memory, z, sizeof(double) * N);
+  }
+  return status;
+}
+#ifdef __GNUC__
+typedef sweep_data solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  prepare_sweep(step, data);
+}
+
+/* The increments by sweeps, from the extrapolated guess and then from the straight line, else by Newton's iteration. On success
+ * guess says whether memory can be extrapolated. */
+static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const kepler_svi_4_options *options, kepler_svi_4_report *report, double *workspace)
+{
+  int status = sweep(step, data, memory, *guess != 0, dq, dp, options, report), swept = 1;
+  if (status != KEPLER_SVI_4_OK && *guess)
+    status = sweep(step, data, memory, 0, dq, dp, options, report);
+  if (status != KEPLER_SVI_4_OK) {
+    status = solve_newton(step, workspace, 0, dq, dp, options, report, workspace + MEMORY);
+    swept = 0;
+  }
+  if (status == KEPLER_SVI_4_OK)
+    *guess = swept;
+  return status;
+}
+#else
+typedef struct {
+  int unused;
+} solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  (void)step;
+  data->unused = 0;
+}
+
+static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const kepler_svi_4_options *options, kepler_svi_4_report *report, double *workspace)
+{
+  const int status = solve_newton(step, memory, *guess != 0, dq, dp, options, report, workspace + MEMORY);
+  (void)data;
+  if (status == KEPLER_SVI_4_OK)
+    *guess = 1;
+  return status;
+}
+#endif
+
+int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, const double *parameters,
+    const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace)
+{
+  const kepler_svi_4_options standard = kepler_svi_4_default_options();
+  const double nothing[M] = {0.0};
+  const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace};
+  kepler_svi_4_report unread;
+  solver_data data;
+  double *memory = workspace + SCRATCH, dq[M], dp[M];
+  long long guess = 0;
+  int status;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  report->t = t;
+  prepare(&step, &data);
+  status = solve(&step, &data, memory, &guess, dq, dp, options ? options : &standard, report, memory + MEMORY);
+  if (status != KEPLER_SVI_4_OK)
+    return status;
+  report->steps = 1;
+  for (int i = 0; i < M; i++) {
+    q1[i] = q0[i] + dq[i];
+    p1[i] = p0[i] + dp[i];
+  }
+  return KEPLER_SVI_4_OK;
+}
+
+void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p)
+{
+  memset(run, 0, sizeof *run);
+  run->t0 = t;
+  run->h = h;
+  memcpy(run->q, q, sizeof(double) * M);
+  memcpy(run->p, p, sizeof(double) * M);
+}
+
+/* x += increment, with what rounding cuts off in carry (Kahan). */
+static void add_compensated(double *x, double *carry, const double *increment)
+{
+  for (int i = 0; i < M; i++) {
+    const double term = increment[i] + carry[i], sum = x[i] + term;
+    carry[i] = term - (sum - x[i]);
+    x[i] = sum;
+  }
+}
+
+int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
+    const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations,
+    kepler_svi_4_report *report, double *workspace)
+{
+  const kepler_svi_4_options standard = kepler_svi_4_default_options();
+  step_data step = {run->t0, run->h, run->q, run->p, run->carry_q, run->carry_p, parameters, workspace};
+  kepler_svi_4_report unread;
+  solver_data data;
+  long long stored = 0;
+  double dq[M], dp[M];
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  prepare(&step, &data);
+  for (long long k = 0; k < steps; k++) {
+    const long long before = report->iterations;
+    int status;
+    report->t = step.t = run->t0 + (double)run->step * run->h;
+    status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
+        workspace + SCRATCH);
+    if (status != KEPLER_SVI_4_OK)
+      return status;
+    add_compensated(run->q, run->carry_q, dq);
+    add_compensated(run->p, run->carry_p, dp);
+    run->iterations += report->iterations - before;
+    run->step++;
+    report->steps++;
+    if (run->step % every == 0) {
+      t[stored] = run->t0 + (double)run->step * run->h;
+      memcpy(q + stored * M, run->q, sizeof(double) * M);
+      memcpy(p + stored * M, run->p, sizeof(double) * M);
+      iterations[stored] = (int)run->iterations;
+      run->iterations = 0;
+      stored++;
+    }
+  }
+  return KEPLER_SVI_4_OK;
+}
+
+/* h sum_n w_n L along the curve given by z. */
+static double action_sum(const step_data *step, const double *z)
+{
+  const double h = step->h;
+  double sum = 0.0;
+  for (int n = 0; n < 4; n++) {
+    double u[2 * M], value[1];
+    gather(QUADRATURE_GATHER_0[n], h, z, u + 0);
+    offset(step, u + 0);
+    gather(QUADRATURE_GATHER_1[n], 1.0, z, u + 2);
+    lagrangian(u, step->parameters, value);
+    sum += QUADRATURE_WEIGHT[n] * value[0];
+  }
+  return h * sum;
+}
+
+int kepler_svi_4_discrete_legendre(double t, double h, const double *q0, const double *q1, const double *parameters,
+    const kepler_svi_4_options *options, double *p0, double *p1, double *action, kepler_svi_4_report *report,
+    double *workspace)
+{
+  const kepler_svi_4_options standard = kepler_svi_4_default_options();
+  const double carry_q[M] = {0.0};
+  kepler_svi_4_report unread;
+  double *z = workspace + SCRATCH, v[M], start_p[M], increment[M];
+  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace};
+  int status;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  for (int i = 0; i < M; i++) {
+    v[i] = (q1[i] - q0[i]) / h;
+    for (int b = 0; b < B; b++)
+      z[b * M + i] = STRAIGHT[b] * v[i];
+  }
+  status = kepler_svi_4_momentum(t, q0, v, parameters, start_p, workspace);
+  if (status == KEPLER_SVI_4_OK)
+    status = newton(&step, z, q1, start_p, increment, options ? options : &standard, report, z + N);
+  if (status != KEPLER_SVI_4_OK)
+    return status;
+  for (int i = 0; i < M; i++) {
+    p0[i] = start_p[i];
+    p1[i] = start_p[i] + increment[i];
+  }
+  *action = action_sum(&step, z);
+  return KEPLER_SVI_4_OK;
+}
