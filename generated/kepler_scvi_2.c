@@ -76,10 +76,11 @@ static const double QUADRATURE_SCATTER_1[2][6] = {
 };
 
 static const int QUADRATURE_SLOPE_0[4][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {0, 1}, {1, 0}, {1, 1}
+  {0, 0}, {0, 1}, {1, 0}, {1, 1}
 };
+
 static const int QUADRATURE_SLOPE_1[2][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {1, 1}
+  {0, 0}, {1, 1}
 };
 
 /* Node: 2 points.
@@ -125,34 +126,38 @@ static const double NODE_SCATTER_3[2][6] = {
 };
 
 static const int NODE_SLOPE_0[4][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {0, 1}, {1, 0}, {1, 1}
-};
-static const int NODE_SLOPE_1[4][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {0, 1}, {1, 0}, {1, 1}
-};
-static const int NODE_SLOPE_2[2][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {1, 1}
-};
-static const int NODE_SLOPE_3[4][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {0, 1}, {1, 0}, {1, 1}
-};
-static const int NODE_SLOPE_4[2][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {1, 1}
+  {0, 0}, {0, 1}, {1, 0}, {1, 1}
 };
 
-/* 4 values; 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+static const int NODE_SLOPE_1[4][2] = { /* {i, j}: d value_i / d u_j */
+  {0, 0}, {0, 1}, {1, 0}, {1, 1}
+};
+
+static const int NODE_SLOPE_2[2][2] = { /* {i, j}: d value_i / d u_j */
+  {0, 0}, {1, 1}
+};
+
+static const int NODE_SLOPE_3[4][2] = { /* {i, j}: d value_i / d u_j */
+  {0, 0}, {0, 1}, {1, 0}, {1, 1}
+};
+
+static const int NODE_SLOPE_4[2][2] = { /* {i, j}: d value_i / d u_j */
+  {0, 0}, {1, 1}
+};
+
+/* L_q and L_v at u = (q, v). Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
   const double w0 = u[0]*u[0] + u[1]*u[1];
   const double w1 = 1.0/w0;
-  const double w2 = parameters[0] * (w1*w1 * sqrt(w0));
+  const double w2 = parameters[0]*(w1*w1*sqrt(w0));
   value[0] = -(w2*u[0]);
   value[1] = -(w2*u[1]);
   value[2] = u[2];
   value[3] = u[3];
 }
 
-/* 4 values, 6 slopes; 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
+/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = u[0]*u[0];
@@ -161,23 +166,23 @@ static void quadrature_slope(const double *u, const double *parameters, double *
   const double w3 = sqrt(w2);
   const double w4 = 1.0/w2;
   const double w5 = w4*w4;
-  const double w6 = parameters[0] * (w5*w3);
-  const double w7 = w5*w4 * w3;
+  const double w6 = parameters[0]*(w5*w3);
+  const double w7 = w5*w4*w3;
   const double w8 = 3.0*parameters[0];
-  const double w9 = w8*w7 * u[0] * u[1];
+  const double w9 = w8*w7*u[0]*u[1];
   value[0] = -(w6*u[0]);
   value[1] = -(w6*u[1]);
   value[2] = u[2];
   value[3] = u[3];
-  slope[0] = -(w6 - w8*w0 * w7);
+  slope[0] = -(w6 - w8*w0*w7);
   slope[1] = w9;
   slope[2] = w9;
-  slope[3] = -(w6 - w8*w1 * w7);
+  slope[3] = -(w6 - w8*w1*w7);
   slope[4] = 1.0;
   slope[5] = 1.0;
 }
 
-/* 8 values; 25 *, 3 +, 4 -, 1 /, 1 sqrt. */
+/* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 25 *, 3 +, 4 -, 1 /, 1 sqrt. */
 static void node_value(const double *u, const double *parameters, double *value)
 {
   const double w0 = u[0]*u[0];
@@ -186,12 +191,12 @@ static void node_value(const double *u, const double *parameters, double *value)
   const double w3 = sqrt(w2);
   const double w4 = 1.0/w2;
   const double w5 = w4*w4;
-  const double w6 = parameters[0] * (w5*w3);
-  const double w7 = w5*w4 * w3;
+  const double w6 = parameters[0]*(w5*w3);
+  const double w7 = w5*w4*w3;
   const double w8 = 3.0*parameters[0];
   const double w9 = w8*w7;
-  value[0] = w6*u[6] - w8*w0 * w7 * u[6] - w9*u[0] * u[1] * u[7];
-  value[1] = w6*u[7] - w8*w1 * w7 * u[7] - w9*u[6] * u[0] * u[1];
+  value[0] = w6*u[6] - w8*w0*w7*u[6] - w9*u[0]*u[1]*u[7];
+  value[1] = w6*u[7] - w8*w1*w7*u[7] - w9*u[6]*u[0]*u[1];
   value[2] = 0.0;
   value[3] = 0.0;
   value[4] = u[6];
@@ -200,7 +205,7 @@ static void node_value(const double *u, const double *parameters, double *value)
   value[7] = w6*u[1] + u[5];
 }
 
-/* 8 values, 16 slopes; 61 *, 6 +, 12 -, 1 /, 1 neg, 1 sqrt. */
+/* The same, and the non-zero derivatives with respect to u = (q, v, a, lambda). Operations: 61 *, 6 +, 12 -, 1 /, 1 neg, 1 sqrt. */
 static void node_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = u[0]*u[0];
@@ -209,21 +214,21 @@ static void node_slope(const double *u, const double *parameters, double *value,
   const double w3 = sqrt(w2);
   const double w4 = 1.0/w2;
   const double w5 = w4*w4;
-  const double w6 = parameters[0] * (w5*w3);
-  const double w7 = w5*w4 * w3;
+  const double w6 = parameters[0]*(w5*w3);
+  const double w7 = w5*w4*w3;
   const double w8 = parameters[0]*w7;
   const double w9 = 3.0*parameters[0];
-  const double w10 = w9*w0 * w7;
+  const double w10 = w9*w0*w7;
   const double w11 = w9*w7;
-  const double w12 = w11*u[0] * u[1];
+  const double w12 = w11*u[0]*u[1];
   const double w13 = w8*u[6];
-  const double w14 = w9*w1 * w7;
-  const double w15 = w11*u[6] * u[0];
-  const double w16 = w5*w5 * w3;
+  const double w14 = w9*w1*w7;
+  const double w15 = w11*u[6]*u[0];
+  const double w16 = w5*w5*w3;
   const double w17 = 5.0*parameters[0];
-  const double w18 = w17*w0 * w16;
-  const double w19 = w17*w1 * w16;
-  const double w20 = (-3.0) * (w8*u[0] * u[7] + w13*u[1] - w19*u[0] * u[7] - w18*u[6] * u[1]);
+  const double w18 = w17*w0*w16;
+  const double w19 = w17*w1*w16;
+  const double w20 = (-3.0)*(w8*u[0]*u[7] + w13*u[1] - w19*u[0]*u[7] - w18*u[6]*u[1]);
   const double w21 = w6 - w10;
   const double w22 = -w12;
   const double w23 = w6 - w14;
@@ -235,10 +240,10 @@ static void node_slope(const double *u, const double *parameters, double *value,
   value[5] = u[7];
   value[6] = w6*u[0] + u[4];
   value[7] = w6*u[1] + u[5];
-  slope[0] = (-3.0) * (w15 + w8*u[1] * u[7] - w17 * (w0*u[0]) * w16 * u[6] - w18*u[1] * u[7]);
+  slope[0] = (-3.0)*(w15 + w8*u[1]*u[7] - w17*(w0*u[0])*w16*u[6] - w18*u[1]*u[7]);
   slope[1] = w20;
   slope[2] = w20;
-  slope[3] = (-3.0) * (w13*u[0] + w11*u[1] * u[7] - w17*w16 * (w1*u[1]) * u[7] - w19*u[6] * u[0]);
+  slope[3] = (-3.0)*(w13*u[0] + w11*u[1]*u[7] - w17*w16*(w1*u[1])*u[7] - w19*u[6]*u[0]);
   slope[4] = w21;
   slope[5] = w22;
   slope[6] = w22;
@@ -253,7 +258,7 @@ static void node_slope(const double *u, const double *parameters, double *value,
   slope[15] = 1.0;
 }
 
-/* 2 values, 2 slopes; constants. */
+/* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
 static void legendre(const double *u, double *value, double *slope)
 {
   value[0] = u[2];
@@ -262,11 +267,11 @@ static void legendre(const double *u, double *value, double *slope)
   slope[1] = 1.0;
 }
 
-/* 1 value; 8 *, 3 +, 1 /, 1 sqrt. */
+/* L at u = (q, v). Operations: 8 *, 3 +, 1 /, 1 sqrt. */
 static void lagrangian(const double *u, const double *parameters, double *value)
 {
   const double w0 = u[0]*u[0] + u[1]*u[1];
-  value[0] = 0.5 * (u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0] * (1.0/w0 * sqrt(w0)));
+  value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*(1.0/w0*sqrt(w0)));
 }
 
 /* LU factors of the n x n matrix a, rows exchanged so that every pivot is the largest of its column. Returns 0 if one
@@ -317,9 +322,10 @@ static void back_substitute(const double *a, int n, const double *pivot, double 
 }
 
 static const int MASS_ENTRY[2][2] = { /* {i, j}: d p_i / d v_j */
-{0, 0}, {1, 1}
+  {0, 0}, {1, 1}
 };
 
+/* Whether no x is an infinity or a NaN. */
 static int all_finite(const double *x, int n)
 {
   double sum = 0.0;
@@ -340,11 +346,12 @@ static void momentum_and_mass(double t, const double *u, const double *parameter
     mass[MASS_ENTRY[e][0] * M + MASS_ENTRY[e][1]] = slope[e];
 }
 
+/* max |value - p|. */
 static double largest_misfit(const double *value, const double *p)
 {
   double largest = 0.0;
   for (int i = 0; i < M; i++)
-    largest = fabs(value[i] - p[i]) > largest ? fabs(value[i] - p[i]) : largest;
+    largest = larger(largest, fabs(value[i] - p[i]));
   return largest;
 }
 
@@ -388,7 +395,7 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       scale *= 0.5;
     } while (!(nearer < misfit) && scale > DBL_EPSILON);
     for (int i = 0; i < M; i++)
-      largest = fabs(p[i]) > largest ? fabs(p[i]) : largest;
+      largest = larger(largest, fabs(p[i]));
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
       return misfit <= 64.0 * DBL_EPSILON * largest ? KEPLER_SCVI_2_OK : KEPLER_SCVI_2_NOT_CONVERGED;
@@ -649,6 +656,7 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
   double size_q[M], size_p[M], last_increment[M], last = INFINITY;
   movement moved = no_movement();
   int keep = 0;
+  memset(increment, 0, sizeof(double) * M);
   for (int k = 0;; k++) {
     evaluate(step, z, rows, size_p, size_q, keep ? NULL : jacobian, size);
     memcpy(last_increment, increment, sizeof(double) * M);

@@ -88,25 +88,26 @@ static const double QUADRATURE_SCATTER_1[4][5] = {
 };
 
 static const int QUADRATURE_SLOPE_0[4][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {0, 1}, {1, 0}, {1, 1}
-};
-static const int QUADRATURE_SLOPE_1[2][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}, {1, 1}
+  {0, 0}, {0, 1}, {1, 0}, {1, 1}
 };
 
-/* 4 values; 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+static const int QUADRATURE_SLOPE_1[2][2] = { /* {i, j}: d value_i / d u_j */
+  {0, 0}, {1, 1}
+};
+
+/* L_q and L_v at u = (q, v). Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
   const double w0 = u[0]*u[0] + u[1]*u[1];
   const double w1 = 1.0/w0;
-  const double w2 = parameters[0] * (w1*w1 * sqrt(w0));
+  const double w2 = parameters[0]*(w1*w1*sqrt(w0));
   value[0] = -(w2*u[0]);
   value[1] = -(w2*u[1]);
   value[2] = u[2];
   value[3] = u[3];
 }
 
-/* 4 values, 6 slopes; 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
+/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = u[0]*u[0];
@@ -115,23 +116,23 @@ static void quadrature_slope(const double *u, const double *parameters, double *
   const double w3 = sqrt(w2);
   const double w4 = 1.0/w2;
   const double w5 = w4*w4;
-  const double w6 = parameters[0] * (w5*w3);
-  const double w7 = w5*w4 * w3;
+  const double w6 = parameters[0]*(w5*w3);
+  const double w7 = w5*w4*w3;
   const double w8 = 3.0*parameters[0];
-  const double w9 = w8*w7 * u[0] * u[1];
+  const double w9 = w8*w7*u[0]*u[1];
   value[0] = -(w6*u[0]);
   value[1] = -(w6*u[1]);
   value[2] = u[2];
   value[3] = u[3];
-  slope[0] = -(w6 - w8*w0 * w7);
+  slope[0] = -(w6 - w8*w0*w7);
   slope[1] = w9;
   slope[2] = w9;
-  slope[3] = -(w6 - w8*w1 * w7);
+  slope[3] = -(w6 - w8*w1*w7);
   slope[4] = 1.0;
   slope[5] = 1.0;
 }
 
-/* 2 values, 2 slopes; constants. */
+/* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
 static void legendre(const double *u, double *value, double *slope)
 {
   value[0] = u[2];
@@ -140,11 +141,11 @@ static void legendre(const double *u, double *value, double *slope)
   slope[1] = 1.0;
 }
 
-/* 1 value; 8 *, 3 +, 1 /, 1 sqrt. */
+/* L at u = (q, v). Operations: 8 *, 3 +, 1 /, 1 sqrt. */
 static void lagrangian(const double *u, const double *parameters, double *value)
 {
   const double w0 = u[0]*u[0] + u[1]*u[1];
-  value[0] = 0.5 * (u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0] * (1.0/w0 * sqrt(w0)));
+  value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*(1.0/w0*sqrt(w0)));
 }
 
 /* LU factors of the n x n matrix a, rows exchanged so that every pivot is the largest of its column. Returns 0 if one
@@ -195,9 +196,10 @@ static void back_substitute(const double *a, int n, const double *pivot, double 
 }
 
 static const int MASS_ENTRY[2][2] = { /* {i, j}: d p_i / d v_j */
-{0, 0}, {1, 1}
+  {0, 0}, {1, 1}
 };
 
+/* Whether no x is an infinity or a NaN. */
 static int all_finite(const double *x, int n)
 {
   double sum = 0.0;
@@ -218,11 +220,12 @@ static void momentum_and_mass(double t, const double *u, const double *parameter
     mass[MASS_ENTRY[e][0] * M + MASS_ENTRY[e][1]] = slope[e];
 }
 
+/* max |value - p|. */
 static double largest_misfit(const double *value, const double *p)
 {
   double largest = 0.0;
   for (int i = 0; i < M; i++)
-    largest = fabs(value[i] - p[i]) > largest ? fabs(value[i] - p[i]) : largest;
+    largest = larger(largest, fabs(value[i] - p[i]));
   return largest;
 }
 
@@ -266,7 +269,7 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       scale *= 0.5;
     } while (!(nearer < misfit) && scale > DBL_EPSILON);
     for (int i = 0; i < M; i++)
-      largest = fabs(p[i]) > largest ? fabs(p[i]) : largest;
+      largest = larger(largest, fabs(p[i]));
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
       return misfit <= 64.0 * DBL_EPSILON * largest ? KEPLER_SVI_4_OK : KEPLER_SVI_4_NOT_CONVERGED;
@@ -492,6 +495,7 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
   double size_q[M], size_p[M], last_increment[M], last = INFINITY;
   movement moved = no_movement();
   int keep = 0;
+  memset(increment, 0, sizeof(double) * M);
   for (int k = 0;; k++) {
     evaluate(step, z, rows, size_p, size_q, keep ? NULL : jacobian, size);
     memcpy(last_increment, increment, sizeof(double) * M);
@@ -527,10 +531,8 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
 }
 
 #ifdef __GNUC__
-/* Vectors of points. GCC and Clang map them to whatever the processor has; other compilers have Newton's iteration only. */
-#if defined(__GNUC__) && !defined(__clang__)
+/* Vectors of points. GCC and Clang map them to whatever the processor has. */
 #pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
-#endif
 
 enum { LANES = 4 };
 typedef double lanes __attribute__((vector_size(8 * 4)));
@@ -613,17 +615,17 @@ static inline lanes lanes_sqrt(lanes x)
   return view.all;
 }
 
-/* 7 *, 1 +, 1 /, 2 neg, 1 sqrt, at all points. */
+/* L_q at all points. Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
 static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
 {
   const lanes w0 = u[0]*u[0] + u[1]*u[1];
   const lanes w1 = 1.0/w0;
-  const lanes w2 = parameters[0] * (w1*w1 * lanes_sqrt(w0));
+  const lanes w2 = parameters[0]*(w1*w1*lanes_sqrt(w0));
   value[0] = -(w2*u[0]);
   value[1] = -(w2*u[1]);
 }
 
-/* The constant masses. */
+/* The constant masses, of the parameters alone. */
 static void mass(double *value)
 {
   value[0] = 1.0;

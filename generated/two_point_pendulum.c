@@ -77,42 +77,43 @@ static const double QUADRATURE_SCATTER_1[2][2] = {
 };
 
 static const int QUADRATURE_SLOPE_0[1][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}
-};
-static const int QUADRATURE_SLOPE_1[1][2] = { /* {i, j}: d value_i / d u_j */
-{0, 0}
+  {0, 0}
 };
 
-/* 2 values; 6 *, 1 neg, 1 sin. */
+static const int QUADRATURE_SLOPE_1[1][2] = { /* {i, j}: d value_i / d u_j */
+  {0, 0}
+};
+
+/* L_q and L_v at u = (q, v). Operations: 6 *, 1 neg, 1 sin. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
-  value[0] = -(parameters[2]*parameters[1] * parameters[0] * sin(u[0]));
-  value[1] = parameters[0] * (parameters[1]*parameters[1]) * u[1];
+  value[0] = -(parameters[2]*parameters[1]*parameters[0]*sin(u[0]));
+  value[1] = parameters[0]*(parameters[1]*parameters[1])*u[1];
 }
 
-/* 2 values, 2 slopes; 7 *, 1 cos, 2 neg, 1 sin. */
+/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 7 *, 1 cos, 2 neg, 1 sin. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
-  const double w0 = parameters[2]*parameters[1] * parameters[0];
-  const double w1 = parameters[0] * (parameters[1]*parameters[1]);
-  value[0] = -(w0 * sin(u[0]));
+  const double w0 = parameters[2]*parameters[1]*parameters[0];
+  const double w1 = parameters[0]*(parameters[1]*parameters[1]);
+  value[0] = -(w0*sin(u[0]));
   value[1] = w1*u[1];
-  slope[0] = -(w0 * cos(u[0]));
+  slope[0] = -(w0*cos(u[0]));
   slope[1] = w1;
 }
 
-/* 1 value, 1 slopes; 3 *. */
+/* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */
 static void legendre(const double *u, const double *parameters, double *value, double *slope)
 {
-  const double w0 = parameters[0] * (parameters[1]*parameters[1]);
+  const double w0 = parameters[0]*(parameters[1]*parameters[1]);
   value[0] = w0*u[1];
   slope[0] = w0;
 }
 
-/* 1 value; 9 *, 1 +, 1 cos. */
+/* L at u = (q, v). Operations: 9 *, 1 +, 1 cos. */
 static void lagrangian(const double *u, const double *parameters, double *value)
 {
-  value[0] = 0.5 * (parameters[0] * (parameters[1]*parameters[1]) * (u[1]*u[1]) + 2.0*parameters[0] * parameters[1] * parameters[2] * cos(u[0]));
+  value[0] = 0.5*(parameters[0]*(parameters[1]*parameters[1])*(u[1]*u[1]) + 2.0*parameters[0]*parameters[1]*parameters[2]*cos(u[0]));
 }
 
 /* LU factors of the n x n matrix a, rows exchanged so that every pivot is the largest of its column. Returns 0 if one
@@ -163,9 +164,10 @@ static void back_substitute(const double *a, int n, const double *pivot, double 
 }
 
 static const int MASS_ENTRY[1][2] = { /* {i, j}: d p_i / d v_j */
-{0, 0}
+  {0, 0}
 };
 
+/* Whether no x is an infinity or a NaN. */
 static int all_finite(const double *x, int n)
 {
   double sum = 0.0;
@@ -185,11 +187,12 @@ static void momentum_and_mass(double t, const double *u, const double *parameter
     mass[MASS_ENTRY[e][0] * M + MASS_ENTRY[e][1]] = slope[e];
 }
 
+/* max |value - p|. */
 static double largest_misfit(const double *value, const double *p)
 {
   double largest = 0.0;
   for (int i = 0; i < M; i++)
-    largest = fabs(value[i] - p[i]) > largest ? fabs(value[i] - p[i]) : largest;
+    largest = larger(largest, fabs(value[i] - p[i]));
   return largest;
 }
 
@@ -233,7 +236,7 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       scale *= 0.5;
     } while (!(nearer < misfit) && scale > DBL_EPSILON);
     for (int i = 0; i < M; i++)
-      largest = fabs(p[i]) > largest ? fabs(p[i]) : largest;
+      largest = larger(largest, fabs(p[i]));
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
       return misfit <= 64.0 * DBL_EPSILON * largest ? TWO_POINT_PENDULUM_OK : TWO_POINT_PENDULUM_NOT_CONVERGED;
@@ -459,6 +462,7 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
   double size_q[M], size_p[M], last_increment[M], last = INFINITY;
   movement moved = no_movement();
   int keep = 0;
+  memset(increment, 0, sizeof(double) * M);
   for (int k = 0;; k++) {
     evaluate(step, z, rows, size_p, size_q, keep ? NULL : jacobian, size);
     memcpy(last_increment, increment, sizeof(double) * M);
@@ -494,10 +498,8 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
 }
 
 #ifdef __GNUC__
-/* Vectors of points. GCC and Clang map them to whatever the processor has; other compilers have Newton's iteration only. */
-#if defined(__GNUC__) && !defined(__clang__)
+/* Vectors of points. GCC and Clang map them to whatever the processor has. */
 #pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
-#endif
 
 enum { LANES = 2 };
 typedef double lanes __attribute__((vector_size(8 * 2)));
@@ -600,16 +602,16 @@ static inline lanes lanes_sin(lanes x)
 }
 #endif
 
-/* 3 *, 1 neg, 1 sin, at all points. */
+/* L_q at all points. Operations: 3 *, 1 neg, 1 sin. */
 static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
 {
-  value[0] = -(parameters[2]*parameters[1] * parameters[0] * lanes_sin(u[0]));
+  value[0] = -(parameters[2]*parameters[1]*parameters[0]*lanes_sin(u[0]));
 }
 
-/* The constant masses. */
+/* The constant masses, of the parameters alone. */
 static void mass(const double *parameters, double *value)
 {
-  value[0] = parameters[0] * (parameters[1]*parameters[1]);
+  value[0] = parameters[0]*(parameters[1]*parameters[1]);
 }
 
 /* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */

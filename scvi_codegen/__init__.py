@@ -15,7 +15,7 @@ Names are imported when they are first used, so code that only steps never impor
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -28,6 +28,8 @@ _HOMES = {
         "MethodError",
         "MethodWarning",
         "ModelFileError",
+        "PackageError",
+        "PlotError",
         "ScviCodegenError",
         "StateError",
         "StepFailedError",
@@ -51,6 +53,7 @@ _HOMES = {
     "model_file": ("Model", "load_model", "save_model"),
     "nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),
     "package": ("generate_package", "load_package"),
+    "plotting": ("plot_trajectory",),
     "problems": ("PROBLEMS", "problem"),
     "quadrature": (
         "Quadrature",

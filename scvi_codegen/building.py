@@ -32,7 +32,7 @@ from scvi_codegen.source import Source
 __all__ = ["PORTABLE_FLAGS", "TUNED_FLAGS", "cache_folder", "find_compiler", "load"]
 
 TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
-"""For a stepper used on the machine it is compiled on; no ``-ffast-math``: NaN, infinities and order of sums are kept."""
+"""For a stepper used where it is compiled; no ``-ffast-math``: NaN, infinities and the order of sums are kept."""
 
 PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
@@ -66,8 +66,8 @@ def find_compiler() -> tuple[str, ...]:
     if importlib.util.find_spec("ziglang"):
         return (sys.executable, "-m", "ziglang", "cc")
     raise BuildError(
-        "no C compiler was found; install one (Debian, Ubuntu: apt install gcc libc6-dev; macOS: xcode-select --install), "
-        "or take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
+        "no C compiler was found; install one (Debian, Ubuntu: apt install gcc libc6-dev; "
+        "macOS: xcode-select --install), or take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
     )
 
 
@@ -219,7 +219,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
-    """Definitions and libraries to try in turn: glibc's vector functions for a tuned build where they should be, libm."""
+    """Definitions and libraries to try in turn: glibc's vector functions in a tuned build on x86-64, then libm."""
     plain: tuple[list[str], list[str]] = ([], ["-lm"])
     name, version = platform.libc_ver()
     modern = name == "glibc" and tuple(int(part) for part in version.split(".")[:2]) >= (2, 22)

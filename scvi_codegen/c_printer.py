@@ -33,14 +33,9 @@ def _print(expression: Expression, context: int) -> str:
         text = f"-{_print(operands[0], level + 1)}"
     else:
         left, right = operands
-        text = f"{_print(left, level)} {operator} {_print(right, level + 1)}"
-        if level == 2:
-            text = text.replace(f" {operator} ", operator) if _flat(left) and _flat(right) else text
+        sign = f" {operator} " if level == 1 else operator
+        text = f"{_print(left, level)}{sign}{_print(right, level + 1)}"
     return f"({text})" if level < context else text
-
-
-def _flat(expression: Expression) -> bool:
-    return isinstance(expression, Constant | Load)
 
 
 def _load(load: Load) -> str:

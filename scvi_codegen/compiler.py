@@ -73,6 +73,7 @@ def describe(program: Program, system: LagrangianSystem, method: Method) -> Inte
     return Interface(
         prefix=program.prefix,
         title=program.title,
+        notes=program.notes,
         system=system.name,
         method=method.name,
         coordinates=program.coordinate_names,

@@ -6,8 +6,8 @@
     (34a) 0 = g*l*m*sin(Q_1) + l**2*m*(Q_1/h**2 - q_k/h**2 - v_0/h)
 
 Entries of nodes' and quadratures' tables appear as named symbols with their values beside them, or as radicals where
-these are short. Nothing is simplified: what stands here is what was derived. The compiled code solves the same equations
-with velocities in place of the positions Q^v (:mod:`scvi_codegen.stage_system`); a test puts its solutions in here.
+these are short. Nothing is simplified: what stands here is what was derived. The compiled code solves the same
+equations with velocities in place of the positions Q^v (:mod:`scvi_codegen.stage_system`); a test compares the steps.
 """
 
 from __future__ import annotations
@@ -298,7 +298,7 @@ class _Writer:
         return self._named(table.names[n][b], table.entries[n][b])
 
     def _named(self, name: str, value: Number) -> sympy.Expr:
-        """The symbol of an entry (``name/2``: half a named one), its value recorded; nameless ones are small integers."""
+        """The symbol of an entry (``name/2``: half a named one), its value recorded; nameless are small integers."""
         if not name:
             return sympy.Integer(int(value))
         base, _, divisor = name.partition("/")
@@ -377,8 +377,8 @@ def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
         yield exact_points(nodes)
     rule = getattr(method, "rule", None)
     if rule is not None:
-        exact = exact_rule(rule)
-        yield None if exact is None else [*exact[0], *exact[1]]
+        exact_points_and_weights = exact_rule(rule)
+        yield None if exact_points_and_weights is None else [x for part in exact_points_and_weights for x in part]
 
 
 def _with_radicals(derived: StepEquations) -> StepEquations:

@@ -13,6 +13,8 @@ __all__ = [
     "MethodError",
     "MethodWarning",
     "ModelFileError",
+    "PackageError",
+    "PlotError",
     "ScviCodegenError",
     "StateError",
     "StepFailedError",
@@ -53,6 +55,14 @@ class MethodWarning(UserWarning):
 
 class ModelFileError(ScviCodegenError, ValueError):
     """A model file that cannot be read, or that lacks or repeats something."""
+
+
+class PackageError(ScviCodegenError, ValueError):
+    """A folder that cannot hold a generated package, or holds none."""
+
+
+class PlotError(ScviCodegenError):
+    """matplotlib is not installed."""
 
 
 class StateError(ScviCodegenError, ValueError):

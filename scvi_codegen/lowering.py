@@ -365,8 +365,10 @@ def _scatter_loop(family: PointFamily, index: int) -> ScatterLoop:
 
 
 def lower_vector(numbers: Vector) -> tuple[float, ...]:
+    """Each number rounded to the nearest double."""
     return tuple(float(x) for x in numbers)
 
 
 def lower_matrix(entries: Matrix) -> tuple[tuple[float, ...], ...]:
+    """The same for the rows of a table."""
     return tuple(lower_vector(line) for line in entries)

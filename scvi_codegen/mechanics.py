@@ -1,4 +1,4 @@
-"""What the kernels compute: momentum, force, the Euler-Lagrange residual, and the adjoint scalar of the shooting method.
+"""What the kernels compute: momentum, force, the Euler-Lagrange residual, and the scalar behind the shooting method.
 
 Everything is differentiated term by term with :mod:`scvi_codegen.derivatives`; nothing is simplified and no mass matrix
 is inverted. Accelerations and multipliers are symbols of their own, so a kernel is a function of plain numbers.
@@ -57,7 +57,7 @@ def euler_lagrange(system: LagrangianSystem) -> tuple[sympy.Expr, ...]:
 
 def multiplied_residual(system: LagrangianSystem) -> sympy.Expr:
     """Lambda . E: the scalar whose stationarity makes a collocation residual vanish, with its multipliers."""
-    terms = []
+    terms: list[sympy.Expr] = []
     for multiplier, residual in zip(multipliers(system), euler_lagrange(system), strict=True):
         terms.extend(multiplier * term for term in sympy.Add.make_args(residual))
     return sympy.Add(*terms)

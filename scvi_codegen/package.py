@@ -22,7 +22,7 @@ from pathlib import Path
 from string import Template
 from typing import IO, TYPE_CHECKING
 
-from scvi_codegen.errors import ModelFileError, ScviCodegenError, StateError
+from scvi_codegen.errors import ModelFileError, PackageError, StateError
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.trajectory import write_atomically
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from scvi_codegen.model_file import Model
     from scvi_codegen.rendering import ExampleRun
 
-__all__ = ["PackageError", "generate_package", "load_package"]
+__all__ = ["generate_package", "load_package"]
 
 INTERFACE_FILE = "interface.json"
 FORMAT = 1
@@ -49,16 +49,15 @@ OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"
 """Folder names that would collide with ``main.c`` or hide what the package imports."""
 
 
-class PackageError(ScviCodegenError, ValueError):
-    """A folder that cannot hold a generated package, or holds none."""
-
-
-def generate_package(model: Model, folder: str | os.PathLike[str], *, force: bool = False) -> Path:
+def generate_package(
+    model: Model, folder: str | os.PathLike[str], *, solver: str = "auto", force: bool = False
+) -> Path:
     """Write the integrator of a model into a folder, made if it is missing; other files in it are left alone.
 
     Args:
         model: system, method, and the initial state and step of the example.
         folder: where to; its name becomes the prefix of the C names and the name of the Python package.
+        solver: of the stage equations, as for ``compile_stepper``.
         force: overwrite files of the same names that were edited or written by someone else.
 
     Returns:
@@ -66,11 +65,12 @@ def generate_package(model: Model, folder: str | os.PathLike[str], *, force: boo
 
     Raises:
         PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
+        MethodError: for a solver that the method does not have.
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
     prefix = _prefix(target)
-    texts = _texts(model, prefix)
+    texts = _texts(model, prefix, solver)
     try:
         target.mkdir(parents=True, exist_ok=True)
         if not force:
@@ -126,20 +126,18 @@ def _prefix(folder: Path) -> str:
     return name
 
 
-def _texts(model: Model, prefix: str) -> dict[str, str]:
+def _texts(model: Model, prefix: str, solver: str) -> dict[str, str]:
     """Text by file name, ``interface.json`` last."""
     from scvi_codegen.compiler import generate_source
-    from scvi_codegen.lowering import lower
     from scvi_codegen.rendering import render_example
 
-    source, interface = generate_source(model.system, model.method, prefix=prefix)
-    program = lower(model.system, model.method, prefix=prefix)
+    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
     texts = {f"{prefix}.h": source.header, f"{prefix}.c": source.code}
-    texts |= render_example(program, _example(model))
+    texts |= render_example(interface, _example(model))
     described = _model_text(model)
     if described is not None:
         texts["model.toml"] = described
-    texts["README.md"] = _readme(interface, program.notes, with_model=described is not None)
+    texts["README.md"] = _readme(interface, with_model=described is not None)
     texts["__init__.py"] = _template("__init__.py")
     return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
 
@@ -187,7 +185,7 @@ def _model_text(model: Model) -> str | None:
         return None
 
 
-def _readme(interface: Interface, notes: tuple[str, ...], *, with_model: bool) -> str:
+def _readme(interface: Interface, *, with_model: bool) -> str:
     defaults = zip(interface.parameters, interface.defaults, strict=True)
     listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
     return (
@@ -196,7 +194,7 @@ def _readme(interface: Interface, notes: tuple[str, ...], *, with_model: bool) -
             prefix=interface.prefix,
             macro=interface.prefix.upper(),
             title=" ".join(interface.title.split()),
-            notes=", ".join(notes),
+            notes=", ".join(interface.notes),
             coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
             parameters=f"Parameters, with default values: {listed}." if listed else "There are no parameters.",
             origin="`model.toml` is what it was generated from." if with_model else "",

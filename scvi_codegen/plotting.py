@@ -13,14 +13,14 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import ScviCodegenError, StateError
+from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.trajectory import Trajectory, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Body", "PlotError", "bodies", "check_plot_path", "draw_trajectory", "plot_trajectory"]
+__all__ = ["Body", "bodies", "check_plot_path", "draw_trajectory", "plot_trajectory"]
 
 Array = NDArray[np.float64]
 
@@ -43,10 +43,6 @@ STYLE = {
     "svg.fonttype": "none",
     "figure.dpi": 100,
 }
-
-
-class PlotError(ScviCodegenError):
-    """matplotlib is not installed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +135,8 @@ def draw_trajectory(trajectory: Trajectory) -> Figure:
     elif found:
         for panel, plane in zip(axes[:-1], combinations(range(3), 2), strict=False):
             _draw_orbits(panel, trajectory, found, plane)
-        _add_legend(axes[0], len(found))
+        if 1 < len(found) <= len(COLORS):
+            figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(found))
     elif m <= MOST_CURVES:
         for panel, plane in zip(axes[:-1], combinations(range(m), 2), strict=False):
             _draw_plane(panel, trajectory, plane)
@@ -175,11 +172,6 @@ def _draw_orbits(axes: Axes, trajectory: Trajectory, found: Sequence[Body], plan
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def _add_legend(axes: Axes, count: int) -> None:
-    if 1 < count <= len(COLORS):
-        axes.legend(loc="upper right", fontsize=8, handlelength=1.2)
-
-
 def _draw_curve(axes: Axes, x: Array, y: Array, color: str, label: str | None = None) -> None:
     """A curve through the states, a ring at the first, a dot at the last; points instead where a curve would tangle."""
     every = max(1, len(x) // MOST_POINTS)
@@ -197,7 +189,7 @@ def _is_coarse(x: Array, y: Array) -> bool:
     if len(x) < 200:
         return False
     size = max(_extent(x), _extent(y))
-    return float(np.median(np.hypot(np.diff(x), np.diff(y)))) > 0.05 * size
+    return float(np.median(np.hypot(np.diff(x), np.diff(y)))) > 0.1 * size
 
 
 def _extent(values: Array) -> float:

@@ -1,7 +1,7 @@
 """The arithmetic in which every table is computed: 60 significant digits, in a context of its own.
 
 Nodes, weights and cardinal functions are computed once, at generation time, and rounded once, when they are printed;
-60 digits leave ten to spare over the 50 that are promised. The context is private, so a user's ``mpmath.mp.dps`` neither
+60 digits leave ten to spare over the 50 that are promised. The context is private: a user's ``mpmath.mp.dps`` neither
 disturbs the tables nor is disturbed by them.
 """
 

@@ -2,8 +2,8 @@
 
 A kernel is straight-line arithmetic over ``u[i]`` (its arguments), ``t`` and ``parameters[i]``: temporaries, each used
 more than once, then results. Operations are ``+ - * / neg sqrt`` and calls of elementary functions on binary64 numbers;
-there are no branches, loops or integers. Everything around the kernels (gather, scatter, Newton, the run) is a loop over
-the tables of a :class:`Family`, the same for every method and system, and stands in the templates.
+there are no branches, loops or integers. Everything around the kernels (gather, scatter, Newton, sweeps, the run) is a
+loop over tables, the same for every method and system, and stands in the templates.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ class Program:
         for family in self.families:
             head.append(f"  family {family.name}: {family.points} points")
             head += [
-                f"    gather  {loop.name}: {'q0 + ' if loop.from_state else ''}h^{loop.power} sum_b {loop.name}[n][b] z[b]"
+                f"    gather  {loop.name}: {'q0 + ' * loop.from_state}h^{loop.power} sum_b {loop.name}[n][b] z[b]"
                 for loop in family.gathers
             ]
             head += [f"    scatter {loop.name}: w[n] h^{loop.power} {loop.name}[n][r]" for loop in family.scatters]

@@ -20,8 +20,8 @@ from scvi_codegen.c_printer import (
     print_lane_temporaries,
     print_number,
 )
-from scvi_codegen.program import Kernel, Program, Sweep
-from scvi_codegen.source import Source
+from scvi_codegen.program import Family, Kernel, Program, Sweep
+from scvi_codegen.source import Interface, Source
 
 __all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "render", "render_example", "template_folder"]
 
@@ -31,6 +31,7 @@ DEFAULT_TOLERANCE = 2.0**-52
 MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
 KEEP_FACTORS = 1e-5
+ARGUMENT_NAMES = {2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
 VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
@@ -69,9 +70,9 @@ def render(program: Program) -> Source:
     )
 
 
-def render_example(program: Program, start: ExampleRun) -> dict[str, str]:
+def render_example(interface: Interface, start: ExampleRun) -> dict[str, str]:
     """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
-    context = _context(program) | {"start": start}
+    context = {"interface": interface, "prefix": interface.prefix, "start": start}
     environment = _environment()
     return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
 
@@ -98,6 +99,7 @@ def _context(program: Program) -> dict[str, object]:
         "program": program,
         "prefix": program.prefix,
         "kernels": program.kernels,
+        "purpose": _purposes(program),
         "legendre": program.legendre,
         "lagrangian": program.lagrangian,
         "workspace": workspace_size(program),
@@ -108,6 +110,27 @@ def _context(program: Program) -> dict[str, object]:
         "keep_factors": KEEP_FACTORS,
         **_lane_context(program.sweep),
     }
+
+
+def _purposes(program: Program) -> dict[str, str]:
+    """One sentence a kernel, for the comment above it."""
+    purposes = {
+        "legendre": "Momenta L_v and mass matrix L_vv at u = (q, v).",
+        "lagrangian": "L at u = (q, v).",
+        "force_lanes": "L_q at all points.",
+        "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
+    }
+    for family in program.families:
+        arguments = ARGUMENT_NAMES[len(family.gathers)]
+        purposes[family.value.name] = f"{_results(family)} at u = {arguments}."
+        purposes[family.slope.name] = f"The same, and the non-zero derivatives with respect to u = {arguments}."
+    return purposes
+
+
+def _results(family: Family) -> str:
+    if family.name == "node":
+        return "Derivatives of lambda . E" if len(family.gathers) == 4 else "The Euler-Lagrange residual E"
+    return "L_q and L_v" if len(family.scatters) == 2 else "L_v"
 
 
 def _lane_context(sweep: Sweep | None) -> dict[str, object]:
@@ -179,6 +202,7 @@ def _environment() -> Environment:
         "signature": _signature,
         "call_arguments": _call_arguments,
         "counts": _counts,
+        "pairs": lambda entries: ", ".join(f"{{{i}, {j}}}" for i, j in entries),
         "transposed": lambda rows: tuple(zip(*rows, strict=True)),
         "lane_signature": _lane_signature,
         "lane_temporaries": print_lane_temporaries,

@@ -26,6 +26,7 @@ class Interface:
     Attributes:
         prefix: beginning of every exported C name.
         title: system and method, one line.
+        notes: order, symplecticity, symmetry in words.
         system, method: their names.
         coordinates, parameters: names in order.
         defaults: parameter values used unless others are given.
@@ -36,6 +37,7 @@ class Interface:
 
     prefix: str
     title: str
+    notes: tuple[str, ...]
     system: str
     method: str
     coordinates: tuple[str, ...]
@@ -58,4 +60,5 @@ class Interface:
     def from_json(cls, text: str) -> Interface:
         """The interface written by :meth:`to_json`."""
         fields: dict[str, Any] = json.loads(text)
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()})
+        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in fields.items()}
+        return cls(**arguments)

@@ -1,11 +1,11 @@
-"""The one shape every method shares: points on the step, a small symbolic kernel at each, and tables of numbers between.
+"""The shape every method shares: points on the step, a small symbolic kernel at each, and tables of numbers between.
 
 A step from (t, q0, p0) with step size h has unknown *blocks* z_1 .. z_B of m components each. At point n of a *family*
 (quadrature points, collocation nodes, the start, the end) the arguments of a kernel are *gathered* from the unknowns,
 
     u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b),                       t_n = t + c_n h,
 
-the kernel phi (m results in the arguments, time and parameters) is evaluated, and its results are *scattered* into rows,
+the kernel phi (m results in the arguments, time and parameters) is evaluated, its results are *scattered* into rows,
 
     R_r = (momentum coefficient) p0 + sum_families sum_n scale w_n h^(power + power of r) S_nr phi(u_n) = 0,
 
@@ -244,8 +244,8 @@ def stationary_increments(
 ) -> StageSystem:
     """The variational method of G(q0, z, mu, q1) = S(q0, z) + mu . (q0 + h sum_b beta_b z_b - q1), unknowns velocities.
 
-    Stationarity gives p1 = -mu = p0 + dS/dq0 and the rows beta_b p1 - (1/h) dS/dz_b = 0, that is, every scatter table is
-    beta_b G_n0 - G_nb with the gather's own G: the map has a generating function whatever the numbers in the tables,
+    Stationarity gives p1 = -mu = p0 + dS/dq0 and the rows beta_b p1 - (1/h) dS/dz_b = 0: every scatter table is
+    beta_b G_n0 - G_nb with the gather's own G. The map has a generating function whatever the numbers in the tables,
     rounded ones included (paper (5); see :func:`dyadic` for why the differences lose nothing).
     """
     beta = tuple(end_position)

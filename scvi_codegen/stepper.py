@@ -1,8 +1,8 @@
 """A compiled integrator in Python: step, integrate, Legendre transforms. Imports neither SymPy nor Jinja.
 
-``step`` depends on its arguments alone. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory: it
-guesses each step by extrapolating the one before and carries along what rounding cut off the state. The whole memory is
-one plain C struct; :meth:`Run.save` gives its bytes and :meth:`Stepper.restore` goes on from them, bit for bit.
+``step`` depends on its arguments alone. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory:
+it guesses each step by extrapolating the one before and carries along what rounding cut off the state. The whole memory
+is one plain C struct; :meth:`Run.save` gives its bytes and :meth:`Stepper.restore` goes on from them, bit for bit.
 
 All calls into C release the GIL and share nothing, so one stepper may be used from many threads.
 """

@@ -9,8 +9,8 @@ that is for SVI with as many points as its degree, every Runge-Kutta method in p
 Runge-Kutta in position form, whose stage equations collapse to q_n = q0 + h c_n v0 + h^2 sum_j Ahat_nj f(q_j).
 
 For a variational method the two matrices belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
-rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51, the
-rounded map still has a generating function: its energy error does not drift.
+rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51,
+the rounded map still has a generating function: its energy error does not drift.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def is_separable(system: LagrangianSystem) -> bool:
     constant = set(system.parameters)
     if any(i != j or not entry.free_symbols <= constant for (i, j), entry in mass.items()):
         return False
-    at_rest = {v: sympy.S.Zero for v in system.velocities}
+    at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
     return all(p.xreplace(at_rest) == 0 for p in momenta) and not jacobian(force(system), system.velocities)
 
 
@@ -105,7 +105,7 @@ def _is_variational(stages: StageSystem) -> bool:
 
 
 def _variational_tables(family: PointFamily, stages: StageSystem) -> _Tables | None:
-    """mu and its partner; for other velocity tables the partner by the (constant) stiffness matrix."""
+    """Mu and its partner; for other velocity tables the partner by the (constant) stiffness matrix."""
     beta = stages.end_position.entries[0][1:]
     if any(x == 0 for x in beta):
         return None
@@ -129,7 +129,7 @@ def _variational_tables(family: PointFamily, stages: StageSystem) -> _Tables | N
 
 
 def _stiffness_partner(position: Matrix, velocity: Matrix, beta: Vector, weights: Vector) -> Matrix:
-    """K^-1 (beta - a)^T, K = l^T w l: the rows beta_b p1 - sum_n w_n (h a_nb L_q + l_nb L_v) solved for constant mass."""
+    """K^-1 (beta - a)^T, K = l^T w l: beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) solved for constant mass."""
     weighted = tuple(tuple(w * x for x in line) for w, line in zip(weights, velocity, strict=True))
     stiffness = mp.matrix(matrix_product(transpose(velocity), weighted))
     right = mp.matrix([[b - x for x in column] for b, column in zip(beta, transpose(position), strict=True)])
@@ -142,9 +142,7 @@ def _tableau_tables(family: PointFamily, stages: StageSystem) -> _Tables:
     A = tuple(line[1:] for line in family.gathers[0].table.entries)
     b = stages.end_position.entries[0][1:]
     ones = (mp.one,) * len(b)
-    return _Tables(
-        position=A, position_weights=ones, momentum=A, momentum_weights=ones, end_position=b, end_momentum=b
-    )
+    return _Tables(position=A, position_weights=ones, momentum=A, momentum_weights=ones, end_position=b, end_momentum=b)
 
 
 def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, separable: bool) -> Sweep:
@@ -153,11 +151,8 @@ def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, s
     while lanes < max(points, blocks):
         lanes *= 2
     degree = min(points - 1, EXTRAPOLATION_DEGREE)
-    weighted = tuple(tuple(x * w for x, w in zip(line, tables.position_weights, strict=True)) for line in tables.position)
-    product = tuple(
-        tuple(x * w for x, w in zip(line, tables.momentum_weights, strict=True))
-        for line in matrix_product(weighted, tables.momentum)
-    )
+    weighted = _weighted(tables.position, tables.position_weights)
+    product = _weighted(matrix_product(weighted, tables.momentum), tables.momentum_weights)
     kernel, mass, entries = _separable_kernels(system) if separable else _coupled_kernel(system)
     return Sweep(
         separable=separable,
@@ -177,6 +172,10 @@ def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, s
         mass=mass,
         mass_entries=entries,
     )
+
+
+def _weighted(entries: Matrix, weights: Vector) -> Matrix:
+    return tuple(tuple(x * w for x, w in zip(line, weights, strict=True)) for line in entries)
 
 
 def _matrix(entries: Matrix, lanes: int) -> tuple[tuple[float, ...], ...]:
@@ -224,6 +223,6 @@ def check_solver(solver: str, sweep: Sweep | None, method: Method, names: Sequen
         raise MethodError(f"there is no solver {solver!r}; there are {', '.join(names)}")
     if solver == "fixed-point" and sweep is None:
         raise MethodError(
-            f"{method.name} has no fixed-point iteration for this system; use solver='auto' or 'newton', or an SVI with "
-            "as many quadrature points as its degree"
+            f"{method.name} has no fixed-point iteration for this system; use solver='auto' or 'newton', "
+            "or an SVI with as many quadrature points as its degree"
         )

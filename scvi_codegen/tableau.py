@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count as count_from, zip_longest
+from itertools import count as count_from
 from itertools import pairwise, zip_longest
 from typing import Any, TypeAlias
 

@@ -49,7 +49,8 @@ class Trajectory:
 
     def energy(self) -> Array:
         """(n,) energies p.v - L, constant along exact trajectories when L does not depend on time."""
-        return self.stepper.energy(self.q, self.p, self.t, self.parameters)
+        energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
+        return energies
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz`` (arrays t, q, p, iterations, h, parameters, names) or ``.csv``, atomically.
@@ -88,7 +89,7 @@ class Trajectory:
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then rename it: the old file stays until the new is whole."""
+    """Let ``write`` fill a temporary file beside ``path``, then rename it: the old one stays until the new is whole."""
     target = Path(path)
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     try:

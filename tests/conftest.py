@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from oracle import Mechanics, numbers, oracle_step
 
+from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.method import Method
 from scvi_codegen.problems import problem
@@ -103,9 +104,13 @@ def sample_named(name: str) -> Sample:
     return Sample(name, OWN_SYSTEMS[name]() if name in OWN_SYSTEMS else problem(name).system)
 
 
+QUICK_FLAGS = ("-O1", *(flag for flag in TUNED_FLAGS if flag != "-O3"))
+"""What users get, but for the optimisation of which most of the compilation time is made."""
+
+
 @cache
-def stepper_for(name: str, method: Method) -> Stepper:
-    return compile_stepper(sample_named(name).system, method)
+def stepper_for(name: str, method: Method, *, solver: str = "auto", flags: tuple[str, ...] = QUICK_FLAGS) -> Stepper:
+    return compile_stepper(sample_named(name).system, method, solver=solver, flags=flags)
 
 
 @pytest.fixture(scope="session")
@@ -114,5 +119,5 @@ def sample() -> Callable[[str], Sample]:
 
 
 @pytest.fixture(scope="session")
-def compiled() -> Callable[[str, Method], Stepper]:
+def compiled() -> Callable[..., Stepper]:
     return stepper_for

@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import pytest
 
+from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -78,16 +79,35 @@ def relative(found, expected):
     return np.abs(np.array(found) - expected).max() / max(1.0, np.abs(expected).max())
 
 
-def check(sample, compiled, name, method, *, h=H, t=T):
+def check(sample, compiled, name, method, *, h=H, t=T, **how):
     case = sample(name)
     q, p = case.state
-    assert relative(compiled(name, method).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
+    assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
 def test_every_kind_of_lagrangian_steps_as_the_oracle(sample, compiled, name, method):
-    check(sample, compiled, name, method)
+    check(sample, compiled, name, method, flags=TUNED_FLAGS)
+
+
+SOLVED_BOTH_WAYS = (
+    ("kepler", SVI(3)),
+    ("kepler", SVI(2, "gauss-legendre:4")),
+    ("kepler", SpectralCollocation(3)),
+    ("double-pendulum", SVI(3)),
+    ("double-pendulum", RadauIIA(2)),
+    ("pumped-cart-pole", SVI(2, "gauss-lobatto:2")),
+    ("relativistic-particle", Gauss(2)),
+    ("driven-duffing", RadauIA(3)),
+    ("charged-particle", StoermerVerlet()),
+)
+
+
+@pytest.mark.parametrize("solver", ["newton", "fixed-point"])
+@pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
+def test_both_solvers_step_as_the_oracle(sample, compiled, name, method, solver):
+    check(sample, compiled, name, method, solver=solver)
 
 
 @pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)

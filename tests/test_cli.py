@@ -198,11 +198,18 @@ class TestRun:
     def test_sums_up_what_was_conserved(self):
         text = output_of("run", "kepler")
         assert "order 16, symplectic, symmetric" in text
-        assert re.search(r"a step, \d\.\d\d Newton iterations a step; prepared in \d", text)
+        assert re.search(r"a step, \d\.\d\d iterations a step; prepared in \d", text)
         error, drift = re.search(r"relative energy error: (\S+) at most, drift (\S+) over", text).groups()
         assert abs(float(drift)) <= 2 * float(error) < 1e-12
         assert float(re.search(r"angular momentum: (\S+) at most", text)[1]) < 1e-14
         assert "final state\n  q1 = " in text
+
+    def test_the_solver_can_be_chosen(self):
+        for solver in ("newton", "fixed-point"):
+            assert "a step" in output_of("run", "kepler", "--span", "5", "--solver", solver)
+        output_of("generate", "kepler", "-o", "kepler_newton", "--solver", "newton")
+        assert "lanes" not in Path("kepler_newton/kepler_newton.c").read_text()
+        assert "'newton', 'fixed-point'" in error_of("run", "kepler", "--solver", "guess")
 
     def test_a_drift_is_seen(self):
         text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")

@@ -59,7 +59,7 @@ def measured_order(compiled, sample, name, method):
 
 METHODS = (
     *(SVI(s, f"gauss-legendre:{g}") for s in (1, 2, 3, 4, 5) for g in (s, s + 1)),
-    *(SVI(s, f"gauss-lobatto:{g}") for s in (2, 3, 4) for g in (s, s + 1)),
+    *(SVI(s, f"gauss-lobatto:{g}") for s in (2, 4) for g in (s, s + 1)),
     SVI(1, "gauss-lobatto:2"),
     SVI(3, "clenshaw-curtis:4"),
     SVI(3, "clenshaw-curtis:5"),
@@ -94,7 +94,7 @@ def test_global_error_on_kepler_shrinks_with_the_order_claimed(compiled, sample,
     assert measured_order(compiled, sample, "kepler", method) == pytest.approx(method.order, abs=0.15)
 
 
-@pytest.mark.parametrize("method", LOW[::4], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", LOW[::5], ids=lambda method: method.name)
 def test_global_error_on_a_coupled_time_dependent_system_does_too(compiled, sample, method):
     assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.15)
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import BuildError, StateError
+from scvi_codegen.errors import BuildError, PackageError, StateError
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.model_file import Model, load_model
-from scvi_codegen.package import PackageError, generate_package, load_package
+from scvi_codegen.package import generate_package, load_package
 from scvi_codegen.problems import problem
 from scvi_codegen.quadrature import Quadrature
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.model_file import Model
-from scvi_codegen.plotting import PlotError, bodies, check_plot_path, draw_trajectory, plot_trajectory
+from scvi_codegen.plotting import bodies, check_plot_path, draw_trajectory, plot_trajectory
 from scvi_codegen.problems import problem
 from scvi_codegen.trajectory import Trajectory
 
@@ -55,7 +55,7 @@ def test_each_kind_of_system_gets_its_panels(name, titles):
 
 def test_bodies_are_named_in_the_legend():
     figure = draw_trajectory(trajectory_of("outer-solar-system"))
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["sun", "jupiter", "saturn", "uranus", "neptune", "pluto"]
 
 

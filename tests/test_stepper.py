@@ -301,15 +301,21 @@ def test_a_looser_tolerance_saves_iterations_and_costs_digits(kepler):
 
 
 def test_the_absolute_rule_compares_the_update_itself(kepler):
-    """With coordinates of size 1e6, an update of 1e-4 is 1e-10 of them: enough for the relative rule, not the other."""
-    q, p, mu = [1e6, 0.0], [0.0, 1e6], {"mu": 1e18}
-    exact = kepler.step(q, p, 0.1, 0.0, mu)
-    for tolerance, bound in ((1e3, 1e3), (1e-3, 1e-3)):
-        options = NewtonOptions(tolerance=tolerance, absolute=True)
-        assert np.abs(np.array(kepler.step(q, p, 0.1, 0.0, mu, options=options)) - exact).max() < bound
-    with pytest.raises(StepFailedError, match="not converged"):
-        kepler.step(q, p, 0.1, 0.0, mu, options=NewtonOptions(tolerance=1e-12, absolute=True))
-    assert np.array_equal(kepler.step(q, p, 0.1, 0.0, mu, options=NewtonOptions(tolerance=1e-15)), exact)
+    """Lengths in units 2^30 times smaller make the same update 2^30 times larger, and a given bound harder to meet."""
+    scale = 2.0**30
+    large = {"q": np.multiply(scale, STATE[0]), "p": np.multiply(scale, STATE[1]), "parameters": {"mu": scale**3}}
+
+    def iterations(options, q=STATE[0], p=STATE[1], parameters=None):
+        return kepler.integrate(q, p, h=0.1, steps=20, parameters=parameters, options=options).iterations.sum()
+
+    relative, absolute = (NewtonOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
+    assert iterations(relative) == iterations(relative, **large)
+    assert iterations(absolute) < iterations(absolute, **large)
+    exact = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"])
+    for bound in (1e3, 1e-3):
+        options = NewtonOptions(tolerance=bound, absolute=True)
+        found = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"], options=options)
+        assert np.abs(np.array(found) - exact).max() < bound
 
 
 # Legendre transforms and energy.

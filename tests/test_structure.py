@@ -72,8 +72,15 @@ FINITE_DIFFERENCES = 2e-12
 """Five times the noise of the differences (4e-13 measured); the smallest real defect below is 1e-7."""
 
 
-@pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
-@pytest.mark.parametrize("method", SYMPLECTIC, ids=lambda method: method.name)
+SHOOTING = tuple(SCVI(s) for s in (2, 3, 4, 5, 6))
+ON_SYSTEMS = (
+    *(("double-pendulum", method) for method in SYMPLECTIC),
+    *(("kepler", method) for method in (SVI(2, "gauss-legendre:3"), SVI(3, "clenshaw-curtis:5"), *SHOOTING)),
+    *(("charged-particle", method) for method in (SVI(4, "gauss-lobatto:5"), Gauss(3), *SHOOTING)),
+)
+
+
+@pytest.mark.parametrize(("name", "method"), ON_SYSTEMS, ids=lambda value: getattr(value, "name", value))
 def test_symplectic_methods_preserve_the_two_form(sample, compiled, name, method):
     q, p = sample(name).state
     assert method.symplectic
@@ -167,6 +174,13 @@ STEPS = 10_000
 def test_kepler_keeps_its_angular_momentum_to_round_off(compiled, method):
     entry = problem("kepler")
     run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
+    L = angular_momentum(run.q, run.p)
+    assert np.abs(L - L[0]).max() < 2e-13
+
+
+def test_newtons_solver_keeps_it_too(compiled):
+    entry = problem("kepler")
+    run = compiled("kepler", SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
     assert np.abs(L - L[0]).max() < 2e-13
 

@@ -41,6 +41,15 @@ cannot be written; 130 after Ctrl-C.
 """
 
 
+SOLVER_OPTION = click.option(
+    "--solver",
+    type=click.Choice(["auto", "newton", "fixed-point"]),
+    default="auto",
+    show_default=True,
+    help="Of the stage equations; auto: fixed-point iteration where there is one, Newton where that fails.",
+)
+
+
 class _Failure(click.ClickException):
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
@@ -82,12 +91,16 @@ def main() -> None:
 @model_arguments
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory, .npz or .csv.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Picture, .png or .svg (needs matplotlib).")
-@click.option("--tolerance", type=float, metavar="X", help="Relative size of the last Newton update [round-off].")
-@click.option("--max-iterations", type=int, metavar="N", help="Newton iterations after which a step fails [50].")
+@SOLVER_OPTION
+@click.option(
+    "--tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
+)
+@click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
 def run(
     model_name: str,
     output: str | None,
     plot: str | None,
+    solver: str,
     tolerance: float | None,
     max_iterations: int | None,
     **choices: Any,
@@ -108,8 +121,9 @@ def run(
     from scvi_codegen.stepper import NewtonOptions
 
     given = {"tolerance": tolerance, "max_iterations": max_iterations}
-    options = NewtonOptions(**{key: value for key, value in given.items() if value is not None})  # type: ignore[arg-type]
-    outcome = integrate_model(model, options)
+    chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    options = NewtonOptions(**chosen)
+    outcome = integrate_model(model, solver=solver, options=options)
     click.echo(summary(model, outcome))
     written = _write_outputs(outcome, output, plot)
     if outcome.failure is not None:
@@ -125,8 +139,9 @@ def run(
 @click.option(
     "-o", "--output", type=click.Path(), required=True, metavar="DIR", help="Folder; its name is the C prefix."
 )
+@SOLVER_OPTION
 @click.option("--force", is_flag=True, help="Overwrite files of the same names that were edited or are not ours.")
-def generate(model_name: str, output: str, force: bool, **choices: Any) -> None:
+def generate(model_name: str, output: str, solver: str, force: bool, **choices: Any) -> None:
     """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
 
     \b
@@ -138,7 +153,7 @@ def generate(model_name: str, output: str, force: bool, **choices: Any) -> None:
     model = read_model(model_name, Choices(**choices))
     from scvi_codegen.package import generate_package
 
-    folder = generate_package(model, output, force=force)
+    folder = generate_package(model, output, solver=solver, force=force)
     click.echo(f"{model.system.name}: {model.method.title}")
     click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run', or 'import {folder.resolve().name}'")
 

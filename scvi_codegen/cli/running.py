@@ -48,15 +48,16 @@ class Outcome:
     interrupted: bool
 
 
-def integrate_model(model: Model, options: NewtonOptions | None = None) -> Outcome:
+def integrate_model(model: Model, *, solver: str = "auto", options: NewtonOptions | None = None) -> Outcome:
     """Run a model with a progress bar, as far as it goes.
 
     Raises:
         BuildError: without a C compiler.
+        MethodError: for a solver that the method does not have.
         StateError: if the initial state is unfit.
     """
     began = time.perf_counter()
-    run = model.start(compile_stepper(model.system, model.method), options=options)
+    run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
     preparation, seconds = time.perf_counter() - began, 0.0
     pieces, failure = [run.record(0, every=model.every)], None
     with _interruptions() as caught, _progress(model.step_count) as advance:
@@ -111,7 +112,7 @@ def _speed(outcome: Outcome, every: int) -> str:
     counted = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
     if not counted:
         return text
-    return f"{text}, {int(outcome.trajectory.iterations.sum()) / counted:.2f} Newton iterations a step"
+    return f"{text}, {int(outcome.trajectory.iterations.sum()) / counted:.2f} iterations a step"
 
 
 def _conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:

@@ -162,8 +162,9 @@ class SVI(Method):
 class StoermerVerlet(Method):
     """Stoermer-Verlet: the two-stage Lobatto IIIA-IIIB pair, order 2, symplectic, symmetric.
 
-    For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the trapezoidal
-    rule; for other Lagrangians it is implicit. Source: Hairer, Lubich & Wanner, Geometric Numerical Integration, II.2.
+    For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the
+    trapezoidal rule; for other Lagrangians it is implicit. Source: Hairer, Lubich & Wanner, Geometric Numerical
+    Integration, II.2.
     """
 
     @property

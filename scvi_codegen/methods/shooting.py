@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, matrix_product
+from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics import euler_lagrange, multiplied_residual, multipliers
 from scvi_codegen.methods.collocation import (
     acceleration_extrapolation,
@@ -73,6 +74,8 @@ class SCVI(Method):
 
     def __post_init__(self) -> None:
         check_count(self.degree, "the degree of a spectral-collocation variational integrator")
+        if not isinstance(self.variational, bool):
+            raise MethodError(f"variational is True or False, not {self.variational!r}")
         object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
 
@@ -211,7 +214,7 @@ def _multiplier_family(system: LagrangianSystem, tableau: Tableau) -> ScalarFami
 
 
 def _curve(tableau: Tableau, at: Vector) -> tuple[Matrix, Matrix, Vector]:
-    """The polynomial through V_i = v0 + sum a_ij z_j at abscissae ``at``: rows for q / h and v, and the row of q1 / h."""
+    """The polynomial through V_i = v0 + sum a_ij z_j at abscissae ``at``: rows for q / h and v, the row of q1 / h."""
     moved = tuple((mp.one, *line) for line in tableau.A)
     position = matrix_product(cardinal_integrals(tableau.c, at, 0), moved)
     velocity = matrix_product(cardinal_values(tableau.c, at), moved)
