@@ -113,6 +113,10 @@ def stepper_for(name: str, method: Method, *, solver: str = "auto", flags: tuple
     return compile_stepper(sample_named(name).system, method, solver=solver, flags=flags)
 
 
+def compile_quickly(system: LagrangianSystem, method: Method) -> Stepper:
+    return compile_stepper(system, method, flags=QUICK_FLAGS)
+
+
 @pytest.fixture(scope="session")
 def sample() -> Callable[[str], Sample]:
     return sample_named
@@ -121,3 +125,9 @@ def sample() -> Callable[[str], Sample]:
 @pytest.fixture(scope="session")
 def compiled() -> Callable[..., Stepper]:
     return stepper_for
+
+
+@pytest.fixture(scope="session")
+def quickly_compiled() -> Callable[[LagrangianSystem, Method], Stepper]:
+    """For systems without a name."""
+    return compile_quickly

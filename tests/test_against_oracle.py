@@ -57,6 +57,7 @@ MANY = (
     RadauIA(1),
     RadauIA(2),
     RadauIA(3),
+    RadauIA(1, form="position"),
     RadauIA(3, form="position"),
     LobattoIIIA(2),
     LobattoIIIA(4),

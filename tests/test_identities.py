@@ -9,7 +9,6 @@ import numpy as np
 import oracle
 import pytest
 
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -256,10 +255,12 @@ def with_gauge(name, order):
     ],
     ids=lambda value: getattr(value, "name", str(value)),
 )
-def test_a_total_derivative_moves_momenta_only_if_the_quadrature_is_exact_for_it(method, order, exact):
+def test_a_total_derivative_moves_momenta_only_if_the_quadrature_is_exact_for_it(
+    quickly_compiled, method, order, exact
+):
     """Along a curve of degree s, d/dt (q^n (1 + t)) is a polynomial of degree n s."""
-    plain = compile_stepper(with_gauge("plain", 0), method)
-    shifted = compile_stepper(with_gauge("gauged", order), method)
+    plain = quickly_compiled(with_gauge("plain", 0), method)
+    shifted = quickly_compiled(with_gauge("gauged", order), method)
     assert exact == (order * method.degree < method.rule.order)
 
     def gradient(q, t):

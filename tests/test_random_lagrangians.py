@@ -11,7 +11,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -138,9 +137,9 @@ def cases(draw):
     )
 
 
-def check(case):
+def check(case, quickly_compiled):
     mechanics = oracle.Mechanics(case.system, case.parameters)
-    stepper = compile_stepper(case.system, case.method)
+    stepper = quickly_compiled(case.system, case.method)
     p = stepper.momentum(case.q, case.v, case.t, case.parameters)
     expected = np.array(oracle.oracle_step(mechanics, case.method.specification(), case.q, p, case.h, case.t))
     found = np.array(stepper.step(case.q, p, case.h, case.t, case.parameters))
@@ -151,14 +150,14 @@ def check(case):
 COMMON = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow], "database": None}
 
 
-@given(cases())
-@settings(max_examples=15, derandomize=True, **COMMON)
-def test_random_steps_are_the_oracles(case):
-    check(case)
+@given(case=cases())
+@settings(max_examples=12, derandomize=True, **COMMON)
+def test_random_steps_are_the_oracles(quickly_compiled, case):
+    check(case, quickly_compiled)
 
 
 @pytest.mark.full
-@given(cases())
+@given(case=cases())
 @settings(max_examples=300, **COMMON)
-def test_many_random_steps_are_the_oracles(case):
-    check(case)
+def test_many_random_steps_are_the_oracles(quickly_compiled, case):
+    check(case, quickly_compiled)

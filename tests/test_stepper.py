@@ -175,9 +175,13 @@ def test_bytes_of_another_length_are_refused(kepler):
         (([1.0, 0.0], [0.0, 1.0], 0.0), "the step h is 0"),
         (([1.0, 0.0], [0.0, 1.0], np.nan), "the step h is nan"),
         (([1.0, 0.0], [0.0, 1.0], np.inf), "the step h is inf"),
+        (([1.0, 0.0], [0.0, 1.0], "small"), "step h"),
+        (([1.0, 0.0], [0.0, 1.0], None), "step h"),
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"muu": 1.0}), "no parameter 'muu' among mu; did you mean 'mu'"),
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": np.inf}), "the parameter mu is inf"),
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, [1.0, 2.0]), r"there are 1 parameters \(mu\), not 2"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": "heavy"}), "mu"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, ["heavy"]), "parameters"),
     ],
 )
 def test_a_wrong_argument_is_named(kepler, arguments, words):
@@ -203,7 +207,28 @@ def test_wrong_counts_and_times_are_named(kepler, arguments, words):
         kepler.integrate(*STATE, h=0.1, **arguments)
 
 
+@pytest.mark.parametrize("t", [np.nan, np.inf, "late"])
+def test_a_time_that_is_no_number_is_named(kepler, t):
+    with pytest.raises(StateError, match=r"\bt\b"):
+        kepler.step(*STATE, 0.1, t)
+    with pytest.raises(StateError, match=r"\bt\b"):
+        kepler.integrate(*STATE, h=0.1, steps=1, t=t)
+
+
+@pytest.mark.parametrize("steps", [-1, 2.5, True])
+def test_a_run_asks_for_a_whole_number_of_steps(kepler, steps):
+    with pytest.raises(StateError, match="steps must be"):
+        kepler.start(*STATE, h=0.1).record(steps)
+
+
+def test_energies_need_one_time_or_one_for_each_state(kepler):
+    with pytest.raises(StateError, match="time"):
+        kepler.energy(np.ones((3, 2)), np.ones((3, 2)), [0.0, 1.0])
+
+
 def test_impossible_options_are_refused():
+    with pytest.raises(StateError, match="max_iterations must be a whole number"):
+        NewtonOptions(max_iterations=2.5)
     with pytest.raises(StateError, match="tolerance must be positive"):
         NewtonOptions(tolerance=0.0)
     with pytest.raises(StateError, match="max_iterations must be at least 1"):

@@ -1,0 +1,6 @@
+"""``python -m scvi_codegen`` is the command line."""
+
+from scvi_codegen.cli import main
+
+if __name__ == "__main__":
+    main()
