@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, Sweep
 
 __all__ = ["lane_functions", "print_expression", "print_lane_results", "print_lane_temporaries", "print_number"]
+
+Sources: TypeAlias = tuple[str, ...]
+"""Loads that differ from lane to lane: ``("u", "t")`` where lanes are points, ``("u", "parameters")`` where they are
+trajectories."""
 
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
 
@@ -44,75 +50,78 @@ def _load(load: Load) -> str:
     return f"w{load.index}" if load.source == "w" else f"{load.source}[{load.index}]"
 
 
-def lane_functions(kernel: Kernel) -> set[str]:
-    """The elementary functions a kernel applies to vectors of points."""
-    vectors = _vectors(kernel)
+def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
+    """The elementary functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
+    vectors = _Vectors(kernel, sources)
     found: set[str] = set()
     for expression in (*kernel.temporaries, *kernel.results):
         _collect_functions(expression, vectors, found)
     return found
 
 
-def print_lane_temporaries(kernel: Kernel) -> list[tuple[str, str, str]]:
-    """(type, name, text) of the temporaries with points as lanes; what does not depend on the point stays a number."""
-    vectors = _vectors(kernel)
+def print_lane_temporaries(kernel: Kernel, sources: Sources) -> list[tuple[str, str, str]]:
+    """(type, name, text) of the temporaries as vectors; what is the same in every lane stays a number."""
+    vectors = _Vectors(kernel, sources)
     return [
-        ("lanes" if k in vectors else "double", f"w{k}", _print_lanes(expression, vectors))
+        ("lanes" if k in vectors.temporaries else "double", f"w{k}", _print_lanes(expression, vectors))
         for k, expression in enumerate(kernel.temporaries)
     ]
 
 
-def print_lane_results(kernel: Kernel, sweep: Sweep) -> list[str]:
+def print_lane_results(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
     """Statements that store the results as vectors; slopes go to their places in the (lower) mass matrix."""
-    vectors = _vectors(kernel)
+    vectors = _Vectors(kernel, sources)
     targets = [f"value[{k}]" for k in range(kernel.values)]
     targets += [f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]" for i, j in sweep.mass_entries]
     statements = []
     for target, expression in zip(targets, kernel.results, strict=False):
         text = _print_lanes(expression, vectors)
-        statements.append(f"{target} = {text};" if _is_vector(expression, vectors) else f"{target} = lanes_of({text});")
+        statements.append(f"{target} = {text};" if vectors.has(expression) else f"{target} = lanes_of({text});")
     return statements
 
 
-def _vectors(kernel: Kernel) -> set[int]:
-    """Indices of the temporaries that differ from point to point."""
-    vectors: set[int] = set()
-    for k, expression in enumerate(kernel.temporaries):
-        if _is_vector(expression, vectors):
-            vectors.add(k)
-    return vectors
+class _Vectors:
+    """Which temporaries of a kernel differ from lane to lane."""
+
+    def __init__(self, kernel: Kernel, sources: Sources) -> None:
+        self.sources, self.temporaries = sources, set[int]()
+        for k, expression in enumerate(kernel.temporaries):
+            if self.has(expression):
+                self.temporaries.add(k)
+
+    def has(self, expression: Expression) -> bool:
+        """Whether the expression is a vector."""
+        if isinstance(expression, Load):
+            return expression.source in self.sources or (
+                expression.source == "w" and expression.index in self.temporaries
+            )
+        return isinstance(expression, Operation) and any(self.has(operand) for operand in expression.operands)
 
 
-def _is_vector(expression: Expression, vectors: set[int]) -> bool:
-    if isinstance(expression, Load):
-        return expression.source in ("u", "t") or (expression.source == "w" and expression.index in vectors)
-    return isinstance(expression, Operation) and any(_is_vector(operand, vectors) for operand in expression.operands)
-
-
-def _collect_functions(expression: Expression, vectors: set[int], found: set[str]) -> None:
+def _collect_functions(expression: Expression, vectors: _Vectors, found: set[str]) -> None:
     if not isinstance(expression, Operation):
         return
-    if expression.operator not in PRECEDENCE and _is_vector(expression, vectors):
+    if expression.operator not in PRECEDENCE and vectors.has(expression):
         found.add(expression.operator)
     for operand in expression.operands:
         _collect_functions(operand, vectors, found)
 
 
-def _print_lanes(expression: Expression, vectors: set[int]) -> str:
+def _print_lanes(expression: Expression, vectors: _Vectors) -> str:
     return print_expression(_with_lane_calls(expression, vectors))
 
 
-def _with_lane_calls(expression: Expression, vectors: set[int]) -> Expression:
+def _with_lane_calls(expression: Expression, vectors: _Vectors) -> Expression:
     """The same with ``f`` of a vector renamed ``lanes_f``, its plain arguments made vectors."""
     if not isinstance(expression, Operation):
         return expression
     operands = tuple(_with_lane_calls(operand, vectors) for operand in expression.operands)
-    if expression.operator in PRECEDENCE or not _is_vector(expression, vectors):
+    if expression.operator in PRECEDENCE or not vectors.has(expression):
         return Operation(expression.operator, operands)
     return Operation(
         f"lanes_{expression.operator}",
         tuple(
-            new if _is_vector(old, vectors) else Operation("lanes_of", (new,))
+            new if vectors.has(old) else Operation("lanes_of", (new,))
             for old, new in zip(expression.operands, operands, strict=True)
         ),
     )

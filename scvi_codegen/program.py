@@ -177,7 +177,8 @@ class Sweep:
 
     Attributes:
         separable: which of the two.
-        points: real points; lanes beyond repeat the last one and have weight 0.
+        points: real points g; lanes beyond repeat the last one and have weight 0.
+        blocks: velocities s that give the curve, g unless the method is an SVI with other points.
         lanes: a power of two.
         abscissae: (lanes,) c_n.
         extrapolation: (lanes, lanes), of F or of V, to the next step.
@@ -189,6 +190,7 @@ class Sweep:
 
     separable: bool
     points: int
+    blocks: int
     lanes: int
     abscissae: tuple[float, ...]
     position: tuple[tuple[float, ...], ...]

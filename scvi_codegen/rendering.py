@@ -32,6 +32,9 @@ MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
 KEEP_FACTORS = 1e-5
 ARGUMENT_NAMES = {2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
+POINT_SOURCES = ("u", "t")
+TRAJECTORY_SOURCES = ("u", "parameters")
+ENSEMBLE_LANES = 8
 VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
@@ -67,6 +70,31 @@ def render(program: Program) -> Source:
         header=environment.get_template("stepper.h.jinja").render(context),
         code=environment.get_template("stepper.c.jinja").render(context),
         declarations=environment.get_template("parts/declarations.h.jinja").render(context),
+    )
+
+
+def render_ensemble(program: Program) -> Source | None:
+    """Header and source that integrate many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
+    if program.sweep is None:
+        return None
+    prefix = f"{program.prefix}_ensemble"
+    context = {
+        "program": program,
+        "prefix": prefix,
+        "purpose": _purposes(program),
+        "tolerance": DEFAULT_TOLERANCE,
+        "max_iterations": MAX_ITERATIONS,
+        "width": ENSEMBLE_LANES,
+        "lane_meaning": "trajectories",
+        "memory_points": program.sweep.points if program.sweep.separable else program.sweep.blocks,
+        **_vector_context(program.sweep, TRAJECTORY_SOURCES),
+    }
+    environment = _environment()
+    return Source(
+        prefix=prefix,
+        header=environment.get_template("ensemble.h.jinja").render(context),
+        code=environment.get_template("ensemble.c.jinja").render(context),
+        declarations=environment.get_template("parts/ensemble_declarations.h.jinja").render(context),
     )
 
 
@@ -137,9 +165,20 @@ def _lane_context(sweep: Sweep | None) -> dict[str, object]:
     """What the templates of the fixed-point solver need; nothing without one."""
     if sweep is None:
         return {}
+    return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points"}
+
+
+def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]:
+    """Kernels in vectors, with the functions they call; ``sources`` differ from lane to lane."""
     kernels = [sweep.kernel] if sweep.separable else [sweep.kernel, sweep.force]
-    functions = sorted(set().union(*(lane_functions(kernel) for kernel in kernels)))
-    return {"sweep": sweep, "lane_kernels": kernels, "lane_functions": functions, "vector_library": VECTOR_LIBRARY}
+    applied = kernels if "t" in sources or not sweep.mass else [*kernels, sweep.mass]
+    return {
+        "sweep": sweep,
+        "lane_kernels": kernels,
+        "lane_functions": sorted(set().union(*(lane_functions(kernel, sources) for kernel in applied))),
+        "vector_library": VECTOR_LIBRARY,
+        "vector_sources": sources,
+    }
 
 
 def _signature(kernel: Kernel) -> str:
@@ -152,15 +191,13 @@ def _signature(kernel: Kernel) -> str:
     return ", ".join(parts)
 
 
-def _lane_signature(kernel: Kernel) -> str:
-    """The same with vectors of points in place of numbers."""
-    return (
-        _signature(kernel)
-        .replace("const double *u", "const lanes *u")
-        .replace("double t", "lanes t")
-        .replace("double *value", "lanes *value")
-        .replace("double *slope", "lanes *slope")
-    )
+def _lane_signature(kernel: Kernel, sources: tuple[str, ...]) -> str:
+    """The same with vectors in place of numbers."""
+    signature = _signature(kernel).replace("const double *u", "const lanes *u").replace("double *value", "lanes *value")
+    signature = signature.replace("double *slope", "lanes *slope")
+    if "t" in sources:
+        return signature.replace("double t", "lanes t")
+    return signature.replace("const double *parameters", "const lanes *parameters")
 
 
 def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:

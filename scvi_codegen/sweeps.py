@@ -157,6 +157,7 @@ def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, s
     return Sweep(
         separable=separable,
         points=points,
+        blocks=blocks,
         lanes=lanes,
         abscissae=_vector(tuple(mp.fsum(line) for line in weighted), lanes, repeat=True),
         position=_matrix(tables.position, lanes),

@@ -175,14 +175,14 @@ def test_kepler_keeps_its_angular_momentum_to_round_off(compiled, method):
     entry = problem("kepler")
     run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
-    assert np.abs(L - L[0]).max() < 2e-13
+    assert np.abs(L - L[0]).max() < 2e-14
 
 
 def test_newtons_solver_keeps_it_too(compiled):
     entry = problem("kepler")
     run = compiled("kepler", SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
-    assert np.abs(L - L[0]).max() < 2e-13
+    assert np.abs(L - L[0]).max() < 2e-14
 
 
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)

@@ -1,0 +1,282 @@
+"""What is measured: problems with eight initial states each, and their accelerations solved for by hand.
+
+The accelerations are written once, for numbers of any kind: NumPy's extended precision (the references), heyoka's and
+SymEngine's expressions, traced text. They owe nothing to the derivation that the project's own steppers go through.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.expression_text import closest
+from scvi_codegen.problems import problem
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["CASES", "STATES", "Case", "Formulation", "case"]
+
+Array = NDArray[np.float64]
+Vector = Sequence[Any]
+Rates = Callable[[Vector, Mapping[str, Any], Any], list[Any]]
+"""Derivative of a first-order state x, from (x, parameters, a module with sin, cos and sqrt)."""
+
+STATES = 8
+"""Initial states of a case: its error is the root of the mean square over them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Formulation:
+    """A first-order system x' = rates(x) for (q, v), or for (q, p).
+
+    Attributes:
+        name: how it was found, for the reader.
+        rates: the derivative of x.
+        momenta: whether the second half of x are momenta.
+    """
+
+    name: str
+    rates: Rates
+    momenta: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Case:
+    """One problem of the benchmark.
+
+    Attributes:
+        name: on the command line.
+        system: the Lagrangian, with the parameters of this case.
+        formulations: hand-solved first-order systems; the first one is in (q, v).
+        q, velocity: (8, m) initial states.
+        span: length of time.
+        step: the middle of the ladder of step sizes, the catalogue's own where it has this problem.
+        fine: a step with which a Gauss method of 16 stages reaches 1e-18, for the reference.
+        bodies: masses (and the constant of gravity) if coordinates are Cartesian positions of gravitating bodies.
+        masses: (m,) constant masses of the coordinates where momenta differ from velocities by a rounding; ``None``
+            where p = dL/dv is exact at the initial states (unit masses, or rest).
+    """
+
+    name: str
+    system: LagrangianSystem
+    formulations: tuple[Formulation, ...]
+    q: Array
+    velocity: Array
+    span: float
+    step: float
+    fine: float
+    bodies: Bodies | None = None
+    masses: tuple[float, ...] | None = None
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by name."""
+        return dict(zip((str(symbol) for symbol in self.system.parameters), self.system.defaults, strict=True))
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return self.q.shape[1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bodies:
+    """Point masses that attract each other.
+
+    Attributes:
+        masses: of the bodies; 0 for one that only follows.
+        gravity: Newton's constant in the units of the case.
+        fixed_centre: whether a mass at rest in the origin comes before the coordinates' own bodies.
+        axes: coordinates of each body, 2 or 3.
+    """
+
+    masses: tuple[float, ...]
+    gravity: float
+    fixed_centre: bool
+    axes: int
+
+
+def second_order(accelerations: Callable[[Vector, Vector, Mapping[str, Any], Any], list[Any]]) -> Rates:
+    """First-order rates of (q, v) from accelerations."""
+
+    def rates(x: Vector, parameters: Mapping[str, Any], functions: Any) -> list[Any]:
+        m = len(x) // 2
+        return [*x[m:], *accelerations(x[:m], x[m:], parameters, functions)]
+
+    return rates
+
+
+def pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """q'' = -(g / l) sin q."""
+    return [-(of["g"] / of["l"]) * functions.sin(q[0])]
+
+
+def duffing(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """q'' = -alpha q - beta q^3, without drive."""
+    return [-(of["alpha"] + of["beta"] * (q[0] * q[0])) * q[0]]
+
+
+def kepler(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """q'' = -mu q / |q|^3."""
+    pull = -of["mu"] * (q[0] * q[0] + q[1] * q[1]) ** -1.5
+    return [pull * q[0], pull * q[1]]
+
+
+def gravitation(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """Newton's law for bodies in space, each pair once."""
+    masses = [value for name, value in of.items() if name.startswith("m_")]
+    result: list[Any] = [0.0] * len(q)
+    for one in range(len(masses)):
+        for two in range(one):
+            d = [q[3 * one + axis] - q[3 * two + axis] for axis in range(3)]
+            pull = of["G"] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) ** -1.5
+            for axis in range(3):
+                result[3 * one + axis] = result[3 * one + axis] - masses[two] * (pull * d[axis])
+                result[3 * two + axis] = result[3 * two + axis] + masses[one] * (pull * d[axis])
+    return result
+
+
+def double_pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """The 2 x 2 mass matrix inverted by hand."""
+    m1, m2, l1, l2, g = (of[name] for name in ("m1", "m2", "l1", "l2", "g"))
+    sine, cosine = functions.sin(q[0] - q[1]), functions.cos(q[0] - q[1])
+    first = -m2 * l2 * (v[1] * v[1]) * sine - (m1 + m2) * g * functions.sin(q[0])
+    second = l1 * (v[0] * v[0]) * sine - g * functions.sin(q[1])
+    denominator = m1 + m2 * (sine * sine)
+    return [
+        (first - m2 * cosine * second) / (l1 * denominator),
+        ((m1 + m2) * second - cosine * first) / (l2 * denominator),
+    ]
+
+
+def relativistic(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """q'' = -(k / m) q (1 - v^2/c^2)^(3/2)."""
+    return [-(of["k"] / of["m"]) * q[0] * (1.0 - v[0] * v[0] / (of["c"] * of["c"])) ** 1.5]
+
+
+def relativistic_in_momenta(x: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """q' = p / sqrt(m^2 + p^2/c^2), p' = -k q."""
+    return [x[1] * (of["m"] * of["m"] + x[1] * x[1] / (of["c"] * of["c"])) ** -0.5, -of["k"] * x[0]]
+
+
+def chain(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """Unit masses between fixed ends, on springs of force d + beta d^3 (alpha = 0)."""
+    stretches = [q[0], *(right - left for left, right in pairwise(q)), -q[-1]]
+    forces = [(1.0 + of["beta"] * (d * d)) * d for d in stretches]
+    return [right - left for left, right in pairwise(forces)]
+
+
+def _scaled(state: Sequence[float], spread: float) -> Array:
+    """(8, m) states proportional to one, within +- spread of it, at incommensurable places."""
+    golden = (math.sqrt(5.0) - 1.0) / 2.0
+    factors = 1.0 + spread * (2.0 * np.modf(golden * np.arange(1, STATES + 1))[0] - 1.0)
+    return factors[:, None] * np.asarray(state, dtype=float)
+
+
+def _rotated(vector: Sequence[float], axes: int) -> Array:
+    """(8, m) states: each body's vector under eight rotations and reflections, the same in every run."""
+    random = np.random.default_rng(1)
+    parts = np.asarray(vector, dtype=float).reshape(-1, axes)
+    matrices = [np.linalg.qr(random.standard_normal((axes, axes)))[0] for _ in range(STATES)]
+    return np.array([(parts @ matrix.T).ravel() for matrix in matrices])
+
+
+def _small_case(name: str, rates: tuple[Formulation, ...], *, span: float, fine: float, **changes: Any) -> Case:
+    """A problem of the catalogue with its own state (or another one at rest), spread by 5 %."""
+    entry = problem(name)
+    q, velocity = changes.pop("q", entry.q), changes.pop("velocity", entry.velocity)
+    step = changes.pop("step", entry.step)
+    return Case(
+        name=name,
+        system=entry.system.with_parameters(**changes),
+        formulations=rates,
+        q=_scaled(q, 0.05),
+        velocity=_scaled(velocity, 0.05),
+        span=span,
+        step=step,
+        fine=fine,
+    )
+
+
+def _hand_solved(accelerations: Callable[..., list[Any]]) -> tuple[Formulation, ...]:
+    return (Formulation(name="hand-solved accelerations", rates=second_order(accelerations)),)
+
+
+def _kepler_case(eccentricity: float, step: float, fine: float) -> Case:
+    entry = problem("kepler")
+    speed = math.sqrt((1.0 + eccentricity) / (1.0 - eccentricity))
+    return Case(
+        name=f"kepler:{eccentricity}",
+        system=entry.system,
+        formulations=_hand_solved(kepler),
+        q=_rotated((1.0 - eccentricity, 0.0), 2),
+        velocity=_rotated((0.0, speed), 2),
+        span=2000.0,
+        step=step,
+        fine=fine,
+        bodies=Bodies(masses=(0.0,), gravity=1.0, fixed_centre=True, axes=2),
+    )
+
+
+def _outer_solar_system() -> Case:
+    entry = problem("outer-solar-system")
+    values = dict(zip((str(symbol) for symbol in entry.system.parameters), entry.system.defaults, strict=True))
+    masses = tuple(value for name, value in values.items() if name.startswith("m_"))
+    return Case(
+        name="outer-solar-system",
+        system=entry.system,
+        formulations=_hand_solved(gravitation),
+        q=_rotated(entry.q, 3),
+        velocity=_rotated(entry.velocity, 3),
+        span=entry.span,
+        step=entry.step,
+        fine=256.0,
+        bodies=Bodies(masses=masses, gravity=values["G"], fixed_centre=False, axes=3),
+        masses=tuple(mass for mass in masses for _ in range(3)),
+    )
+
+
+def _chain_case(n: int) -> Case:
+    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=1.0, step=1.0)
+
+
+def _relativistic_case() -> Case:
+    momenta = Formulation(name="Hamilton's equations", rates=relativistic_in_momenta, momenta=True)
+    name, both = "relativistic-particle", (*_hand_solved(relativistic), momenta)
+    return _small_case(name, both, span=1000.0, fine=0.25)
+
+
+CASES: Mapping[str, Callable[[], Case]] = {
+    "planar-pendulum": lambda: _small_case(
+        "planar-pendulum", _hand_solved(pendulum), span=1000.0, fine=0.5, q=(0.5,), step=0.8
+    ),
+    "duffing": lambda: _small_case("duffing", _hand_solved(duffing), span=2000.0, fine=0.25),
+    "kepler:0.2": lambda: _kepler_case(0.2, 0.5, 0.375),
+    "kepler:0.5": lambda: _kepler_case(0.5, 0.25, 0.1875),
+    "outer-solar-system": _outer_solar_system,
+    "double-pendulum": lambda: _small_case(
+        "double-pendulum", _hand_solved(double_pendulum), span=1000.0, fine=0.25, q=(0.5, 0.5), step=0.4, g=1.0
+    ),
+    "relativistic-particle": _relativistic_case,
+    "fput-chain:8": lambda: _chain_case(8),
+    "fput-chain:64": lambda: _chain_case(64),
+    "fput-chain:256": lambda: _chain_case(256),
+}
+"""The cases of the table: name on the command line -> function that builds one."""
+
+
+def case(name: str) -> Case:
+    """Build a case.
+
+    Raises:
+        SystemDefinitionError: if there is none of that name.
+    """
+    if name not in CASES:
+        raise SystemDefinitionError(f"no case is called '{name}'{closest(name, CASES)} Known: {', '.join(CASES)}")
+    return CASES[name]()

@@ -1,0 +1,203 @@
+"""Where a case ends, to 18 digits: Gauss's method of 16 stages in extended precision, fixed step, compensated sums.
+
+It works in NumPy's ``longdouble`` (80 bits on x86, 128 on 64-bit Arm under Linux), for the eight states at once, and
+knows nothing of the project's steppers: its right-hand sides are the hand-solved ones of :mod:`.cases`, its tables come
+from mpmath here. Tables are kept as sums of two numbers and steps are short binary fractions, so that neither brings in
+a systematic error. Each reference is computed with two different steps, and their difference is kept as its accuracy.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpmath import mp, polyroots, taylor
+from numpy.typing import NDArray
+
+from scvi_codegen import building
+from scvi_codegen.benchmark.cases import Array, Case
+from scvi_codegen.errors import StateError
+from scvi_codegen.trajectory import write_atomically
+
+__all__ = ["Reference", "final_states", "gauss_tables", "reference", "rms_error"]
+
+Extended = NDArray[np.longdouble]
+Field = Callable[[Extended], Extended]
+
+STAGES = 16
+MOST_SWEEPS = 100
+DIGITS = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """Positions at the end.
+
+    Attributes:
+        high, low: (8, m) positions as sums of two doubles.
+        accuracy: difference of two computations with different steps, measured like every error here.
+    """
+
+    high: Array
+    low: Array
+    accuracy: float
+
+
+def rms_error(q: Array, reference: Reference) -> float:
+    """Root mean square over the states of |q - reference|, relative to that of |reference|; (8, m) positions."""
+    return _rms((q - reference.high) - reference.low) / _rms(reference.high)
+
+
+def _rms(positions: NDArray[Any]) -> float:
+    return float(np.sqrt(np.mean(np.sum(np.square(positions), axis=1))))
+
+
+def reference(case: Case, momenta: Array | None = None) -> Reference:
+    """The reference of a case, from the user's cache folder or computed now (seconds to a minute).
+
+    Args:
+        case: what to compute.
+        momenta: (8, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p); it
+            matters only where the masses of the case are given.
+    """
+    velocity = case.velocity.astype(np.longdouble)
+    if momenta is not None and case.masses is not None:
+        velocity = momenta.astype(np.longdouble) / np.array(case.masses, dtype=np.longdouble)
+    path = building.cache_folder() / "references" / f"{_key(case, velocity)}.npz"
+    found = _read(path)
+    if found is None:
+        found = _compute(case, velocity)
+        _write(path, found)
+    return found
+
+
+def _key(case: Case, velocity: Extended) -> str:
+    """Everything the result depends on."""
+    digest = hashlib.sha256(inspect.getsource(inspect.getmodule(_key)).encode())  # type: ignore[arg-type]
+    digest.update(inspect.getsource(inspect.getmodule(Case)).encode())  # type: ignore[arg-type]
+    for array in (case.q, *_two_doubles(velocity)):
+        digest.update(array.tobytes())
+    digest.update(repr((case.name, case.parameters, case.span, case.fine, str(np.finfo(np.longdouble)))).encode())
+    return digest.hexdigest()[:24]
+
+
+def _read(path: Path) -> Reference | None:
+    try:
+        with np.load(path) as file:
+            return Reference(high=file["high"], low=file["low"], accuracy=float(file["accuracy"]))
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _write(path: Path, result: Reference) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {"high": result.high, "low": result.low, "accuracy": np.array(result.accuracy)}
+        write_atomically(path, lambda file: np.savez(file, **arrays))
+    except OSError:
+        return  # a cache that cannot be written is no cache
+
+
+def _compute(case: Case, velocity: Extended) -> Reference:
+    if np.finfo(np.longdouble).eps > 1e-18:
+        raise StateError("references need a long double of at least 64 digits, which this machine's NumPy has not")
+    parameters = {name: np.longdouble(value) for name, value in case.parameters.items()}
+    start = np.concatenate([case.q.astype(np.longdouble), velocity], axis=1)
+
+    def field(x: Extended) -> Extended:
+        rates = case.formulations[0].rates(list(np.moveaxis(x, -1, 0)), parameters, np)
+        return np.stack(rates, axis=-1)
+
+    fine, finer = (final_states(field, start, case.span, case.fine * factor) for factor in (1.0, 0.75))
+    m = case.dimension
+    high, low = _two_doubles(finer[:, :m])
+    accuracy = _rms((fine - finer)[:, :m]) / _rms(high)
+    return Reference(high=high, low=low, accuracy=accuracy)
+
+
+def _two_doubles(x: Extended) -> tuple[Array, Array]:
+    high = x.astype(np.float64)
+    return high, (x - high).astype(np.float64)
+
+
+def final_states(field: Field, start: Extended, span: float, h: float) -> Extended:
+    """(k, d) states after ``span``, by steps of h, a number of few binary digits, and a last shorter one.
+
+    Args:
+        field: x' for x of shape (..., d).
+        start: (k, d) initial states.
+        span: length of time.
+        h: step size.
+    """
+    a, b, guess_table = gauss_tables(STAGES)
+    whole = int(span // h)
+    x, carry, stages = start.copy(), np.zeros_like(start), None
+    for size in [h] * whole + ([span - whole * h] if span > whole * h else []):
+        guess = None if stages is None or size != h else _product(guess_table, stages)
+        stages = _stages(field, x + carry, np.longdouble(size), a, guess)
+        change = carry + np.longdouble(size) * _product(b, stages)[0]
+        new = x + change
+        carry = change - (new - x)
+        x = new
+    return x + carry
+
+
+Table = tuple[Extended, Extended]
+
+
+def _product(table: Table, values: Extended) -> Extended:
+    """(rows, s) table times (s, k, d) values."""
+    flat = values.reshape(values.shape[0], -1)
+    result = table[0] @ flat + table[1] @ flat
+    return result.reshape(-1, *values.shape[1:])
+
+
+def _stages(field: Field, x: Extended, h: np.longdouble, a: Table, guess: Extended | None) -> Extended:
+    """(s, k, d) slopes F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
+    slopes = np.broadcast_to(field(x), (len(a[0]), *x.shape)).copy() if guess is None else guess
+    last = np.inf
+    for _ in range(MOST_SWEEPS):
+        new = field(x + h * _product(a, slopes))
+        change = float(np.max(np.abs(new - slopes)) / np.max(np.abs(new)))
+        slopes = new
+        if change == 0.0 or (change < 1e-16 and change >= 0.3 * last):
+            return slopes
+        last = change
+    raise StateError(f"the reference did not converge with steps of {float(h):g} (last change {change:.1e})")
+
+
+def gauss_tables(stages: int) -> tuple[Table, Table, Table]:
+    """Gauss's A and b, and the table that extrapolates slopes by one step, as sums of two extended numbers."""
+    with mp.workdps(DIGITS):
+        legendre = list(reversed(taylor(lambda x: mp.legendre(stages, 2 * x - 1), 0, stages)))
+        c = sorted(polyroots(legendre, maxsteps=500, extraprec=400), key=lambda root: root.real)
+        powers = mp.matrix([[x**k for k in range(stages)] for x in c])
+        inverse = powers**-1
+        integrals = mp.matrix([[x ** (k + 1) / (k + 1) for k in range(stages)] for x in [*c, mp.one]])
+        ahead = mp.matrix([[(1 + x) ** k for k in range(stages)] for x in c])
+        both, guess = integrals * inverse, ahead * inverse
+        return _table(both[:stages, :]), _table(both[stages:, :]), _table(guess)
+
+
+def _table(matrix: Any) -> Table:
+    rows = [[mp.nstr(entry.real, 40) for entry in matrix[n, :]] for n in range(matrix.rows)]
+    high = np.array([[np.longdouble(entry) for entry in row] for row in rows])
+    low = np.array(
+        [
+            [np.longdouble(mp.nstr(mp.mpf(entry) - _exact(rounded), 25)) for entry, rounded in zip(*pair, strict=True)]
+            for pair in zip(rows, high, strict=True)
+        ]
+    )
+    return high, low
+
+
+def _exact(x: np.longdouble) -> Any:
+    """An extended number as a sum of doubles in mpmath."""
+    high = float(x)
+    middle = float(x - np.longdouble(high))
+    return mp.mpf(high) + mp.mpf(middle) + mp.mpf(float(x - np.longdouble(high) - np.longdouble(middle)))
