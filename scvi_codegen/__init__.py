@@ -63,7 +63,7 @@ _HOMES = {
         "gauss_lobatto",
         "gauss_radau",
     ),
-    "stepper": ("NewtonOptions", "Run", "Stepper"),
+    "stepper": ("SolverOptions", "Run", "Stepper"),
     "system": ("LagrangianSystem",),
     "trajectory": ("Trajectory",),
 }

@@ -49,7 +49,7 @@ from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
-    from scvi_codegen.stepper import Array, NewtonOptions, Run, Stepper
+    from scvi_codegen.stepper import Array, SolverOptions, Run, Stepper
 
 __all__ = ["DEFAULT_METHOD", "Model", "dump_model", "load_model", "parse_model", "save_model"]
 
@@ -141,7 +141,7 @@ class Model:
         assert self.velocity is not None  # by construction
         return stepper.momentum(self.q, self.velocity, self.t, self.system.defaults)
 
-    def start(self, stepper: Stepper, *, options: NewtonOptions | None = None) -> Run:
+    def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
         """The run of this model from its initial state; advance it by :attr:`step_count` steps."""
         p = self.momenta(stepper)
         return stepper.start(self.q, p, h=self.h, t=self.t, parameters=self.system.defaults, options=options)

@@ -173,14 +173,15 @@ class Sweep:
         P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j).
 
     Separable systems (constant diagonal mass, forces of position and time) iterate on the points,
-    q_n = q0 + h c_n v0 + h^2 sum_j product[n][j] F_j / mass; others on the velocities, V += L_vv^-1 (P - L_v).
+    q_n = q0 + h drift[n] v0 + h^2 sum_j product[n][j] F_j / mass; others on the velocities, V += L_vv^-1 (P - L_v).
 
     Attributes:
         separable: which of the two.
         points: real points g; lanes beyond repeat the last one and have weight 0.
         blocks: velocities s that give the curve, g unless the method is an SVI with other points.
         lanes: a power of two.
-        abscissae: (lanes,) c_n.
+        abscissae: (lanes,) c_n, where time stands.
+        drift: (lanes,) row sums of the position table, c_n for collocation methods.
         extrapolation: (lanes, lanes), of F or of V, to the next step.
         kernel: F at (q, t); or F, L_v and the mass at (q, V, t).
         force: F alone.
@@ -193,6 +194,7 @@ class Sweep:
     blocks: int
     lanes: int
     abscissae: tuple[float, ...]
+    drift: tuple[float, ...]
     position: tuple[tuple[float, ...], ...]
     position_weights: tuple[float, ...]
     momentum: tuple[tuple[float, ...], ...]

@@ -24,7 +24,7 @@ from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["NewtonOptions", "Run", "Stepper"]
+__all__ = ["SolverOptions", "Run", "Stepper"]
 
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -35,12 +35,13 @@ ADVICE = {
     "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
+MOST_ITERATIONS = 10**6
 SLICE_SECONDS = 0.1
 """Time between looks at the keyboard (and calls of ``progress``) during an integration."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NewtonOptions:
+class SolverOptions:
     """When the iteration on the stage equations has converged.
 
     Attributes:
@@ -56,8 +57,9 @@ class NewtonOptions:
     def __post_init__(self) -> None:
         if not self.tolerance > 0.0:
             raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
-        if self.max_iterations < 1:
-            raise StateError(f"max_iterations must be at least 1, not {self.max_iterations!r}")
+        _whole_number(self.max_iterations, "max_iterations", least=1)
+        if self.max_iterations > MOST_ITERATIONS:
+            raise StateError(f"max_iterations must be at most {MOST_ITERATIONS}, not {self.max_iterations}")
 
 
 class Stepper:
@@ -115,7 +117,7 @@ class Stepper:
         t: float = 0.0,
         parameters: Parameters = None,
         *,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
         """One step from (q, p) at t to t + h, a function of its arguments alone.
 
@@ -137,7 +139,7 @@ class Stepper:
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
         report = self._new("report *")
         status = self._call("step")(
-            float(t),
+            _finite(t, "the time t"),
             _step_size(h),
             self._pointer(q0),
             self._pointer(p0),
@@ -162,7 +164,7 @@ class Stepper:
         every: int = 1,
         t: float = 0.0,
         parameters: Parameters = None,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Trajectory:
         """Run ``steps`` steps and keep every ``every``-th state, the initial one first.
@@ -183,9 +185,8 @@ class Stepper:
             StateError: on wrong shapes, names or numbers.
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
-        count = _whole_number(steps, "steps", least=0)
         run = self.start(q, p, h=h, t=t, parameters=parameters, options=options)
-        return run.record(count, every=every, progress=progress)
+        return run.record(steps, every=every, progress=progress)
 
     def start(
         self,
@@ -195,15 +196,15 @@ class Stepper:
         h: float,
         t: float = 0.0,
         parameters: Parameters = None,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
     ) -> Run:
         """A run from (q, p) at t with step h, to be advanced at will."""
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
         memory = self._new("run *")
-        self._call("start")(memory, _finite(t, "t"), _step_size(h), self._pointer(q0), self._pointer(p0))
+        self._call("start")(memory, _finite(t, "the time t"), _step_size(h), self._pointer(q0), self._pointer(p0))
         return Run(self, memory, self._parameters(parameters), options)
 
-    def restore(self, saved: bytes, *, parameters: Parameters = None, options: NewtonOptions | None = None) -> Run:
+    def restore(self, saved: bytes, *, parameters: Parameters = None, options: SolverOptions | None = None) -> Run:
         """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have."""
         memory = self._new("run *")
         buffer = self._ffi.buffer(memory)
@@ -230,7 +231,10 @@ class Stepper:
                 f"states must have shape (n, {self.dimension}), not q {positions.shape} and p {momenta.shape}"
             )
         count = positions.size // self.dimension
-        times = np.ascontiguousarray(np.broadcast_to(np.asarray(t, dtype=float), (count,)))
+        times = np.asarray(t, dtype=float)
+        if times.shape not in ((), (count,)):
+            raise StateError(f"there are {count} states, but the time has shape {times.shape}")
+        times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
         positions, momenta = np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
         result = np.empty(count)
         status = self._call("energies")(
@@ -254,7 +258,7 @@ class Stepper:
         t: float = 0.0,
         parameters: Parameters = None,
         *,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
     ) -> float:
         """L_d(q0, q1), the approximate action of the curve from q0 at t to q1 at t + h; paper (25), (33).
 
@@ -272,7 +276,7 @@ class Stepper:
         t: float = 0.0,
         parameters: Parameters = None,
         *,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
         """F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
         return self._vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
@@ -285,7 +289,7 @@ class Stepper:
         t: float = 0.0,
         parameters: Parameters = None,
         *,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
         """F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
         return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
@@ -298,7 +302,7 @@ class Stepper:
         t: float = 0.0,
         parameters: Parameters = None,
         *,
-        options: NewtonOptions | None = None,
+        options: SolverOptions | None = None,
     ) -> Array:
         """The discrete Euler-Lagrange equation (4): (q_{k-1} at t, q_k at t + h) -> q_{k+1} at t + 2 h.
 
@@ -314,7 +318,7 @@ class Stepper:
         h: float,
         t: float,
         parameters: Parameters,
-        options: NewtonOptions | None,
+        options: SolverOptions | None,
     ) -> tuple[Array, Array, float]:
         if not self.interface.has_action:
             raise MethodError(f"{self.interface.method} has no discrete Lagrangian; SVI, SCVI and Gauss methods have")
@@ -322,7 +326,7 @@ class Stepper:
         p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
         report = self._new("report *")
         status = self._call("discrete_legendre")(
-            _finite(t, "t"),
+            _finite(t, "the time t"),
             _step_size(h),
             self._pointer(start),
             self._pointer(end),
@@ -341,7 +345,7 @@ class Stepper:
     def _transform(self, name: str, q: Array, other: Array, t: float, parameters: Parameters) -> Array:
         result = np.empty_like(other)
         status = self._call(name)(
-            _finite(t, "t"),
+            _finite(t, "the time t"),
             self._pointer(q),
             self._pointer(other),
             self._pointer(self._parameters(parameters)),
@@ -366,7 +370,7 @@ class Stepper:
     def _workspace(self) -> Any:
         return self._pointer(np.empty(self.interface.workspace))
 
-    def _options(self, options: NewtonOptions | None) -> Any:
+    def _options(self, options: SolverOptions | None) -> Any:
         if options is None:
             return self._ffi.NULL
         values = [options.tolerance, options.max_iterations, int(options.absolute)]
@@ -392,9 +396,12 @@ class Stepper:
             return values
         if isinstance(parameters, Mapping):
             for name, value in parameters.items():
-                values[self._parameter_index(name)] = value
+                values[self._parameter_index(name)] = _finite(value, f"the parameter {name}")
         else:
-            given = np.array(parameters, dtype=float)
+            try:
+                given = np.array(parameters, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise StateError(f"parameters must be real numbers: {error}") from error
             if given.shape != values.shape:
                 names = ", ".join(self.parameters) or "none"
                 raise StateError(f"there are {len(values)} parameters ({names}), not {given.size}")
@@ -407,7 +414,8 @@ class Stepper:
     def _parameter_index(self, name: str) -> int:
         if name in self.parameters:
             return self.parameters.index(name)
-        near = difflib.get_close_matches(name, self.parameters, 1)
+        folded = {parameter.lower(): parameter for parameter in self.parameters}
+        near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise StateError(f"there is no parameter {name!r} among {', '.join(self.parameters) or 'none'}{hint}")
 
@@ -425,7 +433,7 @@ class Stepper:
 class Run:
     """An integration under way: a state, and the memory that makes the next step cheap and the sums exact."""
 
-    def __init__(self, stepper: Stepper, memory: Any, parameters: Array, options: NewtonOptions | None) -> None:
+    def __init__(self, stepper: Stepper, memory: Any, parameters: Array, options: SolverOptions | None) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
 
     @property
@@ -458,6 +466,7 @@ class Run:
         Raises:
             StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
         """
+        steps = _whole_number(steps, "steps", least=0)
         every = _whole_number(every, "every", least=1)
         first = self.steps
         capacity = (first + steps) // every - first // every
@@ -518,7 +527,10 @@ def _rebuild(source: Source, interface: Interface, flags: tuple[str, ...]) -> St
 
 
 def _finite(value: float, name: str) -> float:
-    number = float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise StateError(f"{name} must be a real number, not {value!r}") from error
     if not math.isfinite(number):
         raise StateError(f"{name} is {number}")
     return number

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from conftest import sample_named
 
+from scvi_codegen.building import TUNED_FLAGS, _mathematics
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.methods import (
     SCVI,
@@ -155,6 +156,16 @@ def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_pa
     sources = [generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
     files = write(sources, tmp_path)
     run([tool(compiler), *C99, "-c", *files], tmp_path)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_tuned_builds_compile_without_a_warning(compiler, tmp_path):
+    """With the vector instructions of this processor, and with glibc's vector functions where those are."""
+    names = ("double-pendulum", "driven-duffing")
+    sources = [generate_source(systems()[name], method)[0] for method in (SVI(3), Gauss(5)) for name in names]
+    files = write(sources, tmp_path)
+    for define, _ in _mathematics(TUNED_FLAGS):
+        run([tool(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
 
 
 # Equal bytes.

@@ -12,7 +12,7 @@ import pytest
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.problems import problem
-from scvi_codegen.stepper import NewtonOptions
+from scvi_codegen.stepper import SolverOptions
 
 METHODS = (SVI(3), SCVI(3), SpectralCollocation(2), RadauIIA(2), StoermerVerlet(), ExplicitEuler())
 SYMMETRIC = (SVI(3), SVI(2, "gauss-lobatto:3"), StoermerVerlet(), Gauss(2))
@@ -228,11 +228,11 @@ def test_energies_need_one_time_or_one_for_each_state(kepler):
 
 def test_impossible_options_are_refused():
     with pytest.raises(StateError, match="max_iterations must be a whole number"):
-        NewtonOptions(max_iterations=2.5)
+        SolverOptions(max_iterations=2.5)
     with pytest.raises(StateError, match="tolerance must be positive"):
-        NewtonOptions(tolerance=0.0)
+        SolverOptions(tolerance=0.0)
     with pytest.raises(StateError, match="max_iterations must be at least 1"):
-        NewtonOptions(max_iterations=0)
+        SolverOptions(max_iterations=0)
 
 
 def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
@@ -276,7 +276,7 @@ def falling(compiled):
 
 def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step(compiled):
     stepper, state = falling(compiled)
-    run = stepper.start(*state, h=0.05, options=NewtonOptions(max_iterations=8))
+    run = stepper.start(*state, h=0.05, options=SolverOptions(max_iterations=8))
     with pytest.raises(StepFailedError) as caught:
         run.record(400, every=2)
     error, kept = caught.value, caught.value.trajectory
@@ -296,7 +296,7 @@ def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step
 
 def test_a_failed_run_can_go_on_with_better_options(compiled):
     state = compiled("kepler", SVI(4)), STATE
-    run = state[0].start(*STATE, h=0.3, options=NewtonOptions(max_iterations=1))
+    run = state[0].start(*STATE, h=0.3, options=SolverOptions(max_iterations=1))
     with pytest.raises(StepFailedError, match=r"not converged.*more iterations"):
         run.record(3)
     assert state[0].restore(run.save()).record(3).q[-1] == pytest.approx(
@@ -320,7 +320,7 @@ def test_the_relative_rule_does_not_depend_on_units(compiled):
 
 def test_a_looser_tolerance_saves_iterations_and_costs_digits(kepler):
     tight = kepler.integrate(*STATE, h=0.2, steps=50)
-    loose = kepler.integrate(*STATE, h=0.2, steps=50, options=NewtonOptions(tolerance=1e-4))
+    loose = kepler.integrate(*STATE, h=0.2, steps=50, options=SolverOptions(tolerance=1e-4))
     assert loose.iterations.sum() < tight.iterations.sum()
     assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
 
@@ -333,12 +333,12 @@ def test_the_absolute_rule_compares_the_update_itself(kepler):
     def iterations(options, q=STATE[0], p=STATE[1], parameters=None):
         return kepler.integrate(q, p, h=0.1, steps=20, parameters=parameters, options=options).iterations.sum()
 
-    relative, absolute = (NewtonOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
+    relative, absolute = (SolverOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
     assert iterations(relative) == iterations(relative, **large)
     assert iterations(absolute) < iterations(absolute, **large)
     exact = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"])
     for bound in (1e3, 1e-3):
-        options = NewtonOptions(tolerance=bound, absolute=True)
+        options = SolverOptions(tolerance=bound, absolute=True)
         found = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"], options=options)
         assert np.abs(np.array(found) - exact).max() < bound
 

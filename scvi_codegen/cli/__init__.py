@@ -118,11 +118,11 @@ def run(
     _check_outputs(output, plot)
     model = read_model(model_name, Choices(**choices))
     from scvi_codegen.cli.running import integrate_model, summary
-    from scvi_codegen.stepper import NewtonOptions
+    from scvi_codegen.stepper import SolverOptions
 
     given = {"tolerance": tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
-    options = NewtonOptions(**chosen)
+    options = SolverOptions(**chosen)
     outcome = integrate_model(model, solver=solver, options=options)
     click.echo(summary(model, outcome))
     written = _write_outputs(outcome, output, plot)

@@ -18,7 +18,7 @@ from scvi_codegen.cli.conservation import energy_report, momentum_maps
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.model_file import Model
-from scvi_codegen.stepper import NewtonOptions, Run
+from scvi_codegen.stepper import SolverOptions, Run
 from scvi_codegen.trajectory import Trajectory
 
 __all__ = ["Outcome", "integrate_model", "summary"]
@@ -48,7 +48,7 @@ class Outcome:
     interrupted: bool
 
 
-def integrate_model(model: Model, *, solver: str = "auto", options: NewtonOptions | None = None) -> Outcome:
+def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> Outcome:
     """Run a model with a progress bar, as far as it goes.
 
     Raises:

@@ -261,7 +261,7 @@ def position_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
         abscissae=tableau.c,
         weights=(mp.one,) * size,
         weight_names=("",) * size,
-        gathers=acceleration_gathers(system, tableau.c, tableau.A),
+        gathers=acceleration_gathers(system, tableau.A),
         scatters=(
             Scatter(
                 results=euler_lagrange(system),
@@ -297,16 +297,20 @@ def acceleration_unknowns(size: int) -> tuple[Block, ...]:
 
 
 def acceleration_gathers(
-    system: LagrangianSystem, abscissae: Vector, A: Matrix, *, other_blocks: int = 0
+    system: LagrangianSystem, A: Matrix, *, other_blocks: int = 0
 ) -> tuple[Gather, Gather, Gather]:
-    """Position, velocity and acceleration at the collocation points from (q0, v0, z_1 .. z_s)."""
-    size = len(abscissae)
+    """Position, velocity and acceleration at the stages from (q0, v0, z_1 .. z_s).
+
+    V_i = v0 + sum_j a_ij z_j and q_i = q0 + h sum_j a_ij V_j; the coefficient of v0 is the row sum of A, which is c_i for
+    collocation but not for every tableau.
+    """
+    size = len(A)
     ones, zeros, padding = Table.constant(size, 1, 1), Table.constant(size, 1), Table.constant(size, other_blocks)
-    c_column = Table.named("c", [(c,) for c in abscissae])
-    c_column = Table(entries=c_column.entries, names=tuple((name.rpartition("_")[0],) for (name,) in c_column.names))
+    sums = Table.named("c", [(mp.fsum(line),) for line in A])
+    drift = Table(entries=sums.entries, names=tuple((name.rpartition("_")[0],) for (name,) in sums.names))
     double = Table.named("aa", matrix_product(A, A))
     return (
-        Gather(arguments=system.coordinates, table=Table.joined(ones, c_column, double, padding), power=0),
+        Gather(arguments=system.coordinates, table=Table.joined(ones, drift, double, padding), power=0),
         Gather(arguments=system.velocities, table=Table.joined(zeros, ones, Table.named("a", A), padding), power=-1),
         Gather(
             arguments=accelerations(system),

@@ -191,7 +191,7 @@ def _shooting_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadr
 def _multiplier_family(system: LagrangianSystem, tableau: Tableau) -> ScalarFamily:
     """The collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
     size = len(tableau.b)
-    position, velocity, acceleration = acceleration_gathers(system, tableau.c, tableau.A, other_blocks=size)
+    position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
     rounded = Gather(
         arguments=position.arguments,
         table=Table(entries=dyadic(position.table.entries), names=position.table.names),
@@ -271,7 +271,7 @@ def _printed_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadra
         abscissae=tableau.c,
         weights=(mp.one,) * size,
         weight_names=("",) * size,
-        gathers=acceleration_gathers(system, tableau.c, tableau.A),
+        gathers=acceleration_gathers(system, tableau.A),
         scatters=(
             Scatter(
                 results=euler_lagrange(system),

@@ -1,0 +1,52 @@
+"""What it was measured on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+from scvi_codegen.building import TUNED_FLAGS, find_compiler
+
+__all__ = ["machine"]
+
+PACKAGES = ("scvi-codegen", "numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine")
+
+
+def machine() -> dict[str, str | dict[str, str]]:
+    """Processor, system, compiler and versions, as plain data."""
+    compiler = find_compiler()
+    shown = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False).stdout
+    return {
+        "processor": _processor(),
+        "cores": str(os.cpu_count()),
+        "load": ", ".join(f"{value:.2f}" for value in os.getloadavg()) if hasattr(os, "getloadavg") else "unknown",
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "compiler": shown.splitlines()[0] if shown else " ".join(compiler),
+        "flags": " ".join(TUNED_FLAGS),
+        "versions": dict(_versions(PACKAGES)),
+    }
+
+
+def _processor() -> str:
+    """Model name and widest vector unit, where the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    entries = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    model = " ".join(entries.get(key, "") for key in ("model name", "cpu family", "model")).strip()
+    width = next((flag for flag in ("avx512f", "avx2", "sse2") if flag in entries.get("flags", "").split()), "")
+    return f"{model or platform.machine()} {width}".strip()
+
+
+def _versions(names: Iterable[str]) -> Iterable[tuple[str, str]]:
+    for name in names:
+        try:
+            yield name, importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            yield name, "not installed"

@@ -1,0 +1,123 @@
+"""Contenders timed in turn, in one process: all of them once, then all of them again."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import STATES, Array
+from scvi_codegen.benchmark.contenders import Contender
+from scvi_codegen.benchmark.curves import Point
+from scvi_codegen.benchmark.reference import Reference, rms_error
+from scvi_codegen.errors import ScviCodegenError
+
+__all__ = ["Measurement", "measure"]
+
+PATIENCE = 1.0
+"""Seconds for a round over all states beyond which a contender is timed once only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """What came of one contender.
+
+    Attributes:
+        method, setting, options, compile_seconds: of the contender.
+        seconds: for one trajectory: the median of the repeats for each state, averaged over the states.
+        fastest: the same with minima for medians.
+        error: root mean square over the states at the end, relative.
+        repeats: rounds timed.
+        failure: why there is no result, or nothing.
+    """
+
+    method: str
+    setting: str
+    options: str
+    compile_seconds: float
+    seconds: float
+    fastest: float
+    error: float
+    repeats: int
+    failure: str = ""
+
+    @property
+    def point(self) -> Point:
+        """Its place on the work-precision curve."""
+        return Point(seconds=self.seconds, error=self.error)
+
+
+@dataclass(slots=True)
+class _Record:
+    contender: Contender
+    seconds: list[list[float]] = field(default_factory=list)
+    final: list[Array] = field(default_factory=list)
+    failure: str = ""
+
+    def round(self) -> None:
+        """Integrate from every state once."""
+        taken, final = [], []
+        for index in range(STATES):
+            integrate = self.contender.prepare(index)
+            began = time.perf_counter()
+            q = integrate()
+            taken.append(time.perf_counter() - began)
+            final.append(q)
+        self.seconds.append(taken)
+        self.final = final
+
+    def wants_more(self) -> bool:
+        return not self.failure and (not self.seconds or sum(self.seconds[0]) < PATIENCE)
+
+
+def measure(
+    contenders: Sequence[Contender],
+    reference_of: Callable[[Contender], Reference],
+    *,
+    repeats: int,
+    progress: Callable[[], None] = lambda: None,
+) -> list[Measurement]:
+    """Time all contenders alternately; one that fails is reported with its reason.
+
+    Args:
+        contenders: what to time.
+        reference_of: the states a contender ought to end in.
+        repeats: rounds; one more comes before them, untimed.
+        progress: called after each round of all.
+    """
+    records = [_Record(contender) for contender in contenders]
+    for number in range(repeats + 1):
+        for record in records:
+            if record.wants_more():
+                _attempt(record)
+            if number == 0 and record.wants_more():
+                record.seconds.clear()  # caches were cold
+        progress()
+    return [_summary(record, reference_of(record.contender)) for record in records]
+
+
+def _attempt(record: _Record) -> None:
+    try:
+        record.round()
+    except (ArithmeticError, RuntimeError, ValueError, ScviCodegenError) as error:
+        record.failure = f"{type(error).__name__}: {error}"
+
+
+def _summary(record: _Record, reference: Reference) -> Measurement:
+    contender, failed = record.contender, bool(record.failure)
+    columns = [] if failed else list(zip(*record.seconds, strict=True))
+    error = float("nan") if failed else rms_error(np.array(record.final), reference)
+    return Measurement(
+        method=contender.method,
+        setting=contender.setting,
+        options=contender.options,
+        compile_seconds=contender.compile_seconds,
+        seconds=float("nan") if failed else statistics.fmean(map(statistics.median, columns)),
+        fastest=float("nan") if failed else statistics.fmean(map(min, columns)),
+        error=error,
+        repeats=len(record.seconds),
+        failure=record.failure,
+    )

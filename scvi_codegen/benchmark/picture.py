@@ -1,0 +1,70 @@
+"""Work-precision plots: time against error, one panel a problem, one line a method."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+from scvi_codegen.benchmark.contenders import OURS
+from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.plotting import COLORS, STYLE, check_plot_path
+from scvi_codegen.trajectory import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_curves", "plot_curves"]
+
+COLUMNS = 3
+
+
+def plot_curves(results: Sequence[CaseResult], path: str | os.PathLike[str]) -> None:
+    """Draw all cases into one picture, .png or .svg.
+
+    Raises:
+        StateError: for another suffix.
+        PlotError: without matplotlib.
+    """
+    check_plot_path(path)
+    import matplotlib as mpl
+
+    kind = Path(path).suffix.lower().removeprefix(".")
+    metadata = {"Date": None} if kind == "svg" else {"Software": None}
+
+    def write(file: IO[bytes]) -> None:
+        draw_curves(results).savefig(file, format=kind, dpi=150, metadata=metadata)
+
+    with mpl.rc_context(STYLE):
+        write_atomically(path, write)
+
+
+def draw_curves(results: Sequence[CaseResult]) -> Figure:
+    """The figure: logarithmic axes, better is down and to the left; a method has one colour in all panels."""
+    from matplotlib.figure import Figure
+
+    columns = min(COLUMNS, len(results))
+    lines = -(-len(results) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.8 * lines + 0.6), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    methods = list(dict.fromkeys(method for result in results for method in result.methods()))
+    colors = {method: COLORS[number % len(COLORS)] for number, method in enumerate(methods)}
+    handles = {}
+    for panel, result in zip(panels, results, strict=False):
+        for method in result.methods():
+            handles[method] = _draw_method(panel, result, method, colors[method])
+        panel.set(xscale="log", yscale="log", xlabel="time of a trajectory, ms", ylabel="error", title=result.name)
+    for panel in panels[len(results) :]:
+        panel.set_visible(False)
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=min(4, len(handles)))
+    return figure
+
+
+def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> object:
+    points = [found.point for found in result.measurements if found.method == method and not found.failure]
+    points.sort(key=lambda point: point.seconds)
+    x, y = [1e3 * point.seconds for point in points], [max(point.error, 1e-18) for point in points]
+    width, marker = (2.0, "o") if method.startswith(OURS) else (1.0, "s")
+    return axes.plot(x, y, color=color, linewidth=width, marker=marker, markersize=4)[0]
