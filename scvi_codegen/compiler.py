@@ -18,7 +18,7 @@ from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.lowering import lower
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
-from scvi_codegen.rendering import render, workspace_size
+from scvi_codegen.rendering import render, render_ensemble, workspace_size
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.sweeps import check_solver, sweep_of
@@ -53,19 +53,24 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
-    source, interface = generate_source(system, method, solver=solver, prefix=prefix)
-    return Stepper(source, interface, flags=flags)
+    program = _program(system, method, solver=solver, prefix=prefix)
+    interface = describe(program, system, method)
+    return Stepper(render(program), interface, ensemble=render_ensemble(program), flags=flags)
 
 
 def generate_source(
     system: LagrangianSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
+    program = _program(system, method, solver=solver, prefix=prefix)
+    return render(program), describe(program, system, method)
+
+
+def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
     sweep = None if solver == "newton" else sweep_of(system, method)
     check_solver(solver, sweep, method, SOLVERS)
     name = c_identifier(prefix or f"{system.name}_{method.name}")
-    program = lower(system, method, prefix=name, sweep=sweep, newton=solver != "fixed-point")
-    return render(program), describe(program, system, method)
+    return lower(system, method, prefix=name, sweep=sweep, newton=solver != "fixed-point")
 
 
 def describe(program: Program, system: LagrangianSystem, method: Method) -> Interface:

@@ -89,3 +89,10 @@ class StepFailedError(ScviCodegenError, ArithmeticError):
     ) -> None:
         super().__init__(message)
         self.status, self.step, self.t, self.residual, self.trajectory = status, step, t, residual, trajectory
+
+    @property
+    def recorded(self) -> Trajectory:
+        """The trajectory before the failure, of an integration."""
+        if self.trajectory is None:
+            raise AttributeError("a single step has no trajectory")
+        return self.trajectory

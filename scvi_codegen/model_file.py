@@ -49,7 +49,7 @@ from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
-    from scvi_codegen.stepper import Array, SolverOptions, Run, Stepper
+    from scvi_codegen.stepper import Array, Run, SolverOptions, Stepper
 
 __all__ = ["DEFAULT_METHOD", "Model", "dump_model", "load_model", "parse_model", "save_model"]
 

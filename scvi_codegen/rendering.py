@@ -74,7 +74,7 @@ def render(program: Program) -> Source:
 
 
 def render_ensemble(program: Program) -> Source | None:
-    """Header and source that integrate many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
+    """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
     if program.sweep is None:
         return None
     prefix = f"{program.prefix}_ensemble"

@@ -10,21 +10,24 @@ All calls into C release the GIL and share nothing, so one stepper may be used f
 from __future__ import annotations
 
 import difflib
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen import building
+from scvi_codegen.arguments import checked_count, checked_number, checked_step
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["SolverOptions", "Run", "Stepper"]
+if TYPE_CHECKING:
+    from scvi_codegen.ensemble import EnsembleTrajectory
+
+__all__ = ["Run", "SolverOptions", "Stepper"]
 
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -57,7 +60,7 @@ class SolverOptions:
     def __post_init__(self) -> None:
         if not self.tolerance > 0.0:
             raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
-        _whole_number(self.max_iterations, "max_iterations", least=1)
+        checked_count(self.max_iterations, "max_iterations", least=1)
         if self.max_iterations > MOST_ITERATIONS:
             raise StateError(f"max_iterations must be at most {MOST_ITERATIONS}, not {self.max_iterations}")
 
@@ -71,10 +74,18 @@ class Stepper:
         defaults: (k,) default parameter values.
         dimension: degrees of freedom m.
         source: the C text it was compiled from.
+        ensemble: the C text for many trajectories at once, compiled when first used; ``None`` if the method has none.
     """
 
-    def __init__(self, source: Source, interface: Interface, *, flags: tuple[str, ...] = building.TUNED_FLAGS) -> None:
-        self.source, self.interface, self.flags = source, interface, flags
+    def __init__(
+        self,
+        source: Source,
+        interface: Interface,
+        *,
+        ensemble: Source | None = None,
+        flags: tuple[str, ...] = building.TUNED_FLAGS,
+    ) -> None:
+        self.source, self.interface, self.ensemble, self.flags = source, interface, ensemble, flags
         module = building.load(source, flags=flags)
         self._ffi, self._lib = module.ffi, module.lib
 
@@ -82,7 +93,7 @@ class Stepper:
         return f"<Stepper {self.title}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_rebuild, (self.source, self.interface, self.flags))
+        return (_rebuild, (self.source, self.interface, self.ensemble, self.flags))
 
     @property
     def title(self) -> str:
@@ -139,8 +150,8 @@ class Stepper:
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
         report = self._new("report *")
         status = self._call("step")(
-            _finite(t, "the time t"),
-            _step_size(h),
+            checked_number(t, "the time t"),
+            checked_step(h),
             self._pointer(q0),
             self._pointer(p0),
             self._pointer(values),
@@ -188,6 +199,51 @@ class Stepper:
         run = self.start(q, p, h=h, t=t, parameters=parameters, options=options)
         return run.record(steps, every=every, progress=progress)
 
+    def integrate_ensemble(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float,
+        steps: int,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: Mapping[str, ArrayLike] | Sequence[Any] | Array | None = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+    ) -> EnsembleTrajectory:
+        """Run k trajectories with common times, eight at a time as vector lanes, over all cores.
+
+        Args:
+            q, p: (k, m) initial positions and momenta.
+            h, steps, every, t, options, progress: as in :meth:`integrate`.
+            parameters: by name, one number or k each; or (k, number of parameters).
+            threads: workers, by default one a core.
+
+        Returns:
+            An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
+            fails has NaN from there on and says why in ``status``; the others are not disturbed.
+
+        Raises:
+            StateError: on wrong shapes, names or numbers.
+        """
+        from scvi_codegen.ensemble import integrate_ensemble
+
+        return integrate_ensemble(
+            self,
+            q,
+            p,
+            h=h,
+            steps=steps,
+            every=every,
+            t=t,
+            parameters=parameters,
+            options=options,
+            progress=progress,
+            threads=threads,
+        )
+
     def start(
         self,
         q: ArrayLike,
@@ -201,7 +257,9 @@ class Stepper:
         """A run from (q, p) at t with step h, to be advanced at will."""
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
         memory = self._new("run *")
-        self._call("start")(memory, _finite(t, "the time t"), _step_size(h), self._pointer(q0), self._pointer(p0))
+        self._call("start")(
+            memory, checked_number(t, "the time t"), checked_step(h), self._pointer(q0), self._pointer(p0)
+        )
         return Run(self, memory, self._parameters(parameters), options)
 
     def restore(self, saved: bytes, *, parameters: Parameters = None, options: SolverOptions | None = None) -> Run:
@@ -326,8 +384,8 @@ class Stepper:
         p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
         report = self._new("report *")
         status = self._call("discrete_legendre")(
-            _finite(t, "the time t"),
-            _step_size(h),
+            checked_number(t, "the time t"),
+            checked_step(h),
             self._pointer(start),
             self._pointer(end),
             self._pointer(self._parameters(parameters)),
@@ -345,7 +403,7 @@ class Stepper:
     def _transform(self, name: str, q: Array, other: Array, t: float, parameters: Parameters) -> Array:
         result = np.empty_like(other)
         status = self._call(name)(
-            _finite(t, "the time t"),
+            checked_number(t, "the time t"),
             self._pointer(q),
             self._pointer(other),
             self._pointer(self._parameters(parameters)),
@@ -396,7 +454,7 @@ class Stepper:
             return values
         if isinstance(parameters, Mapping):
             for name, value in parameters.items():
-                values[self._parameter_index(name)] = _finite(value, f"the parameter {name}")
+                values[self.parameter_index(name)] = checked_number(value, f"the parameter {name}")
         else:
             try:
                 given = np.array(parameters, dtype=float)
@@ -411,7 +469,8 @@ class Stepper:
             raise StateError(f"the parameter {self.parameters[worst]} is {values[worst]}")
         return values
 
-    def _parameter_index(self, name: str) -> int:
+    def parameter_index(self, name: str) -> int:
+        """The place of a parameter; StateError with the nearest name if there is none."""
         if name in self.parameters:
             return self.parameters.index(name)
         folded = {parameter.lower(): parameter for parameter in self.parameters}
@@ -456,6 +515,13 @@ class Run:
         """(m,) momenta."""
         return np.array(list(self._memory.p))
 
+    def resume_at(self, steps: int, carries: tuple[Array, Array] | None = None) -> None:
+        """Count from ``steps`` done, with what rounding had cut off q and p: how a run made elsewhere goes on here."""
+        self._memory.step = steps
+        if carries is not None:
+            for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
+                self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
+
     def save(self) -> bytes:
         """The whole memory of the run, for :meth:`Stepper.restore` on the same kind of machine."""
         return bytes(self.stepper._ffi.buffer(self._memory))
@@ -466,8 +532,8 @@ class Run:
         Raises:
             StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
         """
-        steps = _whole_number(steps, "steps", least=0)
-        every = _whole_number(every, "every", least=1)
+        steps = checked_count(steps, "steps", least=0)
+        every = checked_count(every, "every", least=1)
         first = self.steps
         capacity = (first + steps) // every - first // every
         m = self.stepper.dimension
@@ -522,30 +588,5 @@ class Run:
         )
 
 
-def _rebuild(source: Source, interface: Interface, flags: tuple[str, ...]) -> Stepper:
-    return Stepper(source, interface, flags=flags)
-
-
-def _finite(value: float, name: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise StateError(f"{name} must be a real number, not {value!r}") from error
-    if not math.isfinite(number):
-        raise StateError(f"{name} is {number}")
-    return number
-
-
-def _step_size(h: float) -> float:
-    number = _finite(h, "the step h")
-    if number == 0.0:
-        raise StateError("the step h is 0")
-    return number
-
-
-def _whole_number(value: int, name: str, *, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise StateError(f"{name} must be a whole number, not {value!r}")
-    if value < least:
-        raise StateError(f"{name} must be at least {least}, not {value}")
-    return int(value)
+def _rebuild(source: Source, interface: Interface, ensemble: Source | None, flags: tuple[str, ...]) -> Stepper:
+    return Stepper(source, interface, ensemble=ensemble, flags=flags)

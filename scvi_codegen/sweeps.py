@@ -6,7 +6,8 @@ It exists where the unknowns are velocities V_n at the points themselves, so tha
 
 that is for SVI with as many points as its degree, every Runge-Kutta method in phase space, and Stoermer-Verlet; and for
 *separable* systems (constant diagonal mass, forces of position and time) also for every SVI, spectral collocation and
-Runge-Kutta in position form, whose stage equations collapse to q_n = q0 + h c_n v0 + h^2 sum_j Ahat_nj f(q_j), c_n the row sums of a.
+Runge-Kutta in position form, whose stage equations collapse to q_n = q0 + h c_n v0 + h^2 sum_j Ahat_nj f(q_j),
+c_n the row sums of a.
 
 For a variational method the two matrices belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
 rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51,

@@ -303,6 +303,7 @@ def test_compiled_kernels_have_the_values_of_their_formulas(tmp_path):
     np.testing.assert_allclose(compiled_values(expressions, tmp_path), expected, rtol=1e-15)
 
 
+@settings(deadline=None)
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_printed_numbers_read_back_as_the_same_double(number):
     text = print_number(number)

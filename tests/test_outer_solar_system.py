@@ -1,4 +1,4 @@
-"""The main job: the outer solar system from its published table, by the command line, against an independent reference."""
+"""The main job: the outer solar system from its published table, by the command line, against a reference."""
 
 import subprocess
 import sys

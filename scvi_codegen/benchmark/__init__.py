@@ -38,6 +38,9 @@ __all__ = ["CASES", "PEERS", "Plan", "benchmark", "run_case"]
 QUICK_SHARE = 0.05
 QUICK_RUNGS = 4
 QUICK_REPEATS = 2
+PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
+"""What a peer of an unknown version, or without its compiler, may raise; it is skipped by name."""
+
 Say = Callable[[str], None]
 
 
@@ -103,7 +106,10 @@ def _peer_contenders(chosen: Case, plan: Plan, skipped: dict[str, str], say: Say
             skipped[name] = "not for problems of this kind"
         else:
             say(f"{chosen.name}: compiling {name}")
-            yield from peer_contenders(name, chosen, quick=plan.quick)
+            try:
+                yield from peer_contenders(name, chosen, quick=plan.quick)
+            except PEER_ERRORS as error:
+                skipped[name] = f"{type(error).__name__}: {error}"
 
 
 def benchmark(

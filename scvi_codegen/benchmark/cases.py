@@ -82,7 +82,7 @@ class Case:
     @property
     def dimension(self) -> int:
         """Degrees of freedom m."""
-        return self.q.shape[1]
+        return int(self.q.shape[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,17 +113,17 @@ def second_order(accelerations: Callable[[Vector, Vector, Mapping[str, Any], Any
 
 
 def pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """q'' = -(g / l) sin q."""
+    """Q'' = -(g / l) sin q."""
     return [-(of["g"] / of["l"]) * functions.sin(q[0])]
 
 
 def duffing(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """q'' = -alpha q - beta q^3, without drive."""
+    """Q'' = -alpha q - beta q^3, without drive."""
     return [-(of["alpha"] + of["beta"] * (q[0] * q[0])) * q[0]]
 
 
 def kepler(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """q'' = -mu q / |q|^3."""
+    """Q'' = -mu q / |q|^3."""
     pull = -of["mu"] * (q[0] * q[0] + q[1] * q[1]) ** -1.5
     return [pull * q[0], pull * q[1]]
 
@@ -156,12 +156,12 @@ def double_pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any)
 
 
 def relativistic(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """q'' = -(k / m) q (1 - v^2/c^2)^(3/2)."""
+    """Q'' = -(k / m) q (1 - v^2/c^2)^(3/2)."""
     return [-(of["k"] / of["m"]) * q[0] * (1.0 - v[0] * v[0] / (of["c"] * of["c"])) ** 1.5]
 
 
 def relativistic_in_momenta(x: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """q' = p / sqrt(m^2 + p^2/c^2), p' = -k q."""
+    """Q' = p / sqrt(m^2 + p^2/c^2), p' = -k q."""
     return [x[1] * (of["m"] * of["m"] + x[1] * x[1] / (of["c"] * of["c"])) ** -0.5, -of["k"] * x[0]]
 
 
@@ -176,7 +176,7 @@ def _scaled(state: Sequence[float], spread: float) -> Array:
     """(8, m) states proportional to one, within +- spread of it, at incommensurable places."""
     golden = (math.sqrt(5.0) - 1.0) / 2.0
     factors = 1.0 + spread * (2.0 * np.modf(golden * np.arange(1, STATES + 1))[0] - 1.0)
-    return factors[:, None] * np.asarray(state, dtype=float)
+    return np.outer(factors, np.asarray(state, dtype=float))
 
 
 def _rotated(vector: Sequence[float], axes: int) -> Array:

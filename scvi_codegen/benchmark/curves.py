@@ -55,7 +55,7 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
     after = next(n for n, point in enumerate(curve) if point.error <= wanted)
     loose, tight = curve[after - 1], curve[after]
     share = math.log(loose.error / wanted) / math.log(loose.error / tight.error)
-    return loose.seconds * (tight.seconds / loose.seconds) ** share
+    return loose.seconds * math.pow(tight.seconds / loose.seconds, share)
 
 
 def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -164,12 +164,12 @@ def _heyoka_lagrangian(case: Case) -> list[Any]:
     values = dict(zip(system.parameters, map(sympy.Float, system.defaults), strict=True))
     q, v = ([heyoka.expression(symbol.name) for symbol in part] for part in (system.coordinates, system.velocities))
     lagrangian = heyoka.from_sympy(system.lagrangian.xreplace(values))
-    rates = dict((str(left), right) for left, right in heyoka.lagrangian(lagrangian, q, v))
+    rates = {str(left): right for left, right in heyoka.lagrangian(lagrangian, q, v)}
     return [(symbol, rates[str(symbol)]) for symbol in (*q, *v)]
 
 
 def _heyoka_bodies(case: Case) -> list[Any]:
-    """heyoka's own N-body equations, in the order of the case: all positions, then all velocities."""
+    """Heyoka's own N-body equations, in the order of the case: all positions, then all velocities."""
     import heyoka
 
     bodies = case.bodies
@@ -284,7 +284,7 @@ def _cyrk(case: Case, quick: bool) -> Iterator[Contender]:
     address = cyjit(_right_hand_side(case)).address
     span = np.array([case.span])
 
-    @numba.njit
+    @numba.njit  # type: ignore[untyped-decorator]  # Numba ships no stubs
     def compiled(address: int, start: Array, relative: float, absolute: float, span: Array) -> Any:
         outcome = nbsolve2_ivp(
             address, (0.0, span[0]), start, method="DOP853", rtol=relative, atol=absolute, t_eval=span
@@ -313,7 +313,7 @@ def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
     x = [jitcode.y(n) for n in range(2 * case.dimension)]
     rates = case.formulations[0].rates(x, case.parameters, symengine)
     system = jitcode.jitcode(rates, n=len(x), verbose=False)
-    system.compile_C(chunk_size=100)
+    system.compile_C()
     seconds = time.perf_counter() - began
 
     def solve(start: Array, tolerance: float) -> Array:
@@ -343,7 +343,12 @@ def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
 
     def solve(start: Array, tolerance: float) -> Array:
         outcome = solve_ivp(
-            rates, (0.0, case.span), start, method="DOP853", rtol=tolerance, atol=_absolute(tolerance, start),
+            rates,
+            (0.0, case.span),
+            start,
+            method="DOP853",
+            rtol=tolerance,
+            atol=_absolute(tolerance, start),
             t_eval=[case.span],
         )
         if not outcome.success:

@@ -13,6 +13,7 @@ from scvi_codegen.plotting import COLORS, STYLE, check_plot_path
 from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -51,7 +52,7 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     methods = list(dict.fromkeys(method for result in results for method in result.methods()))
     colors = {method: COLORS[number % len(COLORS)] for number, method in enumerate(methods)}
-    handles = {}
+    handles: dict[str, Artist] = {}
     for panel, result in zip(panels, results, strict=False):
         for method in result.methods():
             handles[method] = _draw_method(panel, result, method, colors[method])
@@ -62,9 +63,10 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
-def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> object:
+def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> Artist:
     points = [found.point for found in result.measurements if found.method == method and not found.failure]
     points.sort(key=lambda point: point.seconds)
     x, y = [1e3 * point.seconds for point in points], [max(point.error, 1e-18) for point in points]
     width, marker = (2.0, "o") if method.startswith(OURS) else (1.0, "s")
-    return axes.plot(x, y, color=color, linewidth=width, marker=marker, markersize=4)[0]
+    line: Artist = axes.plot(x, y, color=color, linewidth=width, marker=marker, markersize=4)[0]
+    return line

@@ -31,6 +31,9 @@ Field = Callable[[Extended], Extended]
 
 STAGES = 16
 MOST_SWEEPS = 100
+STALLED = 1e-16
+"""Relative changes below are round-off once they no longer shrink."""
+
 DIGITS = 50
 
 
@@ -97,8 +100,9 @@ def _read(path: Path) -> Reference | None:
 def _write(path: Path, result: Reference) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {"high": result.high, "low": result.low, "accuracy": np.array(result.accuracy)}
-        write_atomically(path, lambda file: np.savez(file, **arrays))
+        write_atomically(
+            path, lambda file: np.savez(file, high=result.high, low=result.low, accuracy=np.array(result.accuracy))
+        )
     except OSError:
         return  # a cache that cannot be written is no cache
 
@@ -160,12 +164,12 @@ def _product(table: Table, values: Extended) -> Extended:
 def _stages(field: Field, x: Extended, h: np.longdouble, a: Table, guess: Extended | None) -> Extended:
     """(s, k, d) slopes F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
     slopes = np.broadcast_to(field(x), (len(a[0]), *x.shape)).copy() if guess is None else guess
-    last = np.inf
+    scale, last = h / np.max(np.abs(x)), np.inf
     for _ in range(MOST_SWEEPS):
         new = field(x + h * _product(a, slopes))
-        change = float(np.max(np.abs(new - slopes)) / np.max(np.abs(new)))
+        change = float(scale * np.max(np.abs(new - slopes)))
         slopes = new
-        if change == 0.0 or (change < 1e-16 and change >= 0.3 * last):
+        if change == 0.0 or (change < STALLED and change >= 0.3 * last):
             return slopes
         last = change
     raise StateError(f"the reference did not converge with steps of {float(h):g} (last change {change:.1e})")

@@ -206,6 +206,46 @@ def methods(tableau: str | None) -> None:
     click.echo(methods_table() if tableau is None else tableau_text(tableau))
 
 
+@main.command(short_help="Measure this project against other integrators.")
+@click.argument("problems", nargs=-1, metavar="[PROBLEM ...]")
+@click.option("--peers", metavar="NAME,..", help="Only these of heyoka, rebound, cyrk, jitcode, scipy; none: ''.")
+@click.option("--json", "json_path", type=click.Path(), metavar="FILE", help="All measurements as JSON.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
+@click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
+@click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
+@click.option("--drift", is_flag=True, help="The energy over many steps of Kepler's problem (alone, or as well).")
+@click.option("--drift-steps", type=int, default=10_000_000, show_default=True, help="How many.")
+def bench(
+    problems: tuple[str, ...],
+    peers: str | None,
+    json_path: str | None,
+    plot: str | None,
+    repeats: int,
+    quick: bool,
+    drift: bool,
+    drift_steps: int,
+) -> None:
+    """Time this project and the installed peers in turn, and compare them at equal error.
+
+    PROBLEM is planar-pendulum, duffing, kepler:0.2, kepler:0.5, outer-solar-system, double-pendulum,
+    relativistic-particle, or fput-chain:8, :64, :256; by default all. Install the peers with 'scvi-codegen[bench]'.
+
+    \b
+    Examples:
+      scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
+      scvi-codegen bench --drift
+    """  # noqa: D301  (click wants the character \b)
+    for path, hint in ((json_path, "'--json'"), (plot, "'--plot'")):
+        if path is not None:
+            _check_writable(Path(path), hint)
+    from scvi_codegen.benchmark import PEERS, Plan, benchmark
+
+    names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
+    plan, steps = Plan(peers=names, repeats=repeats, quick=quick), drift_steps if drift else 0
+    say = partial(click.echo, err=True)
+    click.echo(benchmark(problems, plan, json_path=json_path, plot_path=plot, drift_steps=steps, say=say))
+
+
 @contextmanager
 def _warnings_as_lines() -> Iterator[None]:
     """Show the warnings of this package as one line each, once."""

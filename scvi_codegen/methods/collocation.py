@@ -301,8 +301,8 @@ def acceleration_gathers(
 ) -> tuple[Gather, Gather, Gather]:
     """Position, velocity and acceleration at the stages from (q0, v0, z_1 .. z_s).
 
-    V_i = v0 + sum_j a_ij z_j and q_i = q0 + h sum_j a_ij V_j; the coefficient of v0 is the row sum of A, which is c_i for
-    collocation but not for every tableau.
+    V_i = v0 + sum_j a_ij z_j and q_i = q0 + h sum_j a_ij V_j; the coefficient of v0 is the row sum of A, which is c_i
+    for collocation but not for every tableau.
     """
     size = len(A)
     ones, zeros, padding = Table.constant(size, 1, 1), Table.constant(size, 1), Table.constant(size, other_blocks)
