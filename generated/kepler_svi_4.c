@@ -541,8 +541,22 @@ typedef union {
   double lane[LANES];
 } lane_view;
 
+static inline lanes lanes_of(double x)
+{
+  const lanes zero = {0.0};
+  return zero + x;
+}
+
+static inline lanes lanes_sqrt(lanes x)
+{
+  lane_view view = {x};
+  for (int j = 0; j < LANES; j++)
+    view.lane[j] = sqrt(view.lane[j]);
+  return view.all;
+}
+
 /* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 4 repeat it. */
-static const lanes POINT_ABSCISSA = {0.06943184420297373, 0.33000947820757165, 0.6699905217924279, 0.9305681557970265};
+static const lanes POINT_DRIFT = {0.06943184420297373, 0.33000947820757165, 0.6699905217924279, 0.9305681557970265};
 static const lanes POINT_POSITION[4] = {
   {0.5000000000000004, 1.0815897500322804, 0.961274073432115, 1.0204404206840407},
   {-0.08158975003227997, 0.49999999999999956, 1.0855037514105188, 0.9612740734321141},
@@ -571,12 +585,6 @@ static const lanes POINT_EXTRAPOLATION[4] = {
   {-1.929896390297009, -9.46401244076669, -29.80681363156252, -55.9889724574008},
   {2.191699902136537, 6.173927437193185, 15.914967984193565, 27.864733549197386}
 };
-
-static inline lanes lanes_of(double x)
-{
-  const lanes zero = {0.0};
-  return zero + x;
-}
 
 /* sum_j table[j] x_j, in four sums that do not wait for each other. */
 static inline lanes lanes_apply(const lanes *table, lanes x)
@@ -607,14 +615,6 @@ static inline void lanes_store(const lanes *x, double *memory)
   memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
-static inline lanes lanes_sqrt(lanes x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = sqrt(view.lane[j]);
-  return view.all;
-}
-
 /* L_q at all points. Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
 static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
 {
@@ -635,7 +635,7 @@ static void mass(double *value)
 /* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */
 typedef struct {
   lanes position_weight, momentum_weight; /* h beta, h w: the same rounded numbers everywhere */
-  lanes abscissa, product[LANES]; /* h c, h^2 (a A) */
+  lanes drift, product[LANES]; /* h times the row sums of a, h^2 (a A) */
   double inverse_mass[M];
 } sweep_data;
 
@@ -644,7 +644,7 @@ static void prepare_sweep(const step_data *step, sweep_data *sweep)
   const double h = step->h;
   sweep->position_weight = h * POINT_POSITION_WEIGHT;
   sweep->momentum_weight = h * POINT_MOMENTUM_WEIGHT;
-  sweep->abscissa = h * POINT_ABSCISSA;
+  sweep->drift = h * POINT_DRIFT;
   for (int j = 0; j < LANES; j++)
     sweep->product[j] = h * (h * POINT_PRODUCT[j]);
   mass(sweep->inverse_mass);
@@ -652,20 +652,27 @@ static void prepare_sweep(const step_data *step, sweep_data *sweep)
     sweep->inverse_mass[i] = 1.0 / sweep->inverse_mass[i];
 }
 
+/* What follows a sweep would change the points by, squared, with a margin: the rate of contraction is that from the sweep
+ * before, whose change is infinite before the first. */
+static inline double expected_change(double change, double last, const kepler_svi_4_options *options)
+{
+  const double ratio = last < INFINITY ? smaller(larger(change / last, 1e-6), 0.25) : 1.0; /* squares, too */
+  return options->absolute ? change : 4.0 * ratio * change * ratio;
+}
+
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
  * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
  * contracts too slowly or not at all. */
 static int sweep_status(double change, double last, const kepler_svi_4_options *options, int k)
 {
-  const double ratio = smaller(larger(change / last, 1e-6), 0.25); /* squares, too */
-  const double expected = options->absolute ? change : 4.0 * ratio * change * ratio;
+  const double expected = expected_change(change, last, options);
   if (!(change < INFINITY))
     return -1;
   if (change == 0.0)
     return 1;
-  if (k > 0 && expected <= options->tolerance * options->tolerance)
+  if (expected <= options->tolerance * options->tolerance)
     return 1;
-  if (k > 1 && change >= last * 0.0625 && change < 1e-25)
+  if (k > 0 && change >= last * 0.0625 && change < 1e-25)
     return 1;
   if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
     return -1;
@@ -682,7 +689,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   int status = 0;
   for (int i = 0; i < M; i++) {
     const double v = data->inverse_mass[i] * step->p0[i];
-    base[i] = step->q0[i] + (data->abscissa * v + step->carry_q[i]);
+    base[i] = step->q0[i] + (data->drift * v + step->carry_q[i]);
     inverse_size[i] = fabs(step->q0[i]) + fabs(step->h * v);
     largest = larger(largest, inverse_size[i]);
     X[i] = base[i];
@@ -708,7 +715,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
     }
     force_lanes(X, step->parameters, F);
     total = lanes_total(change);
-    status = sweep_status(total, last, options, k + guess);
+    status = sweep_status(total, last, options, k);
     last = total;
     report->iterations++;
   }

@@ -26,11 +26,6 @@ static inline double larger(double a, double b)
   return a > b ? a : b;
 }
 
-static inline double smaller(double a, double b)
-{
-  return a < b ? a : b;
-}
-
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b] v0,
  * the guess from the step before sum_c EXTRAPOLATION[b][c] z_c. */
 static const double END_POSITION[2] = {
@@ -43,11 +38,6 @@ static const double MOMENTUM_ROW[2] = {
 
 static const double STRAIGHT[2] = {
   1.0, 1.0
-};
-
-static const double EXTRAPOLATION[2][2] = {
-  {0.0, 1.0},
-  {-1.0, 2.0}
 };
 
 
@@ -498,115 +488,24 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
   }
 }
 
-#ifdef __GNUC__
-/* Vectors of points. GCC and Clang map them to whatever the processor has. */
-#pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
+pendulum_stoermer_verlet_options pendulum_stoermer_verlet_default_options(void)
+{
+  const pendulum_stoermer_verlet_options options = {2.220446049250313e-16, 50, 0};
+  return options;
+}
 
-enum { LANES = 2 };
-typedef double lanes __attribute__((vector_size(8 * 2)));
-typedef union {
-  lanes all;
-  double lane[LANES];
-} lane_view;
-
-/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 2 repeat it. */
-static const lanes POINT_ABSCISSA = {0.0, 1.0};
-static const lanes POINT_POSITION[2] = {
-  {0.0, 1.0},
-  {0.0, 1.0}
+/* Kicks of h KICK[n] L_q and drifts of h DRIFT[n] M^-1 p between them. */
+static const double KICK[2] = {
+  0.5, 0.5
 };
-static const lanes POINT_POSITION_WEIGHT = {0.5, 0.5};
-static const lanes POINT_MOMENTUM[2] = {
-  {1.0, 1.0},
-  {0.0, 0.0}
-};
-static const lanes POINT_MOMENTUM_WEIGHT = {0.5, 0.5};
-static const lanes POINT_END_POSITION = {1.0, 1.0};
-static const lanes POINT_END_MOMENTUM = {1.0, 1.0};
-static const lanes POINT_PRODUCT[2] = {
-  {0.0, 0.5},
-  {0.0, 0.0}
-};
-static const lanes POINT_EXTRAPOLATION[2] = {
-  {0.0, -1.0},
-  {1.0, 2.0}
+static const double DRIFT[1] = {
+  1.0
 };
 
-static inline lanes lanes_of(double x)
+/* L_q. Operations: 3 *, 1 neg, 1 sin. */
+static void force(const double *u, const double *parameters, double *value)
 {
-  const lanes zero = {0.0};
-  return zero + x;
-}
-
-/* sum_j table[j] x_j, in four sums that do not wait for each other. */
-static inline lanes lanes_apply(const lanes *table, lanes x)
-{
-  const lane_view view = {x};
-  lanes a = table[0] * view.lane[0];
-  for (int j = 1; j < LANES; j++)
-    a += table[j] * view.lane[j];
-  return a;
-}
-
-static inline double lanes_total(lanes x)
-{
-  lane_view view = {x};
-  for (int half = LANES / 2; half > 0; half /= 2)
-    for (int j = 0; j < half; j++)
-      view.lane[j] += view.lane[j + half];
-  return view.lane[0];
-}
-
-static inline void lanes_load(const double *memory, lanes *x)
-{
-  memcpy(x, memory, sizeof(double) * M * LANES);
-}
-
-static inline void lanes_store(const lanes *x, double *memory)
-{
-  memcpy(memory, x, sizeof(double) * M * LANES);
-}
-
-/* Whole vectors by glibc's libmvec where SCVI_LIBMVEC says that it is linked, else lane by lane. */
-#if defined(SCVI_LIBMVEC) && defined(__x86_64__)
-#if defined(__AVX512F__) && 2 >= 8
-#define SCVI_PART 8
-#define SCVI_NAME(f, arguments) _ZGVeN8##arguments##_##f
-#elif defined(__AVX2__) && 2 >= 4
-#define SCVI_PART 4
-#define SCVI_NAME(f, arguments) _ZGVdN4##arguments##_##f
-#else
-#define SCVI_PART 2
-#define SCVI_NAME(f, arguments) _ZGVbN2##arguments##_##f
-#endif
-typedef double sin_part __attribute__((vector_size(8 * SCVI_PART)));
-sin_part SCVI_NAME(sin, v)(sin_part);
-static inline lanes lanes_sin(lanes x)
-{
-  union {
-    lanes all;
-    sin_part part[LANES / SCVI_PART];
-  } view = {x};
-  for (int j = 0; j < LANES / SCVI_PART; j++)
-    view.part[j] = SCVI_NAME(sin, v)(view.part[j]);
-  return view.all;
-}
-#undef SCVI_PART
-#undef SCVI_NAME
-#else
-static inline lanes lanes_sin(lanes x)
-{
-  lane_view view = {x};
-  for (int j = 0; j < LANES; j++)
-    view.lane[j] = sin(view.lane[j]);
-  return view.all;
-}
-#endif
-
-/* L_q at all points. Operations: 3 *, 1 neg, 1 sin. */
-static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
-{
-  value[0] = -(parameters[2]*parameters[1]*parameters[0]*lanes_sin(u[0]));
+  value[0] = -(parameters[2]*parameters[1]*parameters[0]*sin(u[0]));
 }
 
 /* The constant masses, of the parameters alone. */
@@ -615,198 +514,47 @@ static void mass(const double *parameters, double *value)
   value[0] = parameters[0]*(parameters[1]*parameters[1]);
 }
 
-/* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */
 typedef struct {
-  lanes position_weight, momentum_weight; /* h beta, h w: the same rounded numbers everywhere */
-  lanes abscissa, product[LANES]; /* h c, h^2 (a A) */
   double inverse_mass[M];
-} sweep_data;
-
-static void prepare_sweep(const step_data *step, sweep_data *sweep)
-{
-  const double h = step->h;
-  sweep->position_weight = h * POINT_POSITION_WEIGHT;
-  sweep->momentum_weight = h * POINT_MOMENTUM_WEIGHT;
-  sweep->abscissa = h * POINT_ABSCISSA;
-  for (int j = 0; j < LANES; j++)
-    sweep->product[j] = h * (h * POINT_PRODUCT[j]);
-  mass(step->parameters, sweep->inverse_mass);
-  for (int i = 0; i < M; i++)
-    sweep->inverse_mass[i] = 1.0 / sweep->inverse_mass[i];
-}
-
-/* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
- * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
- * contracts too slowly or not at all. */
-static int sweep_status(double change, double last, const pendulum_stoermer_verlet_options *options, int k)
-{
-  const double ratio = smaller(larger(change / last, 1e-6), 0.25); /* squares, too */
-  const double expected = options->absolute ? change : 4.0 * ratio * change * ratio;
-  if (!(change < INFINITY))
-    return -1;
-  if (change == 0.0)
-    return 1;
-  if (k > 0 && expected <= options->tolerance * options->tolerance)
-    return 1;
-  if (k > 1 && change >= last * 0.0625 && change < 1e-25)
-    return 1;
-  if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
-    return -1;
-  return 0;
-}
-
-/* One step of a separable system. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; a last sweep in the
- * two-table form, whose rounding keeps a generating function, gives the increments. The forces stay in memory. */
-static int sweep(const step_data *step, const sweep_data *data, double *memory, int guess, double *dq, double *dp,
-    const pendulum_stoermer_verlet_options *options, pendulum_stoermer_verlet_report *report)
-{
-  lanes X[M], base[M], F[M];
-  double inverse_size[M], last = INFINITY, largest = 0.0;
-  int status = 0;
-  for (int i = 0; i < M; i++) {
-    const double v = data->inverse_mass[i] * step->p0[i];
-    base[i] = step->q0[i] + (data->abscissa * v + step->carry_q[i]);
-    inverse_size[i] = fabs(step->q0[i]) + fabs(step->h * v);
-    largest = larger(largest, inverse_size[i]);
-    X[i] = base[i];
-  }
-  for (int i = 0; i < M; i++)
-    inverse_size[i] = options->absolute ? 1.0 : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
-  if (guess) {
-    lanes_load(memory, F);
-    for (int i = 0; i < M; i++) {
-      F[i] = lanes_apply(POINT_EXTRAPOLATION, F[i]);
-      X[i] = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
-    }
-  }
-  force_lanes(X, step->parameters, F);
-  for (int k = 0; status == 0; k++) {
-    lanes change = lanes_of(0.0);
-    double total;
-    for (int i = 0; i < M; i++) {
-      const lanes x = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
-      const lanes moved = (x - X[i]) * inverse_size[i];
-      change += moved * moved;
-      X[i] = x;
-    }
-    force_lanes(X, step->parameters, F);
-    total = lanes_total(change);
-    status = sweep_status(total, last, options, k + guess);
-    last = total;
-    report->iterations++;
-  }
-  report->change = sqrt(last);
-  if (status < 0)
-    return last < INFINITY ? PENDULUM_STOERMER_VERLET_NOT_CONVERGED : PENDULUM_STOERMER_VERLET_NOT_FINITE;
-  for (int i = 0; i < M; i++) {
-    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, data->momentum_weight * F[i]));
-    X[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, data->position_weight * (P * data->inverse_mass[i])));
-  }
-  force_lanes(X, step->parameters, F);
-  for (int i = 0; i < M; i++) {
-    const lanes impulse = data->momentum_weight * F[i];
-    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, impulse));
-    dq[i] = lanes_total(POINT_END_POSITION * (data->position_weight * (P * data->inverse_mass[i])));
-    dp[i] = lanes_total(POINT_END_MOMENTUM * impulse);
-  }
-  if (!all_finite(dq, M) || !all_finite(dp, M))
-    return PENDULUM_STOERMER_VERLET_NOT_FINITE;
-  lanes_store(F, memory);
-  return PENDULUM_STOERMER_VERLET_OK;
-}
-#endif
-
-pendulum_stoermer_verlet_options pendulum_stoermer_verlet_default_options(void)
-{
-  const pendulum_stoermer_verlet_options options = {2.220446049250313e-16, 50, 0};
-  return options;
-}
-
-/* The guess that q moves on a straight line with its initial velocity. */
-static int guess_straight(const step_data *step, double *z)
-{
-  double v[M];
-  const int status = pendulum_stoermer_verlet_velocity(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
-  for (int b = 0; status == PENDULUM_STOERMER_VERLET_OK && b < B; b++)
-    for (int i = 0; i < M; i++)
-      z[b * M + i] = STRAIGHT[b] * v[i];
-  return status;
-}
-
-/* The guess that the curve of the step before goes on. */
-static void guess_extrapolated(const double *memory, double *z)
-{
-  for (int b = 0; b < B; b++)
-    gather(EXTRAPOLATION[b], 1.0, memory, z + b * M);
-}
-
-/* The increments by Newton's iteration, from the extrapolated guess if there is one, and from the straight line if there
- * is none or it leads nowhere. */
-static int solve_newton(const step_data *step, double *memory, int guess, double *dq, double *dp,
-    const pendulum_stoermer_verlet_options *options, pendulum_stoermer_verlet_report *report, double *workspace)
-{
-  double *z = workspace;
-  int status = PENDULUM_STOERMER_VERLET_NOT_CONVERGED;
-  if (guess) {
-    guess_extrapolated(memory, z);
-    status = newton(step, z, NULL, NULL, dp, options, report, z + N);
-  }
-  if (status != PENDULUM_STOERMER_VERLET_OK) {
-    status = guess_straight(step, z);
-    if (status == PENDULUM_STOERMER_VERLET_OK)
-      status = newton(step, z, NULL, NULL, dp, options, report, z + N);
-  }
-  if (status == PENDULUM_STOERMER_VERLET_OK) {
-    gather(END_POSITION, step->h, z, dq);
-    memcpy(memory, z, sizeof(double) * N);
-  }
-  return status;
-}
-#ifdef __GNUC__
-typedef sweep_data solver_data;
-
-static void prepare(const step_data *step, solver_data *data)
-{
-  prepare_sweep(step, data);
-}
-
-/* The increments by sweeps, from the extrapolated guess and then from the straight line, else by Newton's iteration. On success
- * guess says whether memory can be extrapolated. */
-static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
-    const pendulum_stoermer_verlet_options *options, pendulum_stoermer_verlet_report *report, double *workspace)
-{
-  int status = sweep(step, data, memory, *guess != 0, dq, dp, options, report), swept = 1;
-  if (status != PENDULUM_STOERMER_VERLET_OK && *guess)
-    status = sweep(step, data, memory, 0, dq, dp, options, report);
-  if (status != PENDULUM_STOERMER_VERLET_OK) {
-    status = solve_newton(step, workspace, 0, dq, dp, options, report, workspace + MEMORY);
-    swept = 0;
-  }
-  if (status == PENDULUM_STOERMER_VERLET_OK)
-    *guess = swept;
-  return status;
-}
-#else
-typedef struct {
-  int unused;
 } solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
 {
-  (void)step;
-  data->unused = 0;
+  mass(step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
 }
 
+/* The increments of one step; memory keeps the last force, which is the first of the next step. */
 static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const pendulum_stoermer_verlet_options *options, pendulum_stoermer_verlet_report *report, double *workspace)
 {
-  const int status = solve_newton(step, memory, *guess != 0, dq, dp, options, report, workspace + MEMORY);
-  (void)data;
-  if (status == PENDULUM_STOERMER_VERLET_OK)
-    *guess = 1;
-  return status;
+  double F[M], u[M];
+  (void)options;
+  (void)workspace;
+  memset(dq, 0, sizeof(double) * M);
+  memset(dp, 0, sizeof(double) * M);
+  for (int n = 0;; n++) {
+    for (int i = 0; i < M; i++)
+      u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
+    if (n == 0 && *guess)
+      memcpy(F, memory, sizeof F);
+    else
+      force(u, step->parameters, F);
+    for (int i = 0; i < M; i++)
+      dp[i] += step->h * KICK[n] * F[i];
+    if (n == 1)
+      break;
+    for (int i = 0; i < M; i++)
+      dq[i] += step->h * DRIFT[n] * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
+  }
+  report->iterations++;
+  if (!all_finite(dq, M) || !all_finite(dp, M))
+    return PENDULUM_STOERMER_VERLET_NOT_FINITE;
+  memcpy(memory, F, sizeof F);
+  *guess = 1;
+  return PENDULUM_STOERMER_VERLET_OK;
 }
-#endif
 
 int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const pendulum_stoermer_verlet_options *options, double *q1, double *p1, pendulum_stoermer_verlet_report *report, double *workspace)

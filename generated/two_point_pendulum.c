@@ -508,62 +508,10 @@ typedef union {
   double lane[LANES];
 } lane_view;
 
-/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 2 repeat it. */
-static const lanes POINT_ABSCISSA = {0.2113248654051869, 0.7886751345948131};
-static const lanes POINT_POSITION[2] = {
-  {0.2113248654051869, 0.7886751345948131},
-  {0.0, 0.0}
-};
-static const lanes POINT_POSITION_WEIGHT = {1.0, 0.0};
-static const lanes POINT_MOMENTUM[2] = {
-  {0.7886751345948129, 0.7886751345948129},
-  {0.21132486540518713, 0.21132486540518713}
-};
-static const lanes POINT_MOMENTUM_WEIGHT = {0.5, 0.5};
-static const lanes POINT_END_POSITION = {1.0, 0.0};
-static const lanes POINT_END_MOMENTUM = {1.0, 1.0};
-static const lanes POINT_PRODUCT[2] = {
-  {0.08333333333333325, 0.3110042339640732},
-  {0.022329099369260207, 0.08333333333333336}
-};
-static const lanes POINT_EXTRAPOLATION[2] = {
-  {-0.7320508075688773, -1.7320508075688772},
-  {1.7320508075688772, 2.732050807568877}
-};
-
 static inline lanes lanes_of(double x)
 {
   const lanes zero = {0.0};
   return zero + x;
-}
-
-/* sum_j table[j] x_j, in four sums that do not wait for each other. */
-static inline lanes lanes_apply(const lanes *table, lanes x)
-{
-  const lane_view view = {x};
-  lanes a = table[0] * view.lane[0];
-  for (int j = 1; j < LANES; j++)
-    a += table[j] * view.lane[j];
-  return a;
-}
-
-static inline double lanes_total(lanes x)
-{
-  lane_view view = {x};
-  for (int half = LANES / 2; half > 0; half /= 2)
-    for (int j = 0; j < half; j++)
-      view.lane[j] += view.lane[j + half];
-  return view.lane[0];
-}
-
-static inline void lanes_load(const double *memory, lanes *x)
-{
-  memcpy(x, memory, sizeof(double) * M * LANES);
-}
-
-static inline void lanes_store(const lanes *x, double *memory)
-{
-  memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
 /* Whole vectors by glibc's libmvec where SCVI_LIBMVEC says that it is linked, else lane by lane. */
@@ -602,6 +550,58 @@ static inline lanes lanes_sin(lanes x)
 }
 #endif
 
+/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 2 repeat it. */
+static const lanes POINT_DRIFT = {0.2113248654051869, 0.7886751345948131};
+static const lanes POINT_POSITION[2] = {
+  {0.2113248654051869, 0.7886751345948131},
+  {0.0, 0.0}
+};
+static const lanes POINT_POSITION_WEIGHT = {1.0, 0.0};
+static const lanes POINT_MOMENTUM[2] = {
+  {0.7886751345948129, 0.7886751345948129},
+  {0.21132486540518713, 0.21132486540518713}
+};
+static const lanes POINT_MOMENTUM_WEIGHT = {0.5, 0.5};
+static const lanes POINT_END_POSITION = {1.0, 0.0};
+static const lanes POINT_END_MOMENTUM = {1.0, 1.0};
+static const lanes POINT_PRODUCT[2] = {
+  {0.08333333333333325, 0.3110042339640732},
+  {0.022329099369260207, 0.08333333333333336}
+};
+static const lanes POINT_EXTRAPOLATION[2] = {
+  {-0.7320508075688773, -1.7320508075688772},
+  {1.7320508075688772, 2.732050807568877}
+};
+
+/* sum_j table[j] x_j, in four sums that do not wait for each other. */
+static inline lanes lanes_apply(const lanes *table, lanes x)
+{
+  const lane_view view = {x};
+  lanes a = table[0] * view.lane[0];
+  for (int j = 1; j < LANES; j++)
+    a += table[j] * view.lane[j];
+  return a;
+}
+
+static inline double lanes_total(lanes x)
+{
+  lane_view view = {x};
+  for (int half = LANES / 2; half > 0; half /= 2)
+    for (int j = 0; j < half; j++)
+      view.lane[j] += view.lane[j + half];
+  return view.lane[0];
+}
+
+static inline void lanes_load(const double *memory, lanes *x)
+{
+  memcpy(x, memory, sizeof(double) * M * LANES);
+}
+
+static inline void lanes_store(const lanes *x, double *memory)
+{
+  memcpy(memory, x, sizeof(double) * M * LANES);
+}
+
 /* L_q at all points. Operations: 3 *, 1 neg, 1 sin. */
 static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
 {
@@ -617,7 +617,7 @@ static void mass(const double *parameters, double *value)
 /* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */
 typedef struct {
   lanes position_weight, momentum_weight; /* h beta, h w: the same rounded numbers everywhere */
-  lanes abscissa, product[LANES]; /* h c, h^2 (a A) */
+  lanes drift, product[LANES]; /* h times the row sums of a, h^2 (a A) */
   double inverse_mass[M];
 } sweep_data;
 
@@ -626,7 +626,7 @@ static void prepare_sweep(const step_data *step, sweep_data *sweep)
   const double h = step->h;
   sweep->position_weight = h * POINT_POSITION_WEIGHT;
   sweep->momentum_weight = h * POINT_MOMENTUM_WEIGHT;
-  sweep->abscissa = h * POINT_ABSCISSA;
+  sweep->drift = h * POINT_DRIFT;
   for (int j = 0; j < LANES; j++)
     sweep->product[j] = h * (h * POINT_PRODUCT[j]);
   mass(step->parameters, sweep->inverse_mass);
@@ -634,20 +634,27 @@ static void prepare_sweep(const step_data *step, sweep_data *sweep)
     sweep->inverse_mass[i] = 1.0 / sweep->inverse_mass[i];
 }
 
+/* What follows a sweep would change the points by, squared, with a margin: the rate of contraction is that from the sweep
+ * before, whose change is infinite before the first. */
+static inline double expected_change(double change, double last, const two_point_pendulum_options *options)
+{
+  const double ratio = last < INFINITY ? smaller(larger(change / last, 1e-6), 0.25) : 1.0; /* squares, too */
+  return options->absolute ? change : 4.0 * ratio * change * ratio;
+}
+
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
  * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
  * contracts too slowly or not at all. */
 static int sweep_status(double change, double last, const two_point_pendulum_options *options, int k)
 {
-  const double ratio = smaller(larger(change / last, 1e-6), 0.25); /* squares, too */
-  const double expected = options->absolute ? change : 4.0 * ratio * change * ratio;
+  const double expected = expected_change(change, last, options);
   if (!(change < INFINITY))
     return -1;
   if (change == 0.0)
     return 1;
-  if (k > 0 && expected <= options->tolerance * options->tolerance)
+  if (expected <= options->tolerance * options->tolerance)
     return 1;
-  if (k > 1 && change >= last * 0.0625 && change < 1e-25)
+  if (k > 0 && change >= last * 0.0625 && change < 1e-25)
     return 1;
   if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
     return -1;
@@ -664,7 +671,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   int status = 0;
   for (int i = 0; i < M; i++) {
     const double v = data->inverse_mass[i] * step->p0[i];
-    base[i] = step->q0[i] + (data->abscissa * v + step->carry_q[i]);
+    base[i] = step->q0[i] + (data->drift * v + step->carry_q[i]);
     inverse_size[i] = fabs(step->q0[i]) + fabs(step->h * v);
     largest = larger(largest, inverse_size[i]);
     X[i] = base[i];
@@ -690,7 +697,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
     }
     force_lanes(X, step->parameters, F);
     total = lanes_total(change);
-    status = sweep_status(total, last, options, k + guess);
+    status = sweep_status(total, last, options, k);
     last = total;
     report->iterations++;
   }

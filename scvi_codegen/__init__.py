@@ -41,6 +41,7 @@ _HOMES = {
         "ChebyshevGauss",
         "ChebyshevLobatto",
         "CollocationRK",
+        "Composition",
         "ExplicitEuler",
         "Gauss",
         "LobattoIIIA",

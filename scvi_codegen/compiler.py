@@ -16,10 +16,12 @@ import re
 
 from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.lowering import lower
+from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
 from scvi_codegen.rendering import render, render_ensemble, workspace_size
 from scvi_codegen.source import Interface, Source
+from scvi_codegen.splitting import splitting_of
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.sweeps import check_solver, sweep_of
 from scvi_codegen.system import LagrangianSystem
@@ -27,7 +29,7 @@ from scvi_codegen.system import LagrangianSystem
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
 
 LONGEST_PREFIX = 64
-SOLVERS = ("auto", "newton", "fixed-point")
+SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
 def compile_stepper(
@@ -45,7 +47,8 @@ def compile_stepper(
         method: how its motion is discretised.
         solver: of the stage equations: ``"fixed-point"`` (fast, points as vector lanes; for SVI with as many points as
             the degree, Runge-Kutta methods, and every SVI and SC of a separable system), ``"newton"`` (always, also for
-            stiff systems and large steps) or ``"auto"``: fixed point where there is one, Newton where it fails.
+            stiff systems and large steps), ``"explicit"`` (Stoermer-Verlet and compositions on separable systems) or
+            ``"auto"``: explicit or fixed point where there is one, Newton where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 
@@ -67,10 +70,12 @@ def generate_source(
 
 
 def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
-    sweep = None if solver == "newton" else sweep_of(system, method)
-    check_solver(solver, sweep, method, SOLVERS)
     name = c_identifier(prefix or f"{system.name}_{method.name}")
-    return lower(system, method, prefix=name, sweep=sweep, newton=solver != "fixed-point")
+    splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
+    sweep = sweep_of(system, method) if solver in ("auto", "fixed-point") and splitting is None else None
+    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
+    newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))
+    return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton)
 
 
 def describe(program: Program, system: LagrangianSystem, method: Method) -> Interface:

@@ -1,18 +1,21 @@
 """Many trajectories at once: a trajectory a vector lane, blocks of lanes over the processor's cores.
 
-Each block of eight runs in C without Python's lock, so threads share the work. One trajectory cannot spoil another: a
-lane whose step fails keeps its last good state and is continued alone by the single integrator (which has Newton's
-iteration to fall back on); if that fails too, its later states are NaN and its status says so.
+Each block runs in C without Python's lock, so threads share the work. One trajectory cannot spoil another: a lane whose
+step fails keeps its last good state and is continued alone by the single integrator (which has Newton's iteration to
+fall back on); if that fails too, its later states are NaN and its status says so. Results are the same, bit for bit, for
+any number of threads.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,18 +23,22 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen import building
 from scvi_codegen.arguments import checked_count, checked_number, checked_step
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.source import Source
+from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
-    from scvi_codegen.stepper import SolverOptions, Stepper
+    from scvi_codegen.stepper import Run, SolverOptions, Stepper
 
-__all__ = ["EnsembleTrajectory", "integrate_ensemble"]
+__all__ = ["Ensemble", "EnsembleTrajectory", "integrate_ensemble"]
 
 Array = NDArray[np.float64]
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
-LANES = 8
-SLICE_SECONDS = 0.1
-"""Time between looks at the keyboard and calls of ``progress``."""
+
+OK, INTERRUPTED = "ok", "interrupted"
+FIRST_PORTION = 64
+"""Steps of a block before the first look at the clock."""
+PORTION_SECONDS = 0.02
+"""Time between looks, in a block, for a wish to stop."""
+PROGRESS_SECONDS = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,7 +48,8 @@ class EnsembleTrajectory:
     Attributes:
         t: (n,) times.
         q, p: (n, k, m) positions and momenta; NaN after a failure.
-        status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``).
+        status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
+            ``"interrupted"``).
         steps: (k,) steps completed.
         h: step size.
         parameters: (k, number of parameters).
@@ -63,15 +71,68 @@ class EnsembleTrajectory:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(k,) which trajectories reached the end."""
-        return self.status == "ok"
+        return self.status == OK
 
     def energy(self) -> Array:
-        """(n, k) energies p.v - L; NaN after a failure."""
+        """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
         energies = np.full(self.q.shape[:2], np.nan)
         for j in range(len(self)):
-            good = np.isfinite(self.q[:, j]).all(axis=1)
-            energies[good, j] = self.stepper.energy(self.q[good, j], self.p[good, j], self.t[good], self.parameters[j])
+            good = self._reached(j)
+            try:
+                energies[good, j] = self.stepper.energy(
+                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                )
+            except StateError:
+                continue
         return energies
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.
+
+        In a CSV file trajectories are numbered from 0, parameters that differ between them have columns too, and states
+        after a failure are left out.
+
+        Raises:
+            StateError: for another suffix.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".npz":
+            write_atomically(path, self._write_npz)
+        elif suffix == ".csv":
+            write_atomically(path, self._write_csv)
+        else:
+            raise StateError(f"an ensemble is saved as .npz or .csv, not as {str(path)!r}")
+
+    def _reached(self, j: int) -> NDArray[np.bool_]:
+        reached: NDArray[np.bool_] = np.isfinite(self.q[:, j]).all(axis=1)
+        return reached
+
+    def _write_npz(self, file: IO[bytes]) -> None:
+        np.savez(
+            file,
+            t=self.t,
+            q=self.q,
+            p=self.p,
+            status=self.status,
+            steps=self.steps,
+            h=self.h,
+            parameters=self.parameters,
+            coordinates=np.array(self.stepper.coordinates),
+            parameter_names=np.array(self.stepper.parameters, dtype=str),
+            title=self.stepper.title,
+        )
+
+    def _write_csv(self, file: IO[bytes]) -> None:
+        names = self.stepper.coordinates
+        varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
+        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
+        file.write((",".join(header) + "\n").encode())
+        formats = ["%d"] + ["%.17g"] * (len(header) - 1)
+        for j in range(len(self)):
+            good = self._reached(j)
+            label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
+            table = np.column_stack([label, self.t[good], self.q[good, j], self.p[good, j]])
+            np.savetxt(file, table, delimiter=",", fmt=formats)
 
 
 def integrate_ensemble(
@@ -89,25 +150,26 @@ def integrate_ensemble(
     threads: int | None = None,
 ) -> EnsembleTrajectory:
     """See :meth:`scvi_codegen.stepper.Stepper.integrate_ensemble`."""
-    work = _Ensemble(stepper, q, p, h, steps, every, t, parameters, options)
-    work.run(progress, threads or os.cpu_count() or 1)
+    work = Ensemble(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
+    work.run(progress=progress, threads=threads)
     return work.result()
 
 
-class _Ensemble:
-    """Arrays of one call, shared by the blocks that fill them."""
+class Ensemble:
+    """An ensemble to be integrated: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``."""
 
     def __init__(
         self,
         stepper: Stepper,
         q: ArrayLike,
         p: ArrayLike,
+        *,
         h: float,
         steps: int,
-        every: int,
-        t: float,
-        parameters: EnsembleParameters,
-        options: SolverOptions | None,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
     ) -> None:
         self.stepper, self.options = stepper, options
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
@@ -122,105 +184,134 @@ class _Ensemble:
         self.q = np.full((kept, self.count, stepper.dimension), np.nan)
         self.p = np.full_like(self.q, np.nan)
         self.q[0], self.p[0] = start_q, start_p
-        self.status = np.full(self.count, "ok", dtype="<U16")
+        self.status = np.full(self.count, OK, dtype="<U16")
         self.done = np.zeros(self.count, dtype=np.int64)
 
-    def run(self, progress: Callable[[int], None] | None, threads: int) -> None:
-        """All blocks, by ``threads`` workers, in slices short enough to be interrupted."""
-        blocks = [_block(self, first) for first in range(0, self.count, LANES)]
-        with ThreadPoolExecutor(threads) as pool:
-            finished, portion = 0, self.every
-            while finished < self.steps:
-                size = min(portion, self.steps - finished)
+    def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
+        """All blocks, by ``threads`` workers; what ``progress`` raises stops them within moments.
+
+        Afterwards, also after an exception, :meth:`result` holds what was computed.
+        """
+        workers = checked_count(threads or os.cpu_count() or 1, "threads", least=1)
+        make, width = self._blocks()
+        firsts = range(0, self.count, width)
+        reached, stop = np.zeros(len(firsts)), threading.Event()
+
+        def drive(number: int) -> None:
+            block = make(firsts[number])
+            portion = min(FIRST_PORTION, self.steps)
+            while reached[number] < self.steps and not stop.is_set():
                 began = time.perf_counter()
-                list(pool.map(lambda block, at=finished, n=size: block.advance(at, n), blocks))
-                finished += size
-                if progress is not None:
-                    progress(finished)
-                elapsed = max(time.perf_counter() - began, 1e-6)
-                portion = self.every * max(1, int(min(8.0 * size, size * SLICE_SECONDS / elapsed) / self.every))
-            list(pool.map(lambda block: block.finish(), blocks))
+                block.advance(portion)
+                reached[number] += portion
+                faster = PORTION_SECONDS / max(time.perf_counter() - began, 1e-6)
+                portion = min(max(1, int(portion * min(8.0, faster))), self.steps - int(reached[number]))
+
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                pending = {pool.submit(drive, number) for number in range(len(firsts))}
+                while pending:
+                    finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
+                    for future in finished:
+                        future.result()
+                    if progress is not None:
+                        progress(int(reached.mean()))
+            finally:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+
+    def _blocks(self) -> tuple[Callable[[int], _LaneBlock | _SingleBlock], int]:
+        """How to make the block that begins with a trajectory, and how many trajectories it holds."""
+        source = self.stepper.ensemble
+        if source is None:
+            return lambda first: _SingleBlock(self, first), 1
+        module, prefix = building.load(source, flags=self.stepper.flags), source.prefix
+        width = len(module.ffi.new(f"{prefix}_block *").active)
+        return lambda first: _LaneBlock(self, first, module, prefix), width
 
     def result(self) -> EnsembleTrajectory:
-        """The arrays, with their times."""
-        number = self.every * np.arange(len(self.q))
+        """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
+        unfinished = (self.status == OK) & (self.done < self.steps)
         return EnsembleTrajectory(
-            t=self.t0 + number * self.h,
+            t=self.t0 + self.every * np.arange(len(self.q)) * self.h,
             q=self.q,
             p=self.p,
-            status=self.status,
+            status=np.where(unfinished, INTERRUPTED, self.status),
             steps=self.done,
             h=self.h,
             parameters=self.parameters,
             stepper=self.stepper,
         )
 
-    def continue_alone(self, j: int, step: int, q: Array, p: Array, carries: tuple[Array, Array] | None) -> None:
-        """Trajectory j from its state after ``step`` steps to the end, by the single integrator."""
-        run = self.stepper.start(q, p, h=self.h, t=self.t0, parameters=self.parameters[j], options=self.options)
-        run.resume_at(step, carries)
-        first = step // self.every + 1
-        try:
-            trajectory = run.record(self.steps - step, every=self.every)
-        except StepFailedError as failure:
-            self.status[j], trajectory = failure.status, failure.recorded
-        self.done[j] = run.steps
-        self.q[first : first + len(trajectory) - 1, j] = trajectory.q[1:]
-        self.p[first : first + len(trajectory) - 1, j] = trajectory.p[1:]
-
 
 class _LaneBlock:
-    """Up to eight trajectories in one C block."""
+    """A few trajectories, lanes of one C block, and those of them that had to leave it."""
 
-    def __init__(self, work: _Ensemble, first: int, module: Any, source: Source) -> None:
-        self.work, self.first = work, first
-        self.count = min(LANES, work.count - first)
-        self.ffi, self.lib, self.prefix = module.ffi, module.lib, source.prefix
-        self.memory = self.ffi.new(f"{self.prefix}_block *")
+    def __init__(self, work: Ensemble, first: int, module: Any, prefix: str) -> None:
+        self.work, self.first, self.prefix = work, first, prefix
+        self.ffi, self.lib = module.ffi, module.lib
+        self.memory = self.ffi.new(f"{prefix}_block *")
         self._call("start")(self.memory, work.t0, work.h)
-        self.alone = [False] * self.count
-        for lane in range(LANES):
+        width = len(self.memory.active)
+        self.count, self.step = min(width, work.count - first), 0
+        self.left: dict[int, _Alone] = {}
+        for lane in range(width):
             self._fill(lane, first + min(lane, self.count - 1))
-
-    def _fill(self, lane: int, j: int) -> None:
-        work = self.work
-        q, p = work.q[0, j].copy(), work.p[0, j].copy()
-        try:
-            v = work.stepper.velocity(q, p, work.t0, work.parameters[j])
-        except StateError:
-            v = np.zeros_like(q)
-            if lane < self.count:
-                self.alone[lane] = True
-        pointers = (self.ffi.from_buffer("double[]", array) for array in (q, p, v))
-        values = work.parameters[j].copy()
-        given = self.ffi.from_buffer("double[]", values) if values.size else self.ffi.NULL
-        self._call("set")(self.memory, lane, *pointers, given)
-        if lane < self.count and self.alone[lane]:
-            self.memory.active[lane] = 0.0
 
     def _call(self, name: str) -> Callable[..., Any]:
         function: Callable[..., Any] = getattr(self.lib, f"{self.prefix}_{name}")
         return function
 
-    def advance(self, finished: int, size: int) -> None:
-        """``size`` steps on from ``finished``."""
+    def _fill(self, lane: int, j: int) -> None:
+        """Trajectory j into a lane, which rests if it is one too many or the velocity is not to be had."""
         work = self.work
-        row = finished // work.every + 1
-        kept = (finished + size) // work.every - finished // work.every
-        m = work.stepper.dimension
-        out_q, out_p = np.empty((max(kept, 1), self.count, m)), np.empty((max(kept, 1), self.count, m))
-        self._call("advance")(
-            self.memory,
-            self.count,
-            size,
-            work.every,
-            self._options(),
-            self.ffi.from_buffer("double[]", out_q),
-            self.ffi.from_buffer("double[]", out_p),
-            self.count * m,
-        )
-        columns = slice(self.first, self.first + self.count)
-        work.q[row : row + kept, columns], work.p[row : row + kept, columns] = out_q[:kept], out_p[:kept]
+        q, p, values = work.q[0, j].copy(), work.p[0, j].copy(), work.parameters[j].copy()
+        active = lane < self.count
+        try:
+            v = work.stepper.velocity(q, p, work.t0, values)
+        except StateError:
+            v, active = np.zeros_like(q), False
+        pointers = (self.ffi.from_buffer("double[]", array) for array in (q, p, v))
+        given = self.ffi.from_buffer("double[]", values) if values.size else self.ffi.NULL
+        self._call("set")(self.memory, lane, *pointers, given)
+        self.memory.active[lane] = float(active)
+
+    def advance(self, size: int) -> None:
+        """``size`` steps on."""
+        work, begin, self.step = self.work, self.step, self.step + size
+        if len(self.left) < self.count:
+            row = begin // work.every + 1
+            stride = work.count * work.stepper.dimension
+            place = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
+            self._call("advance")(
+                self.memory,
+                self.count,
+                size,
+                work.every,
+                self._options(),
+                self.ffi.from_buffer("double[]", work.q) + place,
+                self.ffi.from_buffer("double[]", work.p) + place,
+                stride,
+            )
+        for lane in range(self.count):
+            if lane not in self.left and self.memory.active[lane] > 0.0:
+                work.done[self.first + lane] = self.step
+            else:
+                self._leave(lane, begin)
+
+    def _leave(self, lane: int, begin: int) -> None:
+        """What the block stored of a resting lane in a call that began after ``begin`` steps gives way to its own run."""
+        work, j = self.work, self.first + lane
+        if lane not in self.left:
+            step = int(self.memory.last_step[lane])
+            q, p, *carries = (
+                np.array([row[lane] for row in getattr(self.memory, name)]) for name in ("q", "p", "carry_q", "carry_p")
+            )
+            self.left[lane] = _Alone(work, j, q, p, step, (carries[0], carries[1]))
+            begin = step
+        rows = slice(begin // work.every + 1, self.step // work.every + 1)
+        work.q[rows, j] = work.p[rows, j] = np.nan
+        self.left[lane].advance_to(self.step)
 
     def _options(self) -> Any:
         options = self.work.options
@@ -229,66 +320,56 @@ class _LaneBlock:
         values = [options.tolerance, options.max_iterations, int(options.absolute)]
         return self.ffi.new(f"{self.prefix}_options *", values)
 
-    def finish(self) -> None:
-        """Continue the trajectories that left the block, each alone."""
-        for lane in range(self.count):
-            j = self.first + lane
-            self.work.done[j] = self.memory.last_step[lane]
-            if self.memory.active[lane] > 0.0:
-                continue
-            step = int(self.memory.last_step[lane])
-            self.work.q[step // self.work.every + 1 :, j] = np.nan
-            self.work.p[step // self.work.every + 1 :, j] = np.nan
-            q, p, *carries = (
-                np.array([row[lane] for row in getattr(self.memory, name)]) for name in ("q", "p", "carry_q", "carry_p")
-            )
-            self.work.continue_alone(j, step, q, p, (carries[0], carries[1]))
-
 
 class _SingleBlock:
-    """Up to eight trajectories, one after the other: methods without a fixed-point iteration."""
+    """One trajectory, of a method without lanes."""
 
-    def __init__(self, work: _Ensemble, first: int) -> None:
-        self.work, self.first, self.count = work, first, min(LANES, work.count - first)
-        self.runs = [
-            work.stepper.start(
-                work.q[0, j], work.p[0, j], h=work.h, t=work.t0, parameters=work.parameters[j], options=work.options
-            )
-            for j in range(first, first + self.count)
-        ]
+    def __init__(self, work: Ensemble, first: int) -> None:
+        self.step, self.run = 0, _Alone(work, first, work.q[0, first], work.p[0, first])
 
-    def advance(self, finished: int, size: int) -> None:
-        """``size`` steps on from ``finished`` of those that have not failed."""
-        work = self.work
-        row = finished // work.every + 1
-        for j, run in enumerate(self.runs, self.first):
-            if work.status[j] != "ok":
-                continue
-            try:
-                trajectory = run.record(size, every=work.every)
-            except StepFailedError as failure:
-                work.status[j], trajectory = failure.status, failure.recorded
-            work.done[j] = run.steps
-            work.q[row : row + len(trajectory) - 1, j] = trajectory.q[1:]
-            work.p[row : row + len(trajectory) - 1, j] = trajectory.p[1:]
-
-    def finish(self) -> None:
-        """Nothing is left to do."""
+    def advance(self, size: int) -> None:
+        """``size`` steps on."""
+        self.step += size
+        self.run.advance_to(self.step)
 
 
-def _block(work: _Ensemble, first: int) -> _LaneBlock | _SingleBlock:
-    source = work.stepper.ensemble
-    if source is None:
-        return _SingleBlock(work, first)
-    return _LaneBlock(work, first, building.load(source, flags=work.stepper.flags), source)
+class _Alone:
+    """Trajectory j by the single integrator, from its state after ``step`` steps."""
+
+    def __init__(
+        self, work: Ensemble, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
+    ) -> None:
+        self.work, self.j = work, j
+        self.run: Run | None = None
+        work.done[j] = step
+        try:
+            run = work.stepper.start(q, p, h=work.h, t=work.t0, parameters=work.parameters[j], options=work.options)
+        except StateError:  # a sum of finite terms that overflowed
+            work.status[j] = "not finite"
+        else:
+            run.resume_at(step, carries)
+            self.run = run
+
+    def advance_to(self, step: int) -> None:
+        """On to ``step``, unless it failed before."""
+        work, j, run = self.work, self.j, self.run
+        if run is None:
+            return
+        row = run.steps // work.every + 1
+        try:
+            trajectory = run.record(step - run.steps, every=work.every)
+        except StepFailedError as failure:
+            work.status[j], trajectory, self.run = failure.status, failure.recorded, None
+        work.done[j] = run.steps
+        rows = slice(row, row + len(trajectory) - 1)
+        work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
 
 
 def _states(stepper: Stepper, value: ArrayLike, name: str) -> Array:
     """(k, m) finite numbers."""
-    try:
-        array = np.array(value, dtype=float, ndmin=2)
-    except (TypeError, ValueError) as error:
-        raise StateError(f"{name} must be an array of real numbers: {error}") from error
+    array = _numbers(value, name)
+    if array.ndim == 1:
+        array = array[np.newaxis]
     if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
         raise StateError(f"{name} must have shape (k, {stepper.dimension}), not {array.shape}")
     if not np.isfinite(array).all():
@@ -301,16 +382,14 @@ def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Arra
     """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))
-    if given is None:
-        return values
     if isinstance(given, Mapping):
         for name, value in given.items():
-            column = np.asarray(value, dtype=float)
+            column = _numbers(value, f"the parameter {name}")
             if column.shape not in ((), (count,)):
                 raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
             values[:, stepper.parameter_index(name)] = column
-    else:
-        array = np.array(given, dtype=float)
+    elif given is not None:
+        array = _numbers(given, "parameters")
         if array.shape not in ((len(names),), (count, len(names))):
             raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
         values[:] = array
@@ -318,3 +397,10 @@ def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Arra
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
         raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}")
     return values
+
+
+def _numbers(value: ArrayLike, name: str) -> Array:
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise StateError(f"{name} must be an array of real numbers: {error}") from error

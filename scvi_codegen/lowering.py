@@ -34,6 +34,7 @@ from scvi_codegen.program import (
     Program,
     ScatterLoop,
     SlopeBlock,
+    Splitting,
     Sweep,
 )
 from scvi_codegen.stage_system import PointFamily, StageSystem
@@ -255,7 +256,13 @@ def _reachable(graph: _Graph, roots: Sequence[int]) -> set[int]:
 
 
 def lower(
-    system: LagrangianSystem, method: Method, *, prefix: str, sweep: Sweep | None = None, newton: bool = True
+    system: LagrangianSystem,
+    method: Method,
+    *,
+    prefix: str,
+    sweep: Sweep | None = None,
+    splitting: Splitting | None = None,
+    newton: bool = True,
 ) -> Program:
     """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
@@ -263,6 +270,7 @@ def lower(
         system, method: what is lowered.
         prefix: a C identifier.
         sweep: the fixed-point iteration to try first (:func:`scvi_codegen.sweeps.sweep_of`).
+        splitting: the explicit solver that replaces both (:func:`scvi_codegen.splitting.splitting_of`).
         newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
     """
     stages = method.stage_system(system)
@@ -290,6 +298,7 @@ def lower(
         lagrangian=lagrangian,
         action=stages.action[0] if stages.action and newton else None,
         sweep=sweep,
+        splitting=splitting,
         newton=newton,
     )
 

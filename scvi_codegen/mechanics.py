@@ -11,7 +11,17 @@ import sympy
 from scvi_codegen.derivatives import gradient, jacobian
 from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["accelerations", "energy", "euler_lagrange", "force", "momentum", "multiplied_residual", "multipliers"]
+__all__ = [
+    "accelerations",
+    "energy",
+    "euler_lagrange",
+    "force",
+    "is_separable",
+    "mass_entries",
+    "momentum",
+    "multiplied_residual",
+    "multipliers",
+]
 
 
 def accelerations(system: LagrangianSystem) -> tuple[sympy.Symbol, ...]:
@@ -38,6 +48,11 @@ def force(system: LagrangianSystem) -> tuple[sympy.Expr, ...]:
     return _dense(gradient(system.lagrangian, system.coordinates), system.dimension)
 
 
+def mass_entries(system: LagrangianSystem) -> dict[tuple[int, int], sympy.Expr]:
+    """Non-zero entries of the mass matrix d2L/dv2 by (row, column), ascending."""
+    return jacobian(momentum(system), system.velocities)
+
+
 def energy(system: LagrangianSystem) -> sympy.Expr:
     """dL/dv . v - L, conserved when L does not depend on time."""
     products = [p * v for p, v in zip(momentum(system), system.velocities, strict=True)]
@@ -61,3 +76,13 @@ def multiplied_residual(system: LagrangianSystem) -> sympy.Expr:
     for multiplier, residual in zip(multipliers(system), euler_lagrange(system), strict=True):
         terms.extend(multiplier * term for term in sympy.Add.make_args(residual))
     return sympy.Add(*terms)
+
+
+def is_separable(system: LagrangianSystem) -> bool:
+    """Whether L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, as seen in the structure of its derivatives."""
+    momenta, mass = momentum(system), mass_entries(system)
+    constant = set(system.parameters)
+    if any(i != j or not entry.free_symbols <= constant for (i, j), entry in mass.items()):
+        return False
+    at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
+    return all(p.xreplace(at_rest) == 0 for p in momenta) and not jacobian(force(system), system.velocities)

@@ -22,6 +22,7 @@ __all__ = [
     "Program",
     "ScatterLoop",
     "SlopeBlock",
+    "Splitting",
     "Sweep",
 ]
 
@@ -158,6 +159,11 @@ class Family:
         return self.value.uses_time or self.slope.uses_time
 
     @property
+    def uses_step(self) -> bool:
+        """Whether h occurs around the kernel."""
+        return self.uses_time or any(loop.power for loop in (*self.gathers, *self.scatters))
+
+    @property
     def weighted(self) -> bool:
         """Whether any weight differs from 1."""
         return any(weight != 1.0 for weight in self.weights)
@@ -215,6 +221,25 @@ class Sweep:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Splitting:
+    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., kick s.
+
+    Attributes:
+        kicks: (s + 1,) p += h kicks[n] L_q.
+        drifts: (s,) q += h drifts[n] M^-1 p.
+        abscissae: (s + 1,) c_n of the kicks.
+        force: L_q at (q, t).
+        mass: constant diagonal (no arguments).
+    """
+
+    kicks: tuple[float, ...]
+    drifts: tuple[float, ...]
+    abscissae: tuple[float, ...]
+    force: Kernel
+    mass: Kernel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """All of an integrator but its syntax.
 
@@ -234,6 +259,7 @@ class Program:
         lagrangian: L at (q, v).
         action: name of the family whose weighted sum of L is the discrete Lagrangian, or ``None``.
         sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
+        splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
     """
 
@@ -254,6 +280,7 @@ class Program:
     lagrangian: Kernel
     action: str | None
     sweep: Sweep | None
+    splitting: Splitting | None
     newton: bool
 
     @property
@@ -276,7 +303,7 @@ class Program:
     def memory(self) -> int:
         """Numbers a run remembers of its last step to guess the next."""
         points = self.dimension * self.sweep.lanes if self.sweep else 0
-        return max(points, self.unknowns if self.newton else 0)
+        return max(points, self.unknowns if self.newton else 0, self.dimension if self.splitting else 0)
 
     def __str__(self) -> str:
         """Readable text of the whole program."""

@@ -31,7 +31,7 @@ DEFAULT_TOLERANCE = 2.0**-52
 MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
 KEEP_FACTORS = 1e-5
-ARGUMENT_NAMES = {2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
+ARGUMENT_NAMES = {1: "the argument alone", 2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
 POINT_SOURCES = ("u", "t")
 TRAJECTORY_SOURCES = ("u", "parameters")
 ENSEMBLE_LANES = 8
@@ -158,7 +158,9 @@ def _purposes(program: Program) -> dict[str, str]:
 def _results(family: Family) -> str:
     if family.name == "node":
         return "Derivatives of lambda . E" if len(family.gathers) == 4 else "The Euler-Lagrange residual E"
-    return "L_q and L_v" if len(family.scatters) == 2 else "L_v"
+    if len(family.scatters) == 2:
+        return "L_q and L_v"
+    return "L_q" if family.name == "kick" else "L_v"
 
 
 def _lane_context(sweep: Sweep | None) -> dict[str, object]:

@@ -18,36 +18,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import sympy
-
 from scvi_codegen.basis import extrapolation, matrix_product, transpose
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import MethodError
 from scvi_codegen.lowering import lower_kernel, lower_matrix, lower_vector
-from scvi_codegen.mechanics import force, momentum
+from scvi_codegen.mechanics import force, is_separable, momentum
 from scvi_codegen.methods.collocation import phase_space_system
 from scvi_codegen.methods.galerkin import EXTRAPOLATION_DEGREE
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import Matrix, Vector, mp
-from scvi_codegen.program import Kernel, Sweep
+from scvi_codegen.program import Kernel, Splitting, Sweep
 from scvi_codegen.stage_system import PointFamily, StageSystem
 from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["is_separable", "sweep_of"]
+__all__ = ["check_solver", "sweep_of"]
 
 MOST_POINTS = 32
 FRACTION_BITS = 51
-
-
-def is_separable(system: LagrangianSystem) -> bool:
-    """Whether L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, as seen in the structure of its derivatives."""
-    momenta = momentum(system)
-    mass = jacobian(momenta, system.velocities)
-    constant = set(system.parameters)
-    if any(i != j or not entry.free_symbols <= constant for (i, j), entry in mass.items()):
-        return False
-    at_rest = dict.fromkeys(system.velocities, sympy.S.Zero)
-    return all(p.xreplace(at_rest) == 0 for p in momenta) and not jacobian(force(system), system.velocities)
 
 
 def sweep_of(system: LagrangianSystem, method: Method) -> Sweep | None:
@@ -220,11 +207,13 @@ def _coupled_kernel(system: LagrangianSystem) -> tuple[Kernel, None, tuple[tuple
     return kernel, None, tuple(mass)
 
 
-def check_solver(solver: str, sweep: Sweep | None, method: Method, names: Sequence[str]) -> None:
-    """Raise :class:`MethodError` for a solver that does not exist, or not for this method and system."""
+def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:
+    """Raise :class:`MethodError` for a solver that does not exist, or was not ``found`` for this method and system."""
     if solver not in names:
         raise MethodError(f"there is no solver {solver!r}; there are {', '.join(names)}")
-    if solver == "fixed-point" and sweep is None:
+    if solver == "explicit" and found is None:
+        raise MethodError(f"{method.name} is not explicit for this system; use solver='auto'")
+    if solver == "fixed-point" and found is None:
         raise MethodError(
             f"{method.name} has no fixed-point iteration for this system; use solver='auto' or 'newton', "
             "or an SVI with as many quadrature points as its degree"

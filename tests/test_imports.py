@@ -18,40 +18,42 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors precision program source
-    derivatives expression_text nodes
+    derivatives expression_text nodes arguments
     quadrature system
     basis mechanics stage_system
     tableau
     methods.method
     methods.galerkin
-    methods.collocation
+    methods.collocation methods.composition
     methods.shooting
     methods
     equations lowering c_printer
-    sweeps rendering building
+    sweeps splitting rendering building
     trajectory
+    ensemble
     stepper
     compiler
     problems
     model_file
-    package plotting benchmark.cases
-    benchmark.reference
+    package plotting
+    __init__
     benchmark
-    cli.choices cli.conservation cli.listings
-    cli.running
     cli
-    __init__ __main__
+    __main__
 """
-"""From the ground up. A room imports from the floors below it; neighbours on one floor know nothing of each other."""
+"""From the ground up. A room imports from the floors below it; neighbours on one floor know nothing of each other.
+
+A folder stands here by its own name where its rooms have no floors of their own.
+"""
 
 FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for room in floor.split()}
 
 OWNERS = {
-    "jinja2": "rendering",
-    "cffi": "building",
-    "platformdirs": "building",
-    "matplotlib": "plotting",
-    "click": "cli",
+    "jinja2": ["rendering"],
+    "cffi": ["building"],
+    "platformdirs": ["building"],
+    "matplotlib": ["plotting", "benchmark"],
+    "click": ["cli"],
 }
 
 
@@ -92,21 +94,26 @@ def own_room(name: str) -> str | None:
     return found[0] if found else "__init__"
 
 
+def place(room: str) -> str:
+    """The entry of the table that a room stands under."""
+    return room if room in FLOOR_OF else room.split(".")[0]
+
+
 def test_every_room_stands_on_one_floor():
     assert len(FLOOR_OF) == len(FLOORS.split())
-    assert sorted(FLOOR_OF) == sorted(ROOMS)
+    assert {place(room) for room in ROOMS} == set(FLOOR_OF)
 
 
-@pytest.mark.parametrize("room", [room for room in FLOOR_OF if room in ROOMS])
+@pytest.mark.parametrize("room", [room for room in ROOMS if place(room) in FLOOR_OF])
 def test_imports_point_down_only(room):
-    own = {own_room(name) for name in imports(ROOMS[room])} - {None}
-    assert [other for other in sorted(own) if FLOOR_OF.get(other, 0) >= FLOOR_OF[room]] == []
+    used = {place(other) for other in map(own_room, imports(ROOMS[room])) if other is not None} - {place(room)}
+    assert [other for other in sorted(used) if FLOOR_OF.get(other, 0) >= FLOOR_OF[place(room)]] == []
 
 
 @pytest.mark.parametrize("library", OWNERS)
 def test_a_third_party_library_has_one_owner(library):
     users = {room for room, tree in ROOMS.items() if library in {name.split(".")[0] for name in imports(tree)}}
-    assert {room for room in users if f"{room}.".split(".")[0] != OWNERS[library]} == set()
+    assert {room.split(".")[0] for room in users} <= set(OWNERS[library])
 
 
 HEAVY = ("sympy", "mpmath", "jinja2", "scipy", "matplotlib", "click", "tomli_w", "pycparser")

@@ -1,7 +1,7 @@
 """The benchmark: this project and other integrators side by side, at equal error.
 
     cases       problems, eight initial states each, accelerations solved for by hand
-    reference   where they end, in extended precision; independent of the project's steppers
+    references  where they end, in extended precision; independent of the project's steppers
     ours        this project's steppers on a ladder of steps
     peers       heyoka, REBOUND, CyRK, JiTCODE, SciPy at several tolerances
     measuring   all of them timed in turn, in one process
@@ -28,7 +28,7 @@ from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.measuring import measure
 from scvi_codegen.benchmark.ours import RUNGS, Advice, our_contenders
 from scvi_codegen.benchmark.peers import PEERS, missing_module, peer_contenders
-from scvi_codegen.benchmark.reference import Reference, reference
+from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult, as_json, table
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods.method import Method
@@ -138,9 +138,8 @@ def benchmark(
 
         check_plot_path(plot_path)
     chosen = [case(name) for name in names or (() if drift_steps else CASES)]
-    description, results = machine(), []
-    for one in chosen:
-        results.append(run_case(one, plan or Plan(), say))
+    description = machine()
+    results = [run_case(one, plan or Plan(), say) for one in chosen]
     drifts = measure_drift(drift_steps, say) if drift_steps else []
     if json_path is not None:
         data: dict[str, Any] = as_json(results, description) | {"drift": [asdict(row) for row in drifts]}

@@ -235,7 +235,7 @@ def _outer_solar_system() -> Case:
         q=_rotated(entry.q, 3),
         velocity=_rotated(entry.velocity, 3),
         span=entry.span,
-        step=entry.step,
+        step=500.0,
         fine=256.0,
         bodies=Bodies(masses=masses, gravity=values["G"], fixed_centre=False, axes=3),
         masses=tuple(mass for mass in masses for _ in range(3)),
@@ -243,7 +243,7 @@ def _outer_solar_system() -> Case:
 
 
 def _chain_case(n: int) -> Case:
-    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=1.0, step=1.0)
+    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=1.0, step=1.0 if n < 16 else 2.0)
 
 
 def _relativistic_case() -> Case:

@@ -92,7 +92,8 @@ def measure_drift(steps: int, progress: Callable[[str], None] = lambda text: Non
 
 def drift_table(found: Sequence[DriftRow]) -> str:
     """The rows as text."""
-    header = f"{'relative energy error':24}{'steps':>10}{'at the end':>12}{'largest':>10}{'drift':>11}{'+-':>10}{'ns/step':>9}"
+    names = f"{'at the end':>12}{'largest':>10}{'drift':>11}{'+-':>10}{'ns/step':>9}"
+    header = f"{'relative energy error':24}{'steps':>10}{names}"
     lines = [
         f"{row.case:14}h={row.h:<8g}{row.steps:>10}{row.final:>12.1e}{row.largest:>10.1e}"
         f"{row.slope:>11.1e}{row.slope_error:>10.1e}{1e9 * row.seconds / row.steps:>9.0f}"

@@ -9,11 +9,12 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
+import scvi_codegen
 from scvi_codegen.building import TUNED_FLAGS, find_compiler
 
 __all__ = ["machine"]
 
-PACKAGES = ("scvi-codegen", "numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine")
+PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine")
 
 
 def machine() -> dict[str, str | dict[str, str]]:
@@ -28,7 +29,7 @@ def machine() -> dict[str, str | dict[str, str]]:
         "python": platform.python_version(),
         "compiler": shown.splitlines()[0] if shown else " ".join(compiler),
         "flags": " ".join(TUNED_FLAGS),
-        "versions": dict(_versions(PACKAGES)),
+        "versions": {"scvi-codegen": scvi_codegen.__version__, **dict(_versions(PACKAGES))},
     }
 
 

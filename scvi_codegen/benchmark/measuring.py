@@ -12,7 +12,7 @@ import numpy as np
 from scvi_codegen.benchmark.cases import STATES, Array
 from scvi_codegen.benchmark.contenders import Contender
 from scvi_codegen.benchmark.curves import Point
-from scvi_codegen.benchmark.reference import Reference, rms_error
+from scvi_codegen.benchmark.references import Reference, rms_error
 from scvi_codegen.errors import ScviCodegenError
 
 __all__ = ["Measurement", "measure"]

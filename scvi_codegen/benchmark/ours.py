@@ -23,7 +23,7 @@ __all__ = ["Advice", "ladder", "our_contenders"]
 Advice = Callable[[Case, Method], float]
 """A step size for a case and a method, chosen without knowing the answer."""
 
-RUNGS = 9
+RUNGS = 11
 RATIO = 2.0 ** (1.0 / 3.0)
 
 

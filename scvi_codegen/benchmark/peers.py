@@ -12,8 +12,11 @@ scipy       ``solve_ivp`` with DOP853, right-hand side compiled by Numba if it i
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import logging
 import math
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -85,6 +88,7 @@ class _Taylor:
     def integrator(self, tolerance: float) -> tuple[Any, float]:
         import heyoka
 
+        heyoka.llvm_state.clear_memcache()
         began = time.perf_counter()
         states = [0.125 * (n + 1) for n in range(len(self.equations))]  # replaced before each run
         made = heyoka.taylor_adaptive(
@@ -313,7 +317,8 @@ def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
     x = [jitcode.y(n) for n in range(2 * case.dimension)]
     rates = case.formulations[0].rates(x, case.parameters, symengine)
     system = jitcode.jitcode(rates, n=len(x), verbose=False)
-    system.compile_C()
+    with _elsewhere():
+        system.compile_C()
     seconds = time.perf_counter() - began
 
     def solve(start: Array, tolerance: float) -> Array:
@@ -323,6 +328,17 @@ def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
         return final
 
     yield from _dop853("JiTCODE DOP853", "right-hand side in C, default flags", seconds, case, quick, solve)
+
+
+@contextlib.contextmanager
+def _elsewhere() -> Iterator[None]:
+    """In a temporary folder: setuptools, which JiTCODE calls, would read a pyproject.toml here; and its logs aside."""
+    level = logging.root.level
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        try:
+            yield
+        finally:
+            logging.root.setLevel(level)
 
 
 def _scipy(case: Case, quick: bool) -> Iterator[Contender]:

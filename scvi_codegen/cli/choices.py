@@ -31,6 +31,7 @@ class Choices:
     method: str | None
     degree: int | None
     stages: int | None
+    order: int | None
     nodes: str | None
     quadrature: str | None
     form: str | None
@@ -80,6 +81,7 @@ METHOD_OPTIONS = (
     _option("--method", metavar="NAME", help="Method: svi, scvi, sc, gauss, ... (see 'scvi-codegen methods')."),
     _option("--degree", type=int, metavar="N", help="Degree of the trial curve (svi, scvi, sc)."),
     _option("--stages", type=int, metavar="N", help="Number of stages (gauss, radau-iia, lobatto-iiia, ...)."),
+    _option("--order", type=int, metavar="N", help="Order of a composition of Stoermer-Verlet: 2, 8 or 10."),
     _option("--quadrature", metavar="NAME:N", help="Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
     _option("--nodes", metavar="NAME", help="Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
     _option("--form", metavar="NAME", help="phase-space or position (sc and Runge-Kutta methods)."),
@@ -163,7 +165,7 @@ def _chosen_method(method: Method, choices: Choices) -> Method:
     """The method of the model with what the command line changes of it."""
     from scvi_codegen.methods import ARGUMENTS, method_from_specification
 
-    fields = ("degree", "stages", "quadrature", "nodes", "form", "variational", "abscissae")
+    fields = ("degree", "stages", "order", "quadrature", "nodes", "form", "variational", "abscissae")
     given = {field: getattr(choices, field) for field in fields if getattr(choices, field) is not None}
     if choices.method is None and not given:
         return method

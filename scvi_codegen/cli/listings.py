@@ -16,6 +16,7 @@ EXAMPLES: dict[str, dict[str, int | list[float]]] = {
     "scvi": {"degree": 4},
     "sc": {"degree": 4},
     "collocation": {"abscissae": [0.25, 0.75]},
+    "composition": {"order": 8},
 }
 EXAMPLE_STAGES = 3
 LONGEST_EXACT = 24

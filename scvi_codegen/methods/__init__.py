@@ -20,6 +20,7 @@ from scvi_codegen.methods.collocation import (
     RungeKutta,
     SpectralCollocation,
 )
+from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method, Specification
 from scvi_codegen.methods.shooting import SCVI
@@ -31,6 +32,7 @@ __all__ = [
     "ChebyshevGauss",
     "ChebyshevLobatto",
     "CollocationRK",
+    "Composition",
     "ExplicitEuler",
     "Gauss",
     "LobattoIIIA",
@@ -51,6 +53,7 @@ METHODS: dict[str, Callable[..., Method]] = {
     **TABLEAU_METHODS,
     "collocation": CollocationRK,
     "stoermer-verlet": StoermerVerlet,
+    "composition": Composition,
     "explicit-euler": ExplicitEuler,
 }
 """Constructors by the name used in model files and on the command line."""
@@ -62,9 +65,10 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(TABLEAU_METHODS, ("stages", "form")),
     "collocation": ("abscissae", "form"),
     "stoermer-verlet": (),
+    "composition": ("order",),
     "explicit-euler": ("form",),
 }
-REQUIRED = ("degree", "stages", "abscissae")
+REQUIRED = ("degree", "stages", "abscissae", "order")
 
 
 def method_from_specification(specification: Specification) -> Method:
@@ -86,4 +90,6 @@ def method_from_specification(specification: Specification) -> Method:
     for argument in accepted:
         if argument in REQUIRED and argument not in arguments:
             raise MethodError(f"{name} needs {argument!r}")
+    if name == "composition":
+        return Composition(arguments["order"])
     return METHODS[name](**arguments)

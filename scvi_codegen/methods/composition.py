@@ -1,0 +1,184 @@
+"""Symmetric compositions of Stoermer-Verlet for separable systems: explicit, symplectic, of order 8 and 10.
+
+A step of size h is s leapfrog steps of sizes gamma_1 h .. gamma_s h with sum gamma_k = 1, gamma_k = gamma_{s+1-k}:
+
+    p += h (gamma_k + gamma_{k+1}) / 2 L_q(q),     q += h gamma_{k+1} M^-1 p,
+
+that is kicks and drifts in turn. Source: Hairer, Lubich & Wanner, Geometric Numerical Integration, V.3.2; coefficients
+of Kahan & Li, Math. Comp. 66 (1997), and Sofroniou & Spaletta, Optim. Methods Softw. 20 (2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics import force, is_separable, momentum
+from scvi_codegen.methods.galerkin import identity_matrix
+from scvi_codegen.methods.method import Method, Specification
+from scvi_codegen.precision import Vector, mp
+from scvi_codegen.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["Composition", "kicks_and_drifts"]
+
+FIRST_HALVES = {
+    2: (),
+    8: (
+        "0.13020248308889008087881763",
+        "0.56116298177510838456196441",
+        "-0.38947496264484728640807860",
+        "0.15884190655515560089621075",
+        "-0.39590389413323757733623154",
+        "0.18453964097831570709183254",
+        "0.25837438768632204729397911",
+        "0.29501172360931029887096624",
+    ),
+    10: (
+        "0.07879572252168641926390768",
+        "0.31309610341510852776481247",
+        "0.02791838323507806610952027",
+        "-0.22959284159390709415121340",
+        "0.13096206107716486317465686",
+        "-0.26973340565451071434460973",
+        "0.07497334315589143566613711",
+        "0.11199342399981020488957508",
+        "0.36613344954622675119314812",
+        "-0.39910563013603589787862981",
+        "0.10308739852747107731580277",
+        "0.41143087395589023782070412",
+        "-0.00486636058313526176219566",
+        "-0.39203335370863990644808194",
+        "0.05194250296244964703718290",
+        "0.05066509075992449633587434",
+        "0.04967437063972987905456880",
+    ),
+}
+"""gamma_1, gamma_2, .. up to the middle one, which makes the sum 1; by order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Composition(Method):
+    """Composition of Stoermer-Verlet steps, for L = sum m_i v_i^2 / 2 - V(q, t) with constant masses.
+
+    Args:
+        order: 2 (Stoermer-Verlet itself), 8 (17 stages, Kahan & Li) or 10 (35 stages, Sofroniou & Spaletta).
+
+    Raises:
+        MethodError: for another order, or when used for a system that is not separable.
+    """
+
+    composition_order: int
+
+    def __post_init__(self) -> None:
+        if self.composition_order not in FIRST_HALVES:
+            raise MethodError(f"there are compositions of order 2, 8 and 10, not {self.composition_order!r}")
+
+    @property
+    def fractions(self) -> Vector:
+        """(s,) gamma_1 .. gamma_s."""
+        half = tuple(mp.mpf(x) for x in FIRST_HALVES[self.composition_order])
+        return (*half, 1 - 2 * mp.fsum(half), *reversed(half))
+
+    @property
+    def name(self) -> str:
+        """``composition-<order>``."""
+        return f"composition-{self.composition_order}"
+
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        stages = len(self.fractions)
+        return f"Composition of {stages} Stoermer-Verlet step{'s' * (stages > 1)}, order {self.composition_order}"
+
+    @property
+    def order(self) -> int | None:
+        """The order asked for."""
+        return self.composition_order
+
+    @property
+    def symmetric(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
+    def symplectic(self) -> bool:
+        """Yes."""
+        return True
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        return {"method": "composition", "order": self.composition_order}
+
+    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+        """Unknowns: the velocities V_k of the drifts; explicit, row after row."""
+        if not is_separable(system):
+            raise MethodError(
+                f"{self.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses; "
+                f"'{system.name}' is not: use an SVI"
+            )
+        gamma = self.fractions
+        kicks, _ = kicks_and_drifts(gamma)
+        size = len(gamma)
+        drifted = tuple(tuple(x if k < n else mp.zero for k, x in enumerate(gamma)) for n in range(size + 1))
+        before = tuple(tuple(int(n <= k) for k in range(size)) for n in range(size + 1))
+        kick = PointFamily(
+            name="kick",
+            abscissae=tuple(mp.fsum(line) for line in drifted),
+            weights=kicks,
+            weight_names=tuple(f"w_{n}" for n in range(size + 1)),
+            gathers=(
+                Gather(
+                    arguments=system.coordinates,
+                    table=Table.joined(Table.constant(size + 1, 1, 1), Table.named("a", drifted)),
+                    power=0,
+                ),
+            ),
+            scatters=(
+                Scatter(
+                    results=force(system),
+                    table=Table.joined(Table.named("", before), Table.constant(size + 1, 1, 1)),
+                    power=1,
+                ),
+            ),
+        )
+        drift = PointFamily(
+            name="drift",
+            abscissae=tuple(mp.fsum(drifted[n]) for n in range(size)),
+            weights=(mp.one,) * size,
+            weight_names=("",) * size,
+            gathers=(
+                Gather(
+                    arguments=system.velocities,
+                    table=Table.joined(Table.constant(size, 1), Table.identity(size)),
+                    power=-1,
+                ),
+            ),
+            scatters=(
+                Scatter(
+                    results=momentum(system),
+                    table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)),
+                    power=0,
+                ),
+            ),
+        )
+        return StageSystem(
+            blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k in range(1, size + 1)),
+            rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k in range(1, size + 1)),
+            families=(kick, drift),
+            end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (gamma,))),
+            end_momentum=mp.one,
+            end_numbers=("q1", "p1"),
+            extrapolation=identity_matrix(size),
+        )
+
+    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+        """The same equations: the paper does not use the method."""
+        return self.stage_system(system)
+
+
+def kicks_and_drifts(fractions: Vector) -> tuple[Vector, Vector]:
+    """(s + 1,) weights of the kicks and (s,) of the drifts between them."""
+    padded = (mp.zero, *fractions, mp.zero)
+    return tuple((a + b) / 2 for a, b in pairwise(padded)), fractions

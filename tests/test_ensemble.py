@@ -1,0 +1,332 @@
+"""Ensembles equal single trajectories, trajectories leave each other alone, and a run can be stopped."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import threading
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from conftest import OWN_SYSTEMS, sample_named, stepper_for
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory, integrate_ensemble
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVerlet
+from scvi_codegen.stepper import SolverOptions, Stepper
+
+KINDS = {
+    "separable": "kepler",
+    "coupled": "double-pendulum",
+    "time-dependent": "driven-duffing",
+    "coupled and time-dependent": "pumped-cart-pole",
+    "not quadratic": "relativistic-particle",
+    "magnetic": "charged-particle",
+}
+METHODS = [SVI(5), Gauss(3), RadauIIA(2), StoermerVerlet(), SCVI(3)]
+
+
+def states(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, m) positions and momenta about the generic state of a system."""
+    q, p = sample_named(name).state
+    generator = np.random.default_rng(7)
+    return tuple(x * (1.0 + 0.1 * generator.uniform(-1, 1, (count, len(x)))) for x in (q, p))  # type: ignore[return-value]
+
+
+def assert_equals_single_runs(stepper: Stepper, result: EnsembleTrajectory, tolerance: float, **settings: object) -> None:
+    assert result.ok.all()
+    for j in range(len(result)):
+        single = stepper.integrate(
+            result.q[0, j], result.p[0, j], h=result.h, parameters=result.parameters[j], **settings
+        )
+        assert np.array_equal(single.t, result.t)
+        for ours, theirs in ((result.q[:, j], single.q), (result.p[:, j], single.p)):
+            assert np.abs(ours - theirs).max() <= tolerance * np.abs(theirs).max()
+
+
+class TestEqualsSingleTrajectories:
+    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_for_systems_and_methods(self, kind: str, method: Method):
+        stepper = stepper_for(KINDS[kind], method)
+        q, p = states(KINDS[kind], 3)
+        result = stepper.integrate_ensemble(q, p, h=0.02, steps=60, every=20, t=0.3)
+        assert result.q.shape == (4, *q.shape)
+        assert result.steps.tolist() == [60, 60, 60]
+        # measured 2e-14: rounding of 60 steps, magnified by the motion
+        assert_equals_single_runs(stepper, result, 3e-13, steps=60, every=20, t=0.3)
+
+    @pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
+    def test_for_any_number_with_their_own_parameters(self, count: int):
+        stepper = stepper_for("kepler", SVI(5))
+        q, p = states("kepler", count)
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=40, every=3, parameters={"mu": np.linspace(0.8, 1.2, count)})
+        assert len(result) == count
+        assert len(result.t) == 14
+        assert_equals_single_runs(stepper, result, 3e-13, steps=40, every=3)
+
+    def test_parameters_come_by_name_as_a_row_or_a_row_each(self):
+        stepper = stepper_for("planar-pendulum", SVI(5))
+        q, p = states("planar-pendulum", 3)
+        each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
+        place = {name: stepper.parameter_index(name) for name in ("g", "l")}
+        assert each.parameters[:, place["g"]].tolist() == [1.0, 2.0, 3.0]
+        assert each.parameters[:, place["l"]].tolist() == [2.0] * 3
+        again = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters)
+        assert np.array_equal(again.q, each.q)
+        same = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters[0])
+        assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
+
+    @pytest.mark.parametrize("method", [SVI(5), SCVI(3)], ids=lambda method: method.name)
+    def test_backward(self, method: Method):
+        stepper = stepper_for("driven-duffing", method)
+        q, p = states("driven-duffing", 9)
+        there = stepper.integrate_ensemble(q, p, h=0.02, steps=50, t=1.0)
+        back = stepper.integrate_ensemble(there.q[-1], there.p[-1], h=-0.02, steps=50, t=2.0)
+        assert back.t[-1] == pytest.approx(1.0)
+        assert_equals_single_runs(stepper, back, 3e-13, steps=50, t=2.0)
+        if method.symmetric:
+            np.testing.assert_allclose(back.q[-1], q, rtol=1e-12)
+
+    def test_options_reach_the_lanes(self):
+        stepper = stepper_for("double-pendulum", SVI(5))
+        q, p = states("double-pendulum", 8)
+        loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=SolverOptions(tolerance=1e-4))
+        exact = stepper.integrate_ensemble(q, p, h=0.05, steps=20)
+        assert loose.ok.all()
+        assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
+
+    def test_energies_are_those_of_the_single_runs(self):
+        stepper = stepper_for("double-pendulum", SVI(5))
+        q, p = states("double-pendulum", 9)
+        result = stepper.integrate_ensemble(q, p, h=0.02, steps=50)
+        energies = result.energy()
+        assert energies.shape == (51, 9)
+        assert np.abs(energies / energies[0] - 1).max() < 1e-9
+        assert energies[7, 8] == stepper.energy(result.q[7, 8], result.p[7, 8], result.t[7])
+
+    def test_few_steps_and_none(self):
+        stepper = stepper_for("kepler", SVI(5))
+        q, p = states("kepler", 9)
+        assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
+        result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, every=5)
+        assert result.q.shape == (1, 9, 2)
+        assert result.steps.tolist() == [3] * 9
+
+
+@pytest.fixture(scope="module")
+def kepler() -> Stepper:
+    return stepper_for("kepler", SVI(5))
+
+
+class TestFailures:
+    def test_a_fall_into_the_centre_spoils_nobody(self, kepler: Stepper):
+        q, p = states("kepler", 16)
+        alone = kepler.integrate_ensemble(q, p, h=0.05, steps=400)
+        p[3] = 0.0
+        result = kepler.integrate_ensemble(q, p, h=0.05, steps=400)
+        others = np.arange(16) != 3
+        assert result.ok.tolist() == others.tolist()
+        assert np.array_equal(result.q[:, 8:], alone.q[:, 8:])
+        assert np.abs(result.q[:, others] - alone.q[:, others]).max() < 1e-11  # measured 2e-13
+        with pytest.raises(StepFailedError) as failure:
+            kepler.integrate(q[3], p[3], h=0.05, steps=400)
+        assert result.status[3] == failure.value.status
+        assert result.steps[3] == failure.value.step
+        reached = failure.value.step + 1
+        np.testing.assert_allclose(result.q[:reached, 3], failure.value.recorded.q, rtol=0, atol=1e-12)
+        assert np.isnan(result.q[reached:, 3]).all()
+        assert np.isnan(result.p[reached:, 3]).all()
+        assert np.isnan(result.energy()[reached:, 3]).all()
+
+    def test_neighbours_of_a_lane_that_never_starts_keep_their_bits(self, kepler: Stepper):
+        """Twice in one block, once between others and once as the last, whose place is filled up with copies."""
+        q, p = states("kepler", 7)
+        without = kepler.integrate_ensemble(q, p, h=0.05, steps=100)
+        for place in (3, 7):
+            several_q, several_p = (np.insert(x, place, y, axis=0) for x, y in ((q, 0.0), (p, 1.0)))
+            result = kepler.integrate_ensemble(several_q, several_p, h=0.05, steps=100)
+            assert result.status[place] == "not finite"
+            assert result.steps[place] == 0
+            others = np.arange(8) != place
+            assert np.array_equal(result.q[:, others], without.q)
+            assert np.array_equal(result.p[:, others], without.p)
+
+    def test_parameters_that_make_no_sense_spoil_nobody(self):
+        stepper = stepper_for("relativistic-particle", SVI(5))
+        q, p = states("relativistic-particle", 8)
+        values = np.tile(stepper.defaults, (8, 1))
+        without = stepper.integrate_ensemble(q, p, h=0.05, steps=50, parameters=values)
+        values[2] = 0.0
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=50, parameters=values)
+        others = np.arange(8) != 2
+        assert result.ok.tolist() == others.tolist()
+        assert result.steps[2] == 0
+        assert np.array_equal(result.q[:, others], without.q[:, others])
+
+    def test_newton_goes_on_where_the_fixed_point_cannot(self):
+        stepper = stepper_for("harmonic-oscillator", SVI(5))
+        q, p = states("harmonic-oscillator", 9)
+        stiffness = {"k": np.where(np.arange(9) % 4 == 1, 1e6, 1.0)}
+        result = stepper.integrate_ensemble(q, p, h=0.5, steps=50, every=7, parameters=stiffness)
+        assert result.steps.tolist() == [50] * 9
+        assert_equals_single_runs(stepper, result, 1e-10, steps=50, every=7)
+        others = stiffness["k"] == 1.0
+        calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, every=7)
+        assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
+
+    def test_a_block_without_trajectories_left_stops(self, kepler: Stepper):
+        q, p = states("kepler", 8)
+        began = time.perf_counter()
+        result = kepler.integrate_ensemble(q, 0.0 * p, h=0.05, steps=10**8, every=10**7)
+        assert time.perf_counter() - began < 5.0  # an empty block would need a minute
+        assert not result.ok.any()
+
+    def test_methods_without_lanes_fail_one_by_one_too(self):
+        stepper = stepper_for("kepler", SCVI(3))
+        q, p = states("kepler", 3)
+        p[1] = 0.0
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=200)
+        assert result.ok.tolist() == [True, False, True]
+        assert np.isfinite(result.q[: result.steps[1] + 1, 1]).all()
+        assert np.isnan(result.q[result.steps[1] + 1 :, 1]).all()
+
+    def test_a_runaway_ends_where_the_single_run_ends(self):
+        stepper = compile_stepper(OWN_SYSTEMS["runaway"](), SVI(4))
+        q, p = np.array([[1.0], [-3.0], [-2.0]]), np.array([[1.0], [0.0], [0.1]])
+        result = stepper.integrate_ensemble(q, p, h=0.02, steps=200)
+        with pytest.raises(StepFailedError) as failure:
+            stepper.integrate(q[0], p[0], h=0.02, steps=200)
+        assert abs(int(result.steps[0]) - failure.value.step) <= 1
+        assert result.status[0] != "ok"
+
+
+class TestThreadsAndInterruption:
+    def test_bits_do_not_depend_on_the_number_of_threads(self, kepler: Stepper):
+        q, p = states("kepler", 64)
+        p[20] = 0.0
+        one, two = (kepler.integrate_ensemble(q, p, h=0.05, steps=300, threads=threads) for threads in (1, 2))
+        assert one.q.tobytes() == two.q.tobytes()
+        assert one.p.tobytes() == two.p.tobytes()
+        assert one.status.tolist() == two.status.tolist()
+
+    @pytest.mark.parametrize("method", [SVI(5), SCVI(2)], ids=lambda method: method.name)
+    def test_progress_counts_up_to_the_end(self, method: Method):
+        stepper = stepper_for("kepler", method)
+        q, p = states("kepler", 32)
+        calls: list[int] = []
+        stepper.integrate_ensemble(q, p, h=0.05, steps=4000, every=4000, progress=calls.append, threads=2)
+        assert calls == sorted(calls)
+        assert calls[-1] == 4000
+
+    def test_an_interruption_leaves_no_thread_and_keeps_what_was_done(self, kepler: Stepper):
+        q, p = states("kepler", 64)
+        work = Ensemble(kepler, q, p, h=0.05, steps=10**9, every=10**7)
+
+        def interrupt(done: int) -> None:
+            raise KeyboardInterrupt
+
+        before, began = set(threading.enumerate()), time.perf_counter()
+        with pytest.raises(KeyboardInterrupt):
+            work.run(progress=interrupt, threads=2)
+        assert time.perf_counter() - began < 3.0
+        assert set(threading.enumerate()) == before
+        result = work.result()
+        assert set(result.status) == {"interrupted"}
+        assert 0 < result.steps.max() < 10**9
+
+    def test_an_error_in_a_block_is_not_lost(self, kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
+        def fail(*arguments: object) -> None:
+            raise RuntimeError("out of order")
+
+        monkeypatch.setattr("scvi_codegen.ensemble._LaneBlock.advance", fail)
+        with pytest.raises(RuntimeError, match="out of order"):
+            kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
+
+    def test_memory_is_bounded_by_every(self, kepler: Stepper):
+        q, p = states("kepler", 64)
+        kepler.integrate_ensemble(q, p, h=0.05, steps=1)
+        gc.collect()
+        tracemalloc.start()
+        try:
+            kepler.integrate_ensemble(q, p, h=0.05, steps=20_000, every=2000)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 1e6  # all states would take 41 MB
+
+
+class TestArguments:
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"q": np.ones((3, 3))}, r"q must have shape \(k, 2\), not \(3, 3\)"),
+            ({"q": np.ones((2, 2))}, r"q has shape \(2, 2\), p \(3, 2\)"),
+            ({"q": np.ones((0, 2))}, "q must have shape"),
+            ({"q": 1.0}, "q must have shape"),
+            ({"p": [[1.0, 0.0], [1.0, np.nan], [0.0, 0.0]]}, r"p\[1, 1\] \(q2\) is nan"),
+            ({"p": "fast"}, "p must be an array of real numbers"),
+            ({"p": [[1.0], [1.0, 2.0], [3.0]]}, "p must be an array of real numbers"),
+            ({"h": 0.0}, "the step h is 0"),
+            ({"h": np.inf}, "the step h is inf"),
+            ({"steps": 1.5}, "steps must be a whole number"),
+            ({"steps": -1}, "steps must be at least 0"),
+            ({"every": 0}, "every must be at least 1"),
+            ({"t": "noon"}, "the time t must be a real number"),
+            ({"threads": -1}, "threads must be at least 1"),
+            ({"threads": 1.5}, "threads must be a whole number"),
+            ({"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),
+            ({"parameters": {"mu": [1.0, 2.0]}}, r"the parameter mu must be one number or 3, not of shape \(2,\)"),
+            ({"parameters": {"mu": "heavy"}}, "the parameter mu must be an array of real numbers"),
+            ({"parameters": np.ones((3, 2))}, r"parameters must have shape \(3, 1\), not \(3, 2\)"),
+            ({"parameters": ["heavy"]}, "parameters must be an array of real numbers"),
+            ({"parameters": {"mu": [1.0, np.nan, 1.0]}}, "the parameter mu of trajectory 1 is nan"),
+        ],
+    )
+    def test_faults_are_named(self, kepler: Stepper, changes: dict[str, object], message: str):
+        arguments: dict[str, object] = {"q": np.ones((3, 2)), "p": np.zeros((3, 2)), "h": 0.1, "steps": 5} | changes
+        with pytest.raises(StateError, match=message):
+            integrate_ensemble(kepler, **arguments)  # type: ignore[arg-type]
+
+    def test_one_state_is_an_ensemble_of_one(self, kepler: Stepper):
+        assert len(kepler.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1
+
+
+class TestFiles:
+    @pytest.fixture
+    def result(self, kepler: Stepper) -> EnsembleTrajectory:
+        q, p = states("kepler", 3)
+        p[1] = 0.0
+        return kepler.integrate_ensemble(q, p, h=0.05, steps=100, every=10, parameters={"mu": [1.0, 1.1, 1.2]})
+
+    def test_npz(self, result: EnsembleTrajectory, tmp_path):
+        result.save(tmp_path / "runs.npz")
+        with np.load(tmp_path / "runs.npz") as file:
+            for name in ("t", "q", "p", "status", "steps", "h", "parameters"):
+                assert np.array_equal(file[name], getattr(result, name), equal_nan=name in "qp")
+            assert file["coordinates"].tolist() == ["q1", "q2"]
+            assert file["parameter_names"].tolist() == ["mu"]
+
+    def test_csv_is_long_and_leaves_out_what_failed(self, result: EnsembleTrajectory, tmp_path):
+        result.save(tmp_path / "runs.csv")
+        assert (tmp_path / "runs.csv").read_text().startswith("trajectory,mu,t,q1,q2,p_q1,p_q2\n0,1,0,")
+        table = np.loadtxt(tmp_path / "runs.csv", delimiter=",", skiprows=1)
+        for j in range(3):
+            rows = table[table[:, 0] == j]
+            assert len(rows) == result.steps[j] // 10 + 1
+            assert np.array_equal(rows[:, 3:5], result.q[: len(rows), j])
+            assert set(rows[:, 1]) == {result.parameters[j, 0]}
+
+    def test_other_suffixes(self, result: EnsembleTrajectory, tmp_path):
+        with pytest.raises(StateError, match=r"saved as \.npz or \.csv"):
+            result.save(tmp_path / "runs.txt")
+
+
+def test_a_stepper_from_a_pickle_has_its_lanes(kepler: Stepper):
+    q, p = states("kepler", 9)
+    again = pickle.loads(pickle.dumps(kepler))
+    first, second = (stepper.integrate_ensemble(q, p, h=0.05, steps=20) for stepper in (kepler, again))
+    assert np.array_equal(first.q, second.q)
