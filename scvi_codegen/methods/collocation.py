@@ -50,6 +50,7 @@ __all__ = [
     "SpectralCollocation",
     "acceleration_gathers",
     "acceleration_unknowns",
+    "residual_family",
 ]
 
 FORMS = ("phase-space", "position")
@@ -256,19 +257,9 @@ def position_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
     minus = Table.constant(1, 1, -1)
     start_table = Table.joined(minus, none, minus)
     end_table = Table.joined(Table.constant(1, 1), none, ones)
-    collocation = PointFamily(
-        name="node",
-        abscissae=tableau.c,
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=acceleration_gathers(system, tableau.A),
-        scatters=(
-            Scatter(
-                results=euler_lagrange(system),
-                table=Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1)),
-                power=1,
-            ),
-        ),
+    inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
+    collocation = residual_family(
+        system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
     )
     return StageSystem(
         blocks=acceleration_unknowns(size),
@@ -285,6 +276,24 @@ def position_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
         end_momentum=mp.one,
         end_numbers=("22", "p1"),
         extrapolation=acceleration_extrapolation(tableau),
+    )
+
+
+def residual_family(
+    system: LagrangianSystem,
+    abscissae: Vector,
+    gathers: tuple[Gather, ...],
+    residual: Scatter,
+    *others: Scatter,
+) -> PointFamily:
+    """Collocation nodes of weight 1 with the Euler-Lagrange residual as kernel, scattered as ``residual`` says."""
+    return PointFamily(
+        name="node",
+        abscissae=abscissae,
+        weights=(mp.one,) * len(abscissae),
+        weight_names=("",) * len(abscissae),
+        gathers=gathers,
+        scatters=(replace(residual, results=euler_lagrange(system)), *others),
     )
 
 
@@ -332,20 +341,12 @@ def nodal_collocation(system: LagrangianSystem, nodes: Nodes) -> StageSystem:
     size = nodes.degree
     momenta = momentum(system)
     none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
-    family = PointFamily(
-        name="node",
-        abscissae=tuple((x + 1) / 2 for x in nodes.points[1:]),
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=nodal_gathers(system, nodes),
-        scatters=(
-            Scatter(
-                results=euler_lagrange(system),
-                table=Table.joined(Table.identity(size), Table.constant(size, 2)),
-                power=0,
-            ),
-            Scatter(results=momenta, table=Table.joined(none, last), power=0),
-        ),
+    family = residual_family(
+        system,
+        tuple((x + 1) / 2 for x in nodes.points[1:]),
+        nodal_gathers(system, nodes),
+        Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
+        Scatter(results=momenta, table=Table.joined(none, last), power=0),
     )
     start = _single_point(
         system,

@@ -19,13 +19,14 @@ from dataclasses import dataclass
 
 from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, matrix_product
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics import euler_lagrange, multiplied_residual, multipliers
+from scvi_codegen.mechanics import multiplied_residual, multipliers
 from scvi_codegen.methods.collocation import (
     acceleration_extrapolation,
     acceleration_gathers,
     acceleration_unknowns,
     nodal_blocks,
     nodal_gathers,
+    residual_family,
 )
 from scvi_codegen.methods.galerkin import SVI, nodal_quadrature_family, resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters, unit_sum
@@ -266,19 +267,9 @@ def _printed_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadra
         Scatter(results=(), table=first_and_sum(values), power=1),
         Scatter(results=(), table=first_and_sum(slopes), power=0),
     )
-    node = PointFamily(
-        name="node",
-        abscissae=tableau.c,
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=acceleration_gathers(system, tableau.A),
-        scatters=(
-            Scatter(
-                results=euler_lagrange(system),
-                table=Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1)),
-                power=1,
-            ),
-        ),
+    inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
+    node = residual_family(
+        system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
     )
     return StageSystem(
         blocks=acceleration_unknowns(size),
@@ -339,19 +330,11 @@ def _printed_nodal(system: LagrangianSystem, nodes: Nodes, rule: Quadrature) -> 
         return Table.joined(none, table.columns([0]), table.columns([size]))
 
     quadrature = action.point_family([ends(gather.table) for gather in action.gathers])
-    node = PointFamily(
-        name="node",
-        abscissae=tuple((x + 1) / 2 for x in nodes.points[1:]),
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=nodal_gathers(system, nodes),
-        scatters=(
-            Scatter(
-                results=euler_lagrange(system),
-                table=Table.joined(Table.identity(size), Table.constant(size, 2)),
-                power=0,
-            ),
-        ),
+    node = residual_family(
+        system,
+        tuple((x + 1) / 2 for x in nodes.points[1:]),
+        nodal_gathers(system, nodes),
+        Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
     )
     return StageSystem(
         blocks=nodal_blocks(nodes),
