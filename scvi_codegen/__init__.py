@@ -64,7 +64,9 @@ _HOMES = {
         "gauss_lobatto",
         "gauss_radau",
     ),
-    "stepper": ("SolverOptions", "Run", "Stepper"),
+    "binding": ("SolverOptions",),
+    "run": ("Run",),
+    "stepper": ("Stepper",),
     "system": ("LagrangianSystem",),
     "trajectory": ("Trajectory",),
 }

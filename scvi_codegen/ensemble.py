@@ -26,7 +26,9 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
-    from scvi_codegen.stepper import Run, SolverOptions, Stepper
+    from scvi_codegen.binding import SolverOptions
+    from scvi_codegen.run import Run
+    from scvi_codegen.stepper import Stepper
 
 __all__ = ["Ensemble", "EnsembleTrajectory", "integrate_ensemble"]
 

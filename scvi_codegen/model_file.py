@@ -49,7 +49,9 @@ from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
-    from scvi_codegen.stepper import Array, Run, SolverOptions, Stepper
+    from scvi_codegen.binding import SolverOptions
+    from scvi_codegen.run import Run
+    from scvi_codegen.stepper import Array, Stepper
 
 __all__ = ["DEFAULT_METHOD", "Model", "dump_model", "load_model", "parse_model", "save_model"]
 

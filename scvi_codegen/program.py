@@ -161,7 +161,8 @@ class Family:
     @property
     def uses_step(self) -> bool:
         """Whether h occurs around the kernel."""
-        return self.uses_time or any(loop.power for loop in (*self.gathers, *self.scatters))
+        powers = [loop.power for loop in self.gathers] + [loop.power for loop in self.scatters]
+        return self.uses_time or any(powers)
 
     @property
     def weighted(self) -> bool:

@@ -10,17 +10,17 @@ All calls into C release the GIL and share nothing, so one stepper may be used f
 from __future__ import annotations
 
 import difflib
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen import building
-from scvi_codegen.arguments import checked_count, checked_number, checked_step
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.arguments import checked_number, checked_step
+from scvi_codegen.binding import STATUS, Binding, SolverOptions, step_failure
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.run import Run
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.trajectory import Trajectory
 
@@ -31,38 +31,6 @@ __all__ = ["Run", "SolverOptions", "Stepper"]
 
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
-
-STATUS = {1: "not converged", 2: "singular", 3: "not finite"}
-ADVICE = {
-    "not converged": "try a smaller step, or more iterations",
-    "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
-    "not finite": "the Lagrangian is undefined there, or the step is far too large",
-}
-MOST_ITERATIONS = 10**6
-SLICE_SECONDS = 0.1
-"""Time between looks at the keyboard (and calls of ``progress``) during an integration."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolverOptions:
-    """When the iteration on the stage equations has converged.
-
-    Attributes:
-        tolerance: size of the last update relative to the state (default: round-off), or absolute.
-        max_iterations: after which a step fails.
-        absolute: compare the update itself, the paper's rule max(|dQ|, |dP|) < TOL.
-    """
-
-    tolerance: float = 2.0**-52
-    max_iterations: int = 50
-    absolute: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.tolerance > 0.0:
-            raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
-        checked_count(self.max_iterations, "max_iterations", least=1)
-        if self.max_iterations > MOST_ITERATIONS:
-            raise StateError(f"max_iterations must be at most {MOST_ITERATIONS}, not {self.max_iterations}")
 
 
 class Stepper:
@@ -86,8 +54,7 @@ class Stepper:
         flags: tuple[str, ...] = building.TUNED_FLAGS,
     ) -> None:
         self.source, self.interface, self.ensemble, self.flags = source, interface, ensemble, flags
-        module = building.load(source, flags=flags)
-        self._ffi, self._lib = module.ffi, module.lib
+        self.binding = Binding(building.load(source, flags=flags), interface)
 
     def __repr__(self) -> str:
         return f"<Stepper {self.title}>"
@@ -148,21 +115,21 @@ class Stepper:
         """
         q0, p0, values = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
-        report = self._new("report *")
-        status = self._call("step")(
+        report = self.binding.new("report *")
+        status = self.binding.function("step")(
             checked_number(t, "the time t"),
             checked_step(h),
-            self._pointer(q0),
-            self._pointer(p0),
-            self._pointer(values),
-            self._options(options),
-            self._pointer(q1),
-            self._pointer(p1),
+            self.binding.pointer(q0),
+            self.binding.pointer(p0),
+            self.binding.pointer(values),
+            self.binding.options(options),
+            self.binding.pointer(q1),
+            self.binding.pointer(p1),
             report,
-            self._workspace(),
+            self.binding.workspace(),
         )
         if status:
-            self._fail(status, report, step=0, h=h, trajectory=None)
+            raise step_failure(status, report, step=0, h=h)
         return q1, p1
 
     def integrate(
@@ -256,16 +223,16 @@ class Stepper:
     ) -> Run:
         """A run from (q, p) at t with step h, to be advanced at will."""
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
-        memory = self._new("run *")
-        self._call("start")(
-            memory, checked_number(t, "the time t"), checked_step(h), self._pointer(q0), self._pointer(p0)
+        memory = self.binding.new("run *")
+        self.binding.function("start")(
+            memory, checked_number(t, "the time t"), checked_step(h), self.binding.pointer(q0), self.binding.pointer(p0)
         )
         return Run(self, memory, self._parameters(parameters), options)
 
     def restore(self, saved: bytes, *, parameters: Parameters = None, options: SolverOptions | None = None) -> Run:
         """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have."""
-        memory = self._new("run *")
-        buffer = self._ffi.buffer(memory)
+        memory = self.binding.new("run *")
+        buffer = self.binding.buffer(memory)
         if len(saved) != len(buffer):
             raise StateError(f"{len(saved)} bytes are not a saved run of this stepper, which has {len(buffer)}")
         buffer[:] = saved
@@ -295,14 +262,14 @@ class Stepper:
         times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
         positions, momenta = np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
         result = np.empty(count)
-        status = self._call("energies")(
+        status = self.binding.function("energies")(
             count,
-            self._pointer(times),
-            self._pointer(positions),
-            self._pointer(momenta),
-            self._pointer(self._parameters(parameters)),
-            self._pointer(result),
-            self._workspace(),
+            self.binding.pointer(times),
+            self.binding.pointer(positions),
+            self.binding.pointer(momenta),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(result),
+            self.binding.workspace(),
         )
         if status:
             raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
@@ -382,57 +349,37 @@ class Stepper:
             raise MethodError(f"{self.interface.method} has no discrete Lagrangian; SVI, SCVI and Gauss methods have")
         start, end = self._vector(q0, "q0"), self._vector(q1, "q1")
         p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
-        report = self._new("report *")
-        status = self._call("discrete_legendre")(
+        report = self.binding.new("report *")
+        status = self.binding.function("discrete_legendre")(
             checked_number(t, "the time t"),
             checked_step(h),
-            self._pointer(start),
-            self._pointer(end),
-            self._pointer(self._parameters(parameters)),
-            self._options(options),
-            self._pointer(p0),
-            self._pointer(p1),
-            self._pointer(action),
+            self.binding.pointer(start),
+            self.binding.pointer(end),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.options(options),
+            self.binding.pointer(p0),
+            self.binding.pointer(p1),
+            self.binding.pointer(action),
             report,
-            self._workspace(),
+            self.binding.workspace(),
         )
         if status:
-            self._fail(status, report, step=0, h=h, trajectory=None)
+            raise step_failure(status, report, step=0, h=h)
         return p0, p1, float(action[0])
 
     def _transform(self, name: str, q: Array, other: Array, t: float, parameters: Parameters) -> Array:
         result = np.empty_like(other)
-        status = self._call(name)(
+        status = self.binding.function(name)(
             checked_number(t, "the time t"),
-            self._pointer(q),
-            self._pointer(other),
-            self._pointer(self._parameters(parameters)),
-            self._pointer(result),
-            self._workspace(),
+            self.binding.pointer(q),
+            self.binding.pointer(other),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(result),
+            self.binding.workspace(),
         )
         if status:
             raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]})")
         return result
-
-    def _call(self, name: str) -> Callable[..., Any]:
-        function: Callable[..., Any] = getattr(self._lib, f"{self.interface.prefix}_{name}")
-        return function
-
-    def _new(self, what: str) -> Any:
-        return self._ffi.new(f"{self.interface.prefix}_{what}")
-
-    def _pointer(self, array: NDArray[Any]) -> Any:
-        kind = "int[]" if array.dtype == np.int32 else "double[]"
-        return self._ffi.from_buffer(kind, array) if array.size else self._ffi.NULL
-
-    def _workspace(self) -> Any:
-        return self._pointer(np.empty(self.interface.workspace))
-
-    def _options(self, options: SolverOptions | None) -> Any:
-        if options is None:
-            return self._ffi.NULL
-        values = [options.tolerance, options.max_iterations, int(options.absolute)]
-        return self._ffi.new(f"{self.interface.prefix}_options *", values)
 
     def _vector(self, value: ArrayLike, name: str) -> Array:
         """A finite, contiguous (m,) copy."""
@@ -477,115 +424,6 @@ class Stepper:
         near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise StateError(f"there is no parameter {name!r} among {', '.join(self.parameters) or 'none'}{hint}")
-
-    def _fail(self, status: int, report: Any, *, step: int, h: float, trajectory: Trajectory | None) -> NoReturn:
-        word = STATUS[status]
-        message = (
-            f"step {step} at t = {report.t:.17g} with h = {h:g} failed: {word} "
-            f"(last update {report.change:.3g}, {report.iterations} iterations in all); {ADVICE[word]}"
-        )
-        raise StepFailedError(
-            message, status=word, step=step, t=report.t, residual=report.change, trajectory=trajectory
-        )
-
-
-class Run:
-    """An integration under way: a state, and the memory that makes the next step cheap and the sums exact."""
-
-    def __init__(self, stepper: Stepper, memory: Any, parameters: Array, options: SolverOptions | None) -> None:
-        self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
-
-    @property
-    def t(self) -> float:
-        """Time t0 + step h."""
-        return float(self._memory.t0 + self._memory.step * self._memory.h)
-
-    @property
-    def steps(self) -> int:
-        """Steps done since the start."""
-        return int(self._memory.step)
-
-    @property
-    def q(self) -> Array:
-        """(m,) positions."""
-        return np.array(list(self._memory.q))
-
-    @property
-    def p(self) -> Array:
-        """(m,) momenta."""
-        return np.array(list(self._memory.p))
-
-    def resume_at(self, steps: int, carries: tuple[Array, Array] | None = None) -> None:
-        """Count from ``steps`` done, with what rounding had cut off q and p: how a run made elsewhere goes on here."""
-        self._memory.step = steps
-        if carries is not None:
-            for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
-                self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
-
-    def save(self) -> bytes:
-        """The whole memory of the run, for :meth:`Stepper.restore` on the same kind of machine."""
-        return bytes(self.stepper._ffi.buffer(self._memory))
-
-    def record(self, steps: int, *, every: int = 1, progress: Callable[[int], None] | None = None) -> Trajectory:
-        """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``every``.
-
-        Raises:
-            StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
-        """
-        steps = checked_count(steps, "steps", least=0)
-        every = checked_count(every, "every", least=1)
-        first = self.steps
-        capacity = (first + steps) // every - first // every
-        m = self.stepper.dimension
-        t, q, p = np.empty(capacity + 1), np.empty((capacity + 1, m)), np.empty((capacity + 1, m))
-        iterations = np.zeros(capacity + 1, dtype=np.int32)
-        t[0], q[0], p[0] = self.t, self.q, self.p
-        filled, done, portion = 1, 0, every * max(1, 256 // every)
-        while done < steps:
-            size = min(portion, steps - done)
-            began = time.perf_counter()
-            status, report = self._advance(size, every, t[filled:], q[filled:], p[filled:], iterations[filled:])
-            done += report.steps
-            filled = 1 + (first + done) // every - first // every
-            if status:
-                kept = self._trajectory(t[:filled], q[:filled], p[:filled], iterations[:filled])
-                self.stepper._fail(status, report, step=self.steps, h=self._memory.h, trajectory=kept)
-            if progress is not None:
-                progress(done)
-            elapsed = max(time.perf_counter() - began, 1e-6)
-            portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
-        return self._trajectory(t, q, p, iterations)
-
-    def _advance(
-        self, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
-    ) -> tuple[int, Any]:
-        stepper = self.stepper
-        report = stepper._new("report *")
-        status = stepper._call("advance")(
-            self._memory,
-            steps,
-            every,
-            stepper._pointer(self._parameters),
-            stepper._options(self._options),
-            stepper._pointer(t),
-            stepper._pointer(q),
-            stepper._pointer(p),
-            stepper._pointer(iterations),
-            report,
-            stepper._workspace(),
-        )
-        return status, report
-
-    def _trajectory(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]) -> Trajectory:
-        return Trajectory(
-            t=t,
-            q=q,
-            p=p,
-            iterations=iterations,
-            h=float(self._memory.h),
-            parameters=self._parameters,
-            stepper=self.stepper,
-        )
 
 
 def _rebuild(source: Source, interface: Interface, ensemble: Source | None, flags: tuple[str, ...]) -> Stepper:

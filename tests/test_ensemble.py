@@ -10,13 +10,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import OWN_SYSTEMS, sample_named, stepper_for
+from conftest import sample_named, stepper_for
 
-from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.binding import SolverOptions
 from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory, integrate_ensemble
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVerlet
-from scvi_codegen.stepper import SolverOptions, Stepper
+from scvi_codegen.stepper import Stepper
 
 KINDS = {
     "separable": "kepler",
@@ -36,7 +36,9 @@ def states(name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(x * (1.0 + 0.1 * generator.uniform(-1, 1, (count, len(x)))) for x in (q, p))  # type: ignore[return-value]
 
 
-def assert_equals_single_runs(stepper: Stepper, result: EnsembleTrajectory, tolerance: float, **settings: object) -> None:
+def assert_equals_single_runs(
+    stepper: Stepper, result: EnsembleTrajectory, tolerance: float, **settings: object
+) -> None:
     assert result.ok.all()
     for j in range(len(result)):
         single = stepper.integrate(
@@ -63,7 +65,9 @@ class TestEqualsSingleTrajectories:
     def test_for_any_number_with_their_own_parameters(self, count: int):
         stepper = stepper_for("kepler", SVI(5))
         q, p = states("kepler", count)
-        result = stepper.integrate_ensemble(q, p, h=0.05, steps=40, every=3, parameters={"mu": np.linspace(0.8, 1.2, count)})
+        result = stepper.integrate_ensemble(
+            q, p, h=0.05, steps=40, every=3, parameters={"mu": np.linspace(0.8, 1.2, count)}
+        )
         assert len(result) == count
         assert len(result.t) == 14
         assert_equals_single_runs(stepper, result, 3e-13, steps=40, every=3)
@@ -123,35 +127,38 @@ def kepler() -> Stepper:
 
 
 class TestFailures:
-    def test_a_fall_into_the_centre_spoils_nobody(self, kepler: Stepper):
-        q, p = states("kepler", 16)
-        alone = kepler.integrate_ensemble(q, p, h=0.05, steps=400)
-        p[3] = 0.0
-        result = kepler.integrate_ensemble(q, p, h=0.05, steps=400)
+    def test_a_trajectory_that_escapes_to_infinity_spoils_nobody(self):
+        stepper = stepper_for("runaway", SVI(5))
+        generator = np.random.default_rng(3)
+        q, p = generator.uniform(-1.2, -0.8, (16, 1)), generator.uniform(-0.6, -0.4, (16, 1))
+        alone = stepper.integrate_ensemble(q, p, h=0.05, steps=50)
+        q[3], p[3] = 1.0, 1.0
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=50)
         others = np.arange(16) != 3
         assert result.ok.tolist() == others.tolist()
         assert np.array_equal(result.q[:, 8:], alone.q[:, 8:])
-        assert np.abs(result.q[:, others] - alone.q[:, others]).max() < 1e-11  # measured 2e-13
+        assert np.abs(result.q[:, others] - alone.q[:, others]).max() < 1e-13  # measured 1e-15
         with pytest.raises(StepFailedError) as failure:
-            kepler.integrate(q[3], p[3], h=0.05, steps=400)
+            stepper.integrate(q[3], p[3], h=0.05, steps=50)
         assert result.status[3] == failure.value.status
         assert result.steps[3] == failure.value.step
         reached = failure.value.step + 1
-        np.testing.assert_allclose(result.q[:reached, 3], failure.value.recorded.q, rtol=0, atol=1e-12)
+        single = failure.value.recorded.q
+        assert (np.abs(result.q[:reached, 3] - single) < 1e-9 * np.abs(single)).all()
         assert np.isnan(result.q[reached:, 3]).all()
         assert np.isnan(result.p[reached:, 3]).all()
         assert np.isnan(result.energy()[reached:, 3]).all()
 
     def test_neighbours_of_a_lane_that_never_starts_keep_their_bits(self, kepler: Stepper):
-        """Twice in one block, once between others and once as the last, whose place is filled up with copies."""
-        q, p = states("kepler", 7)
+        """Between others, and as the last, whose place is filled up with copies."""
+        q, p = states("kepler", 6)
         without = kepler.integrate_ensemble(q, p, h=0.05, steps=100)
-        for place in (3, 7):
+        for place in (3, 6):
             several_q, several_p = (np.insert(x, place, y, axis=0) for x, y in ((q, 0.0), (p, 1.0)))
             result = kepler.integrate_ensemble(several_q, several_p, h=0.05, steps=100)
-            assert result.status[place] == "not finite"
+            others = np.arange(7) != place
+            assert result.ok.tolist() == others.tolist()
             assert result.steps[place] == 0
-            others = np.arange(8) != place
             assert np.array_equal(result.q[:, others], without.q)
             assert np.array_equal(result.p[:, others], without.p)
 
@@ -181,35 +188,27 @@ class TestFailures:
     def test_a_block_without_trajectories_left_stops(self, kepler: Stepper):
         q, p = states("kepler", 8)
         began = time.perf_counter()
-        result = kepler.integrate_ensemble(q, 0.0 * p, h=0.05, steps=10**8, every=10**7)
-        assert time.perf_counter() - began < 5.0  # an empty block would need a minute
+        result = kepler.integrate_ensemble(0.0 * q, p, h=0.05, steps=10**9, every=10**8)
+        assert time.perf_counter() - began < 5.0  # an empty block would need minutes
         assert not result.ok.any()
 
-    def test_methods_without_lanes_fail_one_by_one_too(self):
-        stepper = stepper_for("kepler", SCVI(3))
-        q, p = states("kepler", 3)
-        p[1] = 0.0
-        result = stepper.integrate_ensemble(q, p, h=0.05, steps=200)
+    @pytest.mark.parametrize("method", [SVI(5), SCVI(3), StoermerVerlet()], ids=lambda method: method.name)
+    def test_methods_fail_one_trajectory_at_a_time(self, method: Method):
+        stepper = stepper_for("runaway", method)
+        result = stepper.integrate_ensemble([[-1.0], [1.0], [-0.9]], [[-0.5], [1.0], [-0.4]], h=0.05, steps=50)
         assert result.ok.tolist() == [True, False, True]
-        assert np.isfinite(result.q[: result.steps[1] + 1, 1]).all()
-        assert np.isnan(result.q[result.steps[1] + 1 :, 1]).all()
-
-    def test_a_runaway_ends_where_the_single_run_ends(self):
-        stepper = compile_stepper(OWN_SYSTEMS["runaway"](), SVI(4))
-        q, p = np.array([[1.0], [-3.0], [-2.0]]), np.array([[1.0], [0.0], [0.1]])
-        result = stepper.integrate_ensemble(q, p, h=0.02, steps=200)
-        with pytest.raises(StepFailedError) as failure:
-            stepper.integrate(q[0], p[0], h=0.02, steps=200)
-        assert abs(int(result.steps[0]) - failure.value.step) <= 1
-        assert result.status[0] != "ok"
+        last = int(result.steps[1])
+        assert 0 < last < 50
+        assert np.isfinite(result.q[: last + 1, 1]).all()
+        assert np.isnan(result.q[last + 1 :, 1]).all()
 
 
 class TestThreadsAndInterruption:
     def test_bits_do_not_depend_on_the_number_of_threads(self, kepler: Stepper):
         q, p = states("kepler", 64)
-        p[20] = 0.0
+        q[20] = 0.0
         one, two = (kepler.integrate_ensemble(q, p, h=0.05, steps=300, threads=threads) for threads in (1, 2))
-        assert one.q.tobytes() == two.q.tobytes()
+        assert one.q.tobytes() == two.q.tobytes()  # NaN included
         assert one.p.tobytes() == two.p.tobytes()
         assert one.status.tolist() == two.status.tolist()
 
@@ -299,7 +298,7 @@ class TestFiles:
     @pytest.fixture
     def result(self, kepler: Stepper) -> EnsembleTrajectory:
         q, p = states("kepler", 3)
-        p[1] = 0.0
+        q[1] = 0.0
         return kepler.integrate_ensemble(q, p, h=0.05, steps=100, every=10, parameters={"mu": [1.0, 1.1, 1.2]})
 
     def test_npz(self, result: EnsembleTrajectory, tmp_path):

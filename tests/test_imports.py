@@ -30,7 +30,8 @@ FLOORS = """
     equations lowering c_printer
     sweeps splitting rendering building
     trajectory
-    ensemble
+    binding
+    run ensemble
     stepper
     compiler
     problems

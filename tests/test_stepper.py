@@ -9,10 +9,10 @@ import numpy as np
 import oracle
 import pytest
 
+from scvi_codegen.binding import SolverOptions
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.problems import problem
-from scvi_codegen.stepper import SolverOptions
 
 METHODS = (SVI(3), SCVI(3), SpectralCollocation(2), RadauIIA(2), StoermerVerlet(), ExplicitEuler())
 SYMMETRIC = (SVI(3), SVI(2, "gauss-lobatto:3"), StoermerVerlet(), Gauss(2))

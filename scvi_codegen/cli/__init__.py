@@ -117,8 +117,8 @@ def run(
     """  # noqa: D301  (click wants the character \b)
     _check_outputs(output, plot)
     model = read_model(model_name, Choices(**choices))
+    from scvi_codegen.binding import SolverOptions
     from scvi_codegen.cli.running import integrate_model, summary
-    from scvi_codegen.stepper import SolverOptions
 
     given = {"tolerance": tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
