@@ -189,7 +189,9 @@ class Sweep:
         lanes: a power of two.
         abscissae: (lanes,) c_n, where time stands.
         drift: (lanes,) row sums of the position table, c_n for collocation methods.
-        extrapolation: (lanes, lanes), of F or of V, to the next step.
+        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, for coupled systems with
+            other points than blocks; else empty.
+        extrapolation: (lanes, lanes), of F or of z, to the next step.
         kernel: F at (q, t); or F, L_v and the mass at (q, V, t).
         force: F alone.
         mass: constant diagonal (no arguments), separable only.
@@ -209,11 +211,18 @@ class Sweep:
     end_position: tuple[float, ...]
     end_momentum: tuple[float, ...]
     product: tuple[tuple[float, ...], ...]
+    velocity: tuple[tuple[float, ...], ...]
+    projection: tuple[tuple[float, ...], ...]
     extrapolation: tuple[tuple[float, ...], ...]
     kernel: Kernel
     force: Kernel
     mass: Kernel | None
     mass_entries: tuple[tuple[int, int], ...]
+
+    @property
+    def projected(self) -> bool:
+        """Whether the unknowns are not the velocities at the points."""
+        return bool(self.velocity)
 
     @property
     def diagonal(self) -> bool:

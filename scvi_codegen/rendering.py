@@ -75,7 +75,7 @@ def render(program: Program) -> Source:
 
 def render_ensemble(program: Program) -> Source | None:
     """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
-    if program.sweep is None:
+    if program.sweep is None or program.sweep.projected:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {

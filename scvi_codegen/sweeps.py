@@ -4,10 +4,14 @@ It exists where the unknowns are velocities V_n at the points themselves, so tha
 
     L_v(q_n, V_n) = P_n = p0 + h sum_j A_nj L_q(q_j, V_j),      q_n = q0 + h sum_j a_nj V_j,
 
-that is for SVI with as many points as its degree, every Runge-Kutta method in phase space, and Stoermer-Verlet; and for
-*separable* systems (constant diagonal mass, forces of position and time) also for every SVI, spectral collocation and
-Runge-Kutta in position form, whose stage equations collapse to q_n = q0 + h c_n v0 + h^2 sum_j Ahat_nj f(q_j),
-c_n the row sums of a.
+that is for SVI with as many points as its degree, every Runge-Kutta method in phase space, and Stoermer-Verlet. With
+other points an SVI has fewer velocities z_b, V_n = sum_b l_nb z_b, and the equations are projected on them: with
+K = l^T w l the residual is p0 + h K^-1 (beta - a)^T w L_q - K^-1 l^T w L_v, and a correction goes to the points by l,
+through the mass of each, and back by K^-1 l^T w.
+
+For *separable* systems (constant diagonal mass, forces of position and time) the equations collapse to
+q_n = q0 + h c_n v0 + h^2 sum_j Ahat_nj f(q_j), c_n the row sums of a, for spectral collocation and Runge-Kutta methods
+in position form as well.
 
 For a variational method the two matrices belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
 rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51,
@@ -16,7 +20,7 @@ the rounded map still has a generating function: its energy error does not drift
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from scvi_codegen.basis import extrapolation, matrix_product, transpose
 from scvi_codegen.derivatives import jacobian
@@ -35,6 +39,7 @@ __all__ = ["check_solver", "sweep_of"]
 
 MOST_POINTS = 32
 FRACTION_BITS = 51
+CONSISTENT = 1e-12
 
 
 def sweep_of(system: LagrangianSystem, method: Method) -> Sweep | None:
@@ -45,11 +50,13 @@ def sweep_of(system: LagrangianSystem, method: Method) -> Sweep | None:
         return None
     family = stages.families[0]
     tables = _variational_tables(family, stages) if _is_variational(stages) else _tableau_tables(family, stages)
-    if tables is None or (not separable and len(tables.position) != len(tables.momentum)):
+    if tables is None or len(family.abscissae) > MOST_POINTS:
         return None
-    if len(family.abscissae) > MOST_POINTS:
-        return None
-    return _padded(system, family, tables, separable=separable)
+    if separable:
+        guess = extrapolation(family.abscissae, 1, min(len(family.abscissae) - 1, EXTRAPOLATION_DEGREE))
+    else:
+        guess = stages.extrapolation or ()
+    return _padded(system, family, tables, guess, separable=separable)
 
 
 class _Tables:
@@ -64,10 +71,13 @@ class _Tables:
         momentum_weights: Vector,
         end_position: Vector,
         end_momentum: Vector,
+        velocity: Matrix = (),
+        projection: Matrix = (),
     ) -> None:
         self.position, self.position_weights = position, position_weights
         self.momentum, self.momentum_weights = momentum, momentum_weights
         self.end_position, self.end_momentum = end_position, end_momentum
+        self.velocity, self.projection = velocity, projection
 
 
 def _velocity_stages(system: LagrangianSystem, method: Method, *, separable: bool) -> StageSystem | None:
@@ -77,9 +87,7 @@ def _velocity_stages(system: LagrangianSystem, method: Method, *, separable: boo
     stages = method.stage_system(system)
     family = stages.families[0]
     plain = len(stages.families) == 1 and len(family.gathers) == len(family.scatters) == 2
-    if not plain:
-        return None
-    return stages if separable or _is_identity(family.gathers[1].table.entries) else None
+    return stages if plain else None
 
 
 def _is_identity(entries: Matrix) -> bool:
@@ -93,7 +101,7 @@ def _is_variational(stages: StageSystem) -> bool:
 
 
 def _variational_tables(family: PointFamily, stages: StageSystem) -> _Tables | None:
-    """Mu and its partner; for other velocity tables the partner by the (constant) stiffness matrix."""
+    """Mu and its partner; where the velocities are not those at the points, the equations projected on the curve."""
     beta = stages.end_position.entries[0][1:]
     if any(x == 0 for x in beta):
         return None
@@ -101,11 +109,17 @@ def _variational_tables(family: PointFamily, stages: StageSystem) -> _Tables | N
     velocity = tuple(line[1:] for line in family.gathers[1].table.entries)
     unit = mp.ldexp(1, FRACTION_BITS)
     mu = tuple(tuple(mp.nint(x / b * unit) / unit for x, b in zip(line, beta, strict=True)) for line in position)
-    partner: Matrix
-    if _is_identity(family.gathers[1].table.entries):
+    plain = _is_identity(family.gathers[1].table.entries)
+    if plain:
         partner = transpose(tuple(tuple(1 - x for x in line) for line in mu))
+        projection: Matrix = ()
     else:
-        partner = _stiffness_partner(position, velocity, beta, family.weights)
+        inverse = _inverse_stiffness(velocity, family.weights)
+        if inverse is None or max(abs(mp.fdot(line, beta) - 1) for line in inverse) > CONSISTENT:
+            return None
+        rest = tuple(tuple(b - x for x in column) for b, column in zip(beta, transpose(position), strict=True))
+        partner = matrix_product(inverse, rest)
+        projection = _weighted(matrix_product(inverse, transpose(velocity)), family.weights)
     return _Tables(
         position=mu,
         position_weights=beta,
@@ -113,16 +127,24 @@ def _variational_tables(family: PointFamily, stages: StageSystem) -> _Tables | N
         momentum_weights=family.weights,
         end_position=(mp.one,) * len(beta),
         end_momentum=(mp.one,) * len(family.weights),
+        velocity=() if plain else velocity,
+        projection=projection,
     )
 
 
-def _stiffness_partner(position: Matrix, velocity: Matrix, beta: Vector, weights: Vector) -> Matrix:
-    """K^-1 (beta - a)^T, K = l^T w l: beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) solved for constant mass."""
-    weighted = tuple(tuple(w * x for x in line) for w, line in zip(weights, velocity, strict=True))
-    stiffness = mp.matrix(matrix_product(transpose(velocity), weighted))
-    right = mp.matrix([[b - x for x in column] for b, column in zip(beta, transpose(position), strict=True)])
-    solved = mp.inverse(stiffness) * right
-    return tuple(tuple(solved[b, n] for n in range(solved.cols)) for b in range(solved.rows))
+def _inverse_stiffness(velocity: Matrix, weights: Vector) -> Matrix | None:
+    """K^-1, K = l^T w l: it solves beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) for constant mass."""
+    stiffness = mp.matrix(matrix_product(transpose(velocity), tuple(_scaled(velocity, weights))))
+    try:
+        inverse = mp.inverse(stiffness)
+    except ZeroDivisionError:
+        return None
+    return tuple(tuple(inverse[i, j] for j in range(inverse.cols)) for i in range(inverse.rows))
+
+
+def _scaled(entries: Matrix, weights: Vector) -> Iterator[Vector]:
+    """Rows times weights."""
+    return (tuple(w * x for x in line) for w, line in zip(weights, entries, strict=True))
 
 
 def _tableau_tables(family: PointFamily, stages: StageSystem) -> _Tables:
@@ -133,12 +155,11 @@ def _tableau_tables(family: PointFamily, stages: StageSystem) -> _Tables:
     return _Tables(position=A, position_weights=ones, momentum=A, momentum_weights=ones, end_position=b, end_momentum=b)
 
 
-def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, separable: bool) -> Sweep:
+def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, guess: Matrix, *, separable: bool) -> Sweep:
     points, blocks = len(family.abscissae), len(tables.momentum)
     lanes = 2
     while lanes < max(points, blocks):
         lanes *= 2
-    degree = min(points - 1, EXTRAPOLATION_DEGREE)
     weighted = _weighted(tables.position, tables.position_weights)
     product = _weighted(matrix_product(weighted, tables.momentum), tables.momentum_weights)
     kernel, mass, entries = _separable_kernels(system) if separable else _coupled_kernel(system)
@@ -156,7 +177,9 @@ def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, *, s
         end_position=_vector(tables.end_position, lanes),
         end_momentum=_vector(tables.end_momentum, lanes),
         product=_matrix(product, lanes),
-        extrapolation=_matrix(extrapolation(family.abscissae, 1, degree), lanes),
+        velocity=_matrix(tables.velocity, lanes) if tables.velocity and not separable else (),
+        projection=_matrix(tables.projection, lanes) if tables.projection and not separable else (),
+        extrapolation=_matrix(guess, lanes),
         kernel=kernel,
         force=_force_kernel(system, separable=separable),
         mass=mass,

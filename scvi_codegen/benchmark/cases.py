@@ -242,8 +242,8 @@ def _outer_solar_system() -> Case:
     )
 
 
-def _chain_case(n: int) -> Case:
-    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=1.0, step=1.0 if n < 16 else 2.0)
+def _chain_case(n: int, step: float, fine: float) -> Case:
+    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=fine, step=step)
 
 
 def _relativistic_case() -> Case:
@@ -264,9 +264,9 @@ CASES: Mapping[str, Callable[[], Case]] = {
         "double-pendulum", _hand_solved(double_pendulum), span=1000.0, fine=0.25, q=(0.5, 0.5), step=0.4, g=1.0
     ),
     "relativistic-particle": _relativistic_case,
-    "fput-chain:8": lambda: _chain_case(8),
-    "fput-chain:64": lambda: _chain_case(64),
-    "fput-chain:256": lambda: _chain_case(256),
+    "fput-chain:8": lambda: _chain_case(8, 1.0, 1.0),
+    "fput-chain:64": lambda: _chain_case(64, 2.0, 3.0),
+    "fput-chain:256": lambda: _chain_case(256, 2.0, 2.0),
 }
 """The cases of the table: name on the command line -> function that builds one."""
 

@@ -155,19 +155,20 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
 Table = tuple[Extended, Extended]
 
 
-def _product(table: Table, values: Extended) -> Extended:
-    """(rows, s) table times (s, k, d) values."""
+def _product(table: tuple[Extended, ...], values: Extended) -> Extended:
+    """(rows, s) table, a sum of parts, times (s, k, d) values."""
     flat = values.reshape(values.shape[0], -1)
-    result = table[0] @ flat + table[1] @ flat
+    result: Extended = sum(part @ flat for part in table[1:]) + table[0] @ flat
     return result.reshape(-1, *values.shape[1:])
 
 
 def _stages(field: Field, x: Extended, h: np.longdouble, a: Table, guess: Extended | None) -> Extended:
     """(s, k, d) slopes F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
     slopes = np.broadcast_to(field(x), (len(a[0]), *x.shape)).copy() if guess is None else guess
+    low = _product((a[1],), slopes)  # small enough to be left at the first guess
     scale, last = h / np.max(np.abs(x)), np.inf
     for _ in range(MOST_SWEEPS):
-        new = field(x + h * _product(a, slopes))
+        new = field(x + h * (_product((a[0],), slopes) + low))
         change = float(scale * np.max(np.abs(new - slopes)))
         slopes = new
         if change == 0.0 or (change < STALLED and change >= 0.3 * last):

@@ -100,7 +100,7 @@ def _ratio(reference: Sequence[Point], points: Sequence[Point], error: float | N
 
 
 HEADER = ("", "setting", "time", "error", "compile", "ratio", "plain", "at error", "options")
-LEGEND = """Times are of stepping one trajectory to the end. Errors are those of q at the end, relative, in root mean
+LEGEND = """Times are processor times of stepping one trajectory to the end. Errors are those of q at the end, relative, in root mean
 square over eight initial states. ratio: time of heyoka's best, with fast_math or without, over the method's, at the
 error named, interpolated on the measured curves (errors below 1e-13 count as equal); above 1 is faster than heyoka.
 plain: the same against heyoka without fast_math."""
