@@ -26,6 +26,11 @@ static inline double larger(double a, double b)
   return a > b ? a : b;
 }
 
+static inline double smaller(double a, double b)
+{
+  return a < b ? a : b;
+}
+
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b] v0,
  * the guess from the step before sum_c EXTRAPOLATION[b][c] z_c. */
 static const double END_POSITION[5] = {
@@ -691,6 +696,318 @@ static int newton(const step_data *step, double *z, const double *q1, double *p0
   }
 }
 
+#ifdef __GNUC__
+/* Vectors of points. GCC and Clang map them to whatever the processor has. */
+#pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
+
+enum { LANES = 2 };
+typedef double lanes __attribute__((vector_size(8 * 2)));
+typedef union {
+  lanes all;
+  double lane[LANES];
+} lane_view;
+
+static inline lanes lanes_of(double x)
+{
+  const lanes zero = {0.0};
+  return zero + x;
+}
+
+static inline lanes lanes_sqrt(lanes x)
+{
+  lane_view view = {x};
+  for (int j = 0; j < LANES; j++)
+    view.lane[j] = sqrt(view.lane[j]);
+  return view.all;
+}
+
+/* Column j of a table multiplies node j, or point j of a transposed one. Lanes beyond repeat the last. */
+static const lanes COLLOCATION[2] = {
+  {0.75, 1.0},
+  {-0.25, 0.0}
+};
+static const lanes COLLOCATION_T[2] = {
+  {0.75, -0.25},
+  {1.0, 0.0}
+};
+static const lanes POINT_POSITION[2] = {
+  {0.37799153207185376, 0.9553418012614795},
+  {-0.16666666666666666, -0.16666666666666666}
+};
+static const lanes POINT_POSITION_T[2] = {
+  {0.37799153207185376, -0.16666666666666666},
+  {0.9553418012614795, -0.16666666666666666}
+};
+static const lanes POINT_VELOCITY[2] = {
+  {1.5773502691896257, 0.4226497308103742},
+  {-0.5773502691896257, 0.5773502691896257}
+};
+static const lanes POINT_VELOCITY_T[2] = {
+  {1.5773502691896257, -0.5773502691896257},
+  {0.4226497308103742, 0.5773502691896257}
+};
+static const lanes NODE_EXTRAPOLATION[2] = {
+  {-1.0, -2.0},
+  {2.0, 3.0}
+};
+static const lanes POINT_WEIGHT = {0.5, 0.5};
+static const lanes NODE_END = {1.0, 0.0};
+static const lanes NODE_CONSISTENCY = {1.0, 0.0};
+static const lanes NODE_MASK = {1.0, 1.0};
+
+/* sum_j table[j] x_j, in four sums that do not wait for each other. */
+static inline lanes lanes_apply(const lanes *table, lanes x)
+{
+  const lane_view view = {x};
+  lanes a = table[0] * view.lane[0];
+  for (int j = 1; j < LANES; j++)
+    a += table[j] * view.lane[j];
+  return a;
+}
+
+static inline double lanes_total(lanes x)
+{
+  lane_view view = {x};
+  for (int half = LANES / 2; half > 0; half /= 2)
+    for (int j = 0; j < half; j++)
+      view.lane[j] += view.lane[j + half];
+  return view.lane[0];
+}
+
+static inline void lanes_load(const double *memory, lanes *x)
+{
+  memcpy(x, memory, sizeof(double) * M * LANES);
+}
+
+static inline void lanes_store(const lanes *x, double *memory)
+{
+  memcpy(memory, x, sizeof(double) * M * LANES);
+}
+
+/* E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m). Operations: 23 *, 3 +, 4 -, 1 /, 1 sqrt. */
+static inline void node_lanes(const lanes *u, const double *parameters, lanes *value, lanes *slope)
+{
+  const lanes w0 = u[0]*u[0];
+  const lanes w1 = u[1]*u[1];
+  const lanes w2 = w0 + w1;
+  const lanes w3 = lanes_sqrt(w2);
+  const lanes w4 = 1.0/w2;
+  const lanes w5 = w4*w4;
+  const lanes w6 = parameters[0]*(w5*w3);
+  const lanes w7 = w5*w4*w3;
+  const double w8 = 3.0*parameters[0];
+  const lanes w9 = w8*w7*u[0]*u[1];
+  value[0] = w6*u[0] + u[4];
+  value[1] = w6*u[1] + u[5];
+  value[2] = w6*u[6] - w8*w0*w7*u[6] - w9*u[7];
+  value[3] = w6*u[7] - w8*w1*w7*u[7] - w9*u[6];
+  value[4] = lanes_of(0.0);
+  value[5] = lanes_of(0.0);
+  slope[0] = lanes_of(1.0);
+  slope[1] = lanes_of(1.0);
+}
+
+/* L_q and L_v at all points, u = (q, v). Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+static inline void action_lanes(const lanes *u, const double *parameters, lanes *value)
+{
+  const lanes w0 = u[0]*u[0] + u[1]*u[1];
+  const lanes w1 = 1.0/w0;
+  const lanes w2 = parameters[0]*(w1*w1*lanes_sqrt(w0));
+  value[0] = -(w2*u[0]);
+  value[1] = -(w2*u[1]);
+  value[2] = u[2];
+  value[3] = u[3];
+}
+
+/* The masses are diagonal: nothing to factorise. */
+static inline void factor_mass(lanes *mass)
+{
+  (void)mass;
+}
+
+/* d = mass^-1 r in every lane. */
+static inline void solve_mass(const lanes *mass, lanes *r)
+{
+  for (int i = 0; i < M; i++)
+    r[i] /= mass[i];
+}
+
+/* What follows a sweep would change the points by, squared, with a margin: the rate of contraction is that from the sweep
+ * before, whose change is infinite before the first. */
+static inline double expected_change(double change, double last, const kepler_scvi_2_options *options)
+{
+  const double ratio = last < INFINITY ? smaller(larger(change / last, 1e-6), 0.25) : 1.0; /* squares, too */
+  return options->absolute ? change : 4.0 * ratio * change;
+}
+
+/* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
+ * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
+ * contracts too slowly or not at all. */
+static int sweep_status(double change, double last, const kepler_scvi_2_options *options, int k)
+{
+  const double expected = expected_change(change, last, options);
+  if (!(change < INFINITY))
+    return -1;
+  if (change == 0.0)
+    return 1;
+  if (expected <= options->tolerance * options->tolerance)
+    return 1;
+  if (k > 0 && change >= last * 0.0625 && change < 1e-25)
+    return 1;
+  if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
+    return -1;
+  return 0;
+}
+
+typedef struct {
+  lanes weight; /* h w */
+} sweep_data;
+
+static void prepare_sweep(const step_data *step, sweep_data *data)
+{
+  data->weight = step->h * POINT_WEIGHT;
+}
+
+/* v0, z = h a and m of the curve of a step. */
+typedef struct {
+  double v0[M];
+  lanes z[M], m[M];
+} shot;
+
+static void save_shot(const shot *curve, double *memory)
+{
+  lanes_store(curve->z, memory);
+  lanes_store(curve->m, memory + M * LANES);
+  memcpy(memory + 2 * M * LANES, curve->v0, sizeof curve->v0);
+}
+
+/* The curve of the step before, continued. */
+static void continue_shot(const double *memory, shot *curve)
+{
+  lanes_load(memory, curve->z);
+  lanes_load(memory + M * LANES, curve->m);
+  memcpy(curve->v0, memory + 2 * M * LANES, sizeof curve->v0);
+  for (int i = 0; i < M; i++) {
+    curve->v0[i] += lanes_total(NODE_MASK * NODE_END * curve->z[i]);
+    curve->z[i] = lanes_apply(NODE_EXTRAPOLATION, curve->z[i]);
+  }
+}
+
+/* Positions, velocities, accelerations and multipliers at the nodes. */
+static inline void place_nodes(const step_data *step, const shot *curve, lanes *V, lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    V[i] = curve->v0[i] + lanes_apply(COLLOCATION, curve->z[i]);
+    u[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(COLLOCATION, step->h * V[i]));
+    u[M + i] = V[i];
+    u[2 * M + i] = curve->z[i] / step->h;
+    u[3 * M + i] = curve->m[i];
+  }
+}
+
+/* Positions and velocities at the quadrature points. */
+static inline void place_points(const step_data *step, const lanes *V, lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    u[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, step->h * V[i]));
+    u[M + i] = lanes_apply(POINT_VELOCITY, V[i]);
+  }
+}
+
+/* p1 - p0 from the forces at the points and the gradient of m . E at the nodes. */
+static inline double end_increment(const step_data *step, const sweep_data *data, lanes force, lanes slope)
+{
+  return lanes_total(data->weight * force) + step->h * (step->h * lanes_total(NODE_MASK * slope));
+}
+
+/* One step. Accelerations, momentum, initial velocity and multipliers are corrected in turn until all rest. */
+static int sweep(const step_data *step, const sweep_data *data, double *memory, int guess, double *dq, double *dp,
+    const kepler_scvi_2_options *options, kepler_scvi_2_report *report)
+{
+  shot curve;
+  lanes V[M], u[4 * M], node[3 * M], action[2 * M], mass[M];
+  const double h = step->h;
+  double inverse_size[M], last = INFINITY, largest = 0.0;
+  int status = 0, settled = 0;
+  if (guess) {
+    continue_shot(memory, &curve);
+  } else {
+    status = kepler_scvi_2_velocity(step->t, step->q0, step->p0, step->parameters, curve.v0, step->scratch);
+    if (status != KEPLER_SCVI_2_OK)
+      return status;
+    for (int i = 0; i < M; i++)
+      curve.z[i] = curve.m[i] = lanes_of(0.0);
+  }
+  for (int i = 0; i < M; i++) {
+    inverse_size[i] = fabs(curve.v0[i]) + fabs(curve.v0[i] + lanes_total(NODE_MASK * NODE_END * curve.z[i]));
+    largest = larger(largest, inverse_size[i]);
+  }
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = options->absolute ? fabs(h) : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
+  for (int k = 0; status == 0; k++) {
+    lanes change = lanes_of(0.0), r[M], gamma[M];
+    double total = 0.0, misfit[M];
+    place_nodes(step, &curve, V, u);
+    node_lanes(u, step->parameters, node, mass);
+    factor_mass(mass);
+    for (int i = 0; i < M; i++)
+      r[i] = h * node[i];
+    solve_mass(mass, r);
+    for (int i = 0; i < M; i++) {
+      const lanes moved = r[i] * inverse_size[i];
+      change += moved * moved;
+      curve.z[i] -= r[i];
+      V[i] = curve.v0[i] + lanes_apply(COLLOCATION, curve.z[i]);
+    }
+    place_points(step, V, u);
+    action_lanes(u, step->parameters, action);
+    for (int i = 0; i < M; i++) {
+      const double p1 = step->p0[i] + (step->carry_p[i] + end_increment(step, data, action[i], node[M + i]));
+      gamma[i] = lanes_apply(POINT_POSITION_T, data->weight * action[i]) + lanes_apply(POINT_VELOCITY_T, POINT_WEIGHT * action[M + i])
+          + h * (node[2 * M + i] + h * lanes_apply(COLLOCATION_T, node[M + i])) - NODE_END * p1;
+      misfit[i] = lanes_total(NODE_MASK * gamma[i]);
+      r[i] = lanes_of(misfit[i]);
+    }
+    solve_mass(mass, r);
+    for (int i = 0; i < M; i++) {
+      const double correction = lanes_total(NODE_MASK * r[i]) / 2.0;
+      total += (correction * inverse_size[i]) * (correction * inverse_size[i]);
+      curve.v0[i] -= correction;
+      r[i] = lanes_apply(COLLOCATION_T, gamma[i] - NODE_CONSISTENCY * misfit[i]);
+    }
+    solve_mass(mass, r);
+    for (int i = 0; i < M; i++) {
+      const lanes moved = (r[i] + curve.m[i]) * inverse_size[i];
+      change += moved * moved;
+      curve.m[i] = -r[i];
+    }
+    total += lanes_total(change);
+    status = sweep_status(total, last, options, k);
+    if (status > 0 && !settled) { /* once more: the rate of contraction shows late */
+      settled = 1;
+      status = 0;
+    }
+    last = total;
+    report->iterations++;
+  }
+  report->change = sqrt(last);
+  if (status < 0)
+    return last < INFINITY ? KEPLER_SCVI_2_NOT_CONVERGED : KEPLER_SCVI_2_NOT_FINITE;
+  place_nodes(step, &curve, V, u);
+  node_lanes(u, step->parameters, node, mass);
+  place_points(step, V, u);
+  action_lanes(u, step->parameters, action);
+  for (int i = 0; i < M; i++) {
+    dq[i] = lanes_total(NODE_MASK * NODE_END * (h * V[i]));
+    dp[i] = end_increment(step, data, action[i], node[M + i]);
+  }
+  if (!all_finite(dq, M) || !all_finite(dp, M))
+    return KEPLER_SCVI_2_NOT_FINITE;
+  save_shot(&curve, memory);
+  return KEPLER_SCVI_2_OK;
+}
+#endif
+
 kepler_scvi_2_options kepler_scvi_2_default_options(void)
 {
   const kepler_scvi_2_options options = {2.220446049250313e-16, 50, 0};
@@ -737,6 +1054,31 @@ static int solve_newton(const step_data *step, double *memory, int guess, double
   }
   return status;
 }
+#ifdef __GNUC__
+typedef sweep_data solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  prepare_sweep(step, data);
+}
+
+/* The increments by sweeps, from the extrapolated guess and then from the straight line, else by Newton's iteration. On success
+ * guess says whether memory can be extrapolated. */
+static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const kepler_scvi_2_options *options, kepler_scvi_2_report *report, double *workspace)
+{
+  int status = sweep(step, data, memory, *guess != 0, dq, dp, options, report), swept = 1;
+  if (status != KEPLER_SCVI_2_OK && *guess)
+    status = sweep(step, data, memory, 0, dq, dp, options, report);
+  if (status != KEPLER_SCVI_2_OK) {
+    status = solve_newton(step, workspace, 0, dq, dp, options, report, workspace + MEMORY);
+    swept = 0;
+  }
+  if (status == KEPLER_SCVI_2_OK)
+    *guess = swept;
+  return status;
+}
+#else
 typedef struct {
   int unused;
 } solver_data;
@@ -756,6 +1098,7 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
     *guess = 1;
   return status;
 }
+#endif
 
 int kepler_scvi_2_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const kepler_scvi_2_options *options, double *q1, double *p1, kepler_scvi_2_report *report, double *workspace)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, Sweep
+from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, ShootingSweep, Sweep
 
 __all__ = ["lane_functions", "print_expression", "print_lane_results", "print_lane_temporaries", "print_number"]
 
@@ -68,7 +68,7 @@ def print_lane_temporaries(kernel: Kernel, sources: Sources) -> list[tuple[str, 
     ]
 
 
-def print_lane_results(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
+def print_lane_results(kernel: Kernel, sweep: Sweep | ShootingSweep, sources: Sources) -> list[str]:
     """Statements that store the results as vectors; slopes go to their places in the (lower) mass matrix."""
     vectors = _Vectors(kernel, sources)
     targets = [f"value[{k}]" for k in range(kernel.values)]

@@ -20,6 +20,7 @@ from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
 from scvi_codegen.rendering import render, render_ensemble, workspace_size
+from scvi_codegen.shooting_sweep import shooting_sweep_of
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.splitting import splitting_of
 from scvi_codegen.stepper import Stepper
@@ -29,6 +30,10 @@ from scvi_codegen.system import LagrangianSystem
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
 
 LONGEST_PREFIX = 64
+C_HEADERS = frozenset(
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef "
+    "stdint stdio stdlib string tgmath time wchar wctype unistd".split()
+)
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
@@ -72,7 +77,8 @@ def generate_source(
 def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
-    sweep = sweep_of(system, method) if solver in ("auto", "fixed-point") and splitting is None else None
+    swept = solver in ("auto", "fixed-point") and splitting is None
+    sweep = (shooting_sweep_of(system, method) or sweep_of(system, method)) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))
     return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton)
@@ -96,6 +102,11 @@ def describe(program: Program, system: LagrangianSystem, method: Method) -> Inte
 
 
 def c_identifier(name: str) -> str:
-    """Lower-case letters, digits and underscores, beginning with a letter, of limited length."""
+    """Lower-case letters, digits and underscores, beginning with a letter, of limited length.
+
+    A single letter (``X_OK`` is a macro of POSIX) and names of C headers get a longer name.
+    """
     cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
-    return cleaned if cleaned[:1].isalpha() else f"integrator_{cleaned}".rstrip("_")
+    if len(cleaned) < 2 or cleaned in C_HEADERS or not cleaned[0].isalpha():
+        return f"integrator_{cleaned}".rstrip("_")
+    return cleaned

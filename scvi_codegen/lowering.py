@@ -33,6 +33,7 @@ from scvi_codegen.program import (
     Operation,
     Program,
     ScatterLoop,
+    ShootingSweep,
     SlopeBlock,
     Splitting,
     Sweep,
@@ -260,7 +261,7 @@ def lower(
     method: Method,
     *,
     prefix: str,
-    sweep: Sweep | None = None,
+    sweep: Sweep | ShootingSweep | None = None,
     splitting: Splitting | None = None,
     newton: bool = True,
 ) -> Program:

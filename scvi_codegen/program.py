@@ -21,6 +21,7 @@ __all__ = [
     "Operation",
     "Program",
     "ScatterLoop",
+    "ShootingSweep",
     "SlopeBlock",
     "Splitting",
     "Sweep",
@@ -220,6 +221,20 @@ class Sweep:
     mass_entries: tuple[tuple[int, int], ...]
 
     @property
+    def kind(self) -> str:
+        """For the templates."""
+        return "points"
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes."""
+        return (self.kernel,) if self.separable else (self.kernel, self.force)
+
+    def memory(self, dimension: int) -> int:
+        """The forces, or the velocities, at the points."""
+        return dimension * self.lanes
+
+    @property
     def projected(self) -> bool:
         """Whether the unknowns are not the velocities at the points."""
         return bool(self.velocity)
@@ -228,6 +243,73 @@ class Sweep:
     def diagonal(self) -> bool:
         """Whether the mass matrix is diagonal."""
         return all(i == j for i, j in self.mass_entries)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShootingSweep:
+    """The fixed-point iteration of a shooting-based variational method; tables padded to ``lanes`` rows.
+
+    Unknowns: v0, the scaled accelerations z_i = h a_i at the nodes and the scaled multipliers m_i. With
+    V = v0 + A z and q = q0 + h A V at the nodes, and q = q0 + h a V, v = l V at the points, one sweep is
+
+        z -= h M^-1 E(q, V, z / h),          p1 = p0 + h sum w L_q + h^2 sum (m . E)_q,
+        gamma = h a^T w L_q + l^T w L_v + h (m . E)_v + h^2 A^T (m . E)_q - b p1,
+        v0 -= M^-1 sum gamma,                m = -M^-1 A^T (gamma - l^T w sum gamma).
+
+    Attributes:
+        points, nodes: how many of each; lanes beyond repeat the last and have weight 0.
+        node_abscissae, abscissae: (lanes,) times.
+        collocation: A; position, velocity: a, l; their transposes act on what is gathered back.
+        weights: (lanes,) w; end: (lanes,) b; consistency: (lanes,) l^T w; mask: (lanes,) 1 for nodes.
+        extrapolation: (lanes, lanes), of z to the next step.
+        kernel: E, (m . E)_q, (m . E)_v and the mass at (q, V, a, m, t).
+        action: L_q and L_v at (q, v, t).
+        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+    """
+
+    points: int
+    nodes: int
+    lanes: int
+    node_abscissae: tuple[float, ...]
+    abscissae: tuple[float, ...]
+    collocation: tuple[tuple[float, ...], ...]
+    collocation_transposed: tuple[tuple[float, ...], ...]
+    position: tuple[tuple[float, ...], ...]
+    position_transposed: tuple[tuple[float, ...], ...]
+    velocity: tuple[tuple[float, ...], ...]
+    velocity_transposed: tuple[tuple[float, ...], ...]
+    weights: tuple[float, ...]
+    end: tuple[float, ...]
+    consistency: tuple[float, ...]
+    mask: tuple[float, ...]
+    extrapolation: tuple[tuple[float, ...], ...]
+    kernel: Kernel
+    action: Kernel
+    mass_entries: tuple[tuple[int, int], ...]
+
+    @property
+    def kind(self) -> str:
+        """For the templates."""
+        return "shooting"
+
+    @property
+    def separable(self) -> bool:
+        """The sweep is one for any system."""
+        return False
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes."""
+        return (self.kernel, self.action)
+
+    @property
+    def diagonal(self) -> bool:
+        """Whether the mass matrix is diagonal."""
+        return all(i == j for i, j in self.mass_entries)
+
+    def memory(self, dimension: int) -> int:
+        """z, m and v0."""
+        return dimension * (2 * self.lanes + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,7 +371,7 @@ class Program:
     mass_entries: tuple[tuple[int, int], ...]
     lagrangian: Kernel
     action: str | None
-    sweep: Sweep | None
+    sweep: Sweep | ShootingSweep | None
     splitting: Splitting | None
     newton: bool
 
@@ -312,7 +394,7 @@ class Program:
     @property
     def memory(self) -> int:
         """Numbers a run remembers of its last step to guess the next."""
-        points = self.dimension * self.sweep.lanes if self.sweep else 0
+        points = self.sweep.memory(self.dimension) if self.sweep else 0
         return max(points, self.unknowns if self.newton else 0, self.dimension if self.splitting else 0)
 
     def __str__(self) -> str:

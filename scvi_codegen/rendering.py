@@ -20,7 +20,7 @@ from scvi_codegen.c_printer import (
     print_lane_temporaries,
     print_number,
 )
-from scvi_codegen.program import Family, Kernel, Program, Sweep
+from scvi_codegen.program import Family, Kernel, Program, ShootingSweep, Sweep
 from scvi_codegen.source import Interface, Source
 
 __all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "render", "render_example", "template_folder"]
@@ -75,7 +75,7 @@ def render(program: Program) -> Source:
 
 def render_ensemble(program: Program) -> Source | None:
     """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
-    if program.sweep is None or program.sweep.projected:
+    if not isinstance(program.sweep, Sweep) or program.sweep.projected:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
@@ -146,6 +146,8 @@ def _purposes(program: Program) -> dict[str, str]:
         "legendre": "Momenta L_v and mass matrix L_vv at u = (q, v).",
         "lagrangian": "L at u = (q, v).",
         "force_lanes": "L_q at all points.",
+        "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
+        "action_lanes": "L_q and L_v at all points, u = (q, v).",
         "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
     }
     for family in program.families:
@@ -163,17 +165,18 @@ def _results(family: Family) -> str:
     return "L_q" if family.name == "kick" else "L_v"
 
 
-def _lane_context(sweep: Sweep | None) -> dict[str, object]:
+def _lane_context(sweep: Sweep | ShootingSweep | None) -> dict[str, object]:
     """What the templates of the fixed-point solver need; nothing without one."""
     if sweep is None:
         return {}
     return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points"}
 
 
-def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]:
+def _vector_context(sweep: Sweep | ShootingSweep, sources: tuple[str, ...]) -> dict[str, object]:
     """Kernels in vectors, with the functions they call; ``sources`` differ from lane to lane."""
-    kernels = [sweep.kernel] if sweep.separable else [sweep.kernel, sweep.force]
-    applied = kernels if "t" in sources or not sweep.mass else [*kernels, sweep.mass]
+    kernels = applied = sweep.kernels
+    if isinstance(sweep, Sweep) and sweep.mass is not None and "t" not in sources:
+        applied = (*kernels, sweep.mass)
     return {
         "sweep": sweep,
         "lane_kernels": kernels,

@@ -31,11 +31,11 @@ from scvi_codegen.methods.collocation import phase_space_system
 from scvi_codegen.methods.galerkin import EXTRAPOLATION_DEGREE
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import Matrix, Vector, mp
-from scvi_codegen.program import Kernel, Splitting, Sweep
+from scvi_codegen.program import Kernel, ShootingSweep, Splitting, Sweep
 from scvi_codegen.stage_system import PointFamily, StageSystem
 from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["check_solver", "sweep_of"]
+__all__ = ["check_solver", "pad_matrix", "pad_vector", "sweep_of"]
 
 MOST_POINTS = 32
 FRACTION_BITS = 51
@@ -168,18 +168,18 @@ def _padded(system: LagrangianSystem, family: PointFamily, tables: _Tables, gues
         points=points,
         blocks=blocks,
         lanes=lanes,
-        abscissae=_vector(family.abscissae, lanes, repeat=True),
-        drift=_vector(tuple(mp.fsum(line) for line in weighted), lanes, repeat=True),
-        position=_matrix(tables.position, lanes),
-        position_weights=_vector(tables.position_weights, lanes),
-        momentum=_matrix(tables.momentum, lanes),
-        momentum_weights=_vector(tables.momentum_weights, lanes),
-        end_position=_vector(tables.end_position, lanes),
-        end_momentum=_vector(tables.end_momentum, lanes),
-        product=_matrix(product, lanes),
-        velocity=_matrix(tables.velocity, lanes) if tables.velocity and not separable else (),
-        projection=_matrix(tables.projection, lanes) if tables.projection and not separable else (),
-        extrapolation=_matrix(guess, lanes),
+        abscissae=pad_vector(family.abscissae, lanes, repeat=True),
+        drift=pad_vector(tuple(mp.fsum(line) for line in weighted), lanes, repeat=True),
+        position=pad_matrix(tables.position, lanes),
+        position_weights=pad_vector(tables.position_weights, lanes),
+        momentum=pad_matrix(tables.momentum, lanes),
+        momentum_weights=pad_vector(tables.momentum_weights, lanes),
+        end_position=pad_vector(tables.end_position, lanes),
+        end_momentum=pad_vector(tables.end_momentum, lanes),
+        product=pad_matrix(product, lanes),
+        velocity=pad_matrix(tables.velocity, lanes) if tables.velocity and not separable else (),
+        projection=pad_matrix(tables.projection, lanes) if tables.projection and not separable else (),
+        extrapolation=pad_matrix(guess, lanes),
         kernel=kernel,
         force=_force_kernel(system, separable=separable),
         mass=mass,
@@ -191,13 +191,14 @@ def _weighted(entries: Matrix, weights: Vector) -> Matrix:
     return tuple(tuple(x * w for x, w in zip(line, weights, strict=True)) for line in entries)
 
 
-def _matrix(entries: Matrix, lanes: int) -> tuple[tuple[float, ...], ...]:
+def pad_matrix(entries: Matrix, lanes: int) -> tuple[tuple[float, ...], ...]:
     """Rows beyond the last repeat it, columns beyond are zero: a lane too many is the last point again."""
     wide = [(*line, *(mp.zero,) * (lanes - len(line))) for line in entries]
     return lower_matrix((*wide, *(wide[-1],) * (lanes - len(wide))))
 
 
-def _vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[float, ...]:
+def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[float, ...]:
+    """The rest is zero, or the last entry again."""
     return lower_vector((*entries, *((entries[-1] if repeat else mp.zero),) * (lanes - len(entries))))
 
 
@@ -230,7 +231,9 @@ def _coupled_kernel(system: LagrangianSystem) -> tuple[Kernel, None, tuple[tuple
     return kernel, None, tuple(mass)
 
 
-def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:
+def check_solver(
+    solver: str, method: Method, names: Sequence[str], *, found: Sweep | ShootingSweep | Splitting | None
+) -> None:
     """Raise :class:`MethodError` for a solver that does not exist, or was not ``found`` for this method and system."""
     if solver not in names:
         raise MethodError(f"there is no solver {solver!r}; there are {', '.join(names)}")

@@ -149,30 +149,19 @@ class TestFailures:
         assert np.isnan(result.p[reached:, 3]).all()
         assert np.isnan(result.energy()[reached:, 3]).all()
 
-    def test_neighbours_of_a_lane_that_never_starts_keep_their_bits(self, kepler: Stepper):
+    @pytest.mark.parametrize("place", [3, 6])
+    def test_neighbours_of_a_lane_that_never_starts_keep_their_bits(self, place: int):
         """Between others, and as the last, whose place is filled up with copies."""
-        q, p = states("kepler", 6)
-        without = kepler.integrate_ensemble(q, p, h=0.05, steps=100)
-        for place in (3, 6):
-            several_q, several_p = (np.insert(x, place, y, axis=0) for x, y in ((q, 0.0), (p, 1.0)))
-            result = kepler.integrate_ensemble(several_q, several_p, h=0.05, steps=100)
-            others = np.arange(7) != place
-            assert result.ok.tolist() == others.tolist()
-            assert result.steps[place] == 0
-            assert np.array_equal(result.q[:, others], without.q)
-            assert np.array_equal(result.p[:, others], without.p)
-
-    def test_parameters_that_make_no_sense_spoil_nobody(self):
         stepper = stepper_for("relativistic-particle", SVI(5))
-        q, p = states("relativistic-particle", 8)
-        values = np.tile(stepper.defaults, (8, 1))
-        without = stepper.integrate_ensemble(q, p, h=0.05, steps=50, parameters=values)
-        values[2] = 0.0
+        q, p = states("relativistic-particle", 7)
+        values, others = np.tile(stepper.defaults, (7, 1)), np.arange(7) != place
+        values[place] = 0.0
         result = stepper.integrate_ensemble(q, p, h=0.05, steps=50, parameters=values)
-        others = np.arange(8) != 2
+        without = stepper.integrate_ensemble(q[others], p[others], h=0.05, steps=50)
         assert result.ok.tolist() == others.tolist()
-        assert result.steps[2] == 0
-        assert np.array_equal(result.q[:, others], without.q[:, others])
+        assert result.steps[place] == 0
+        assert np.array_equal(result.q[:, others], without.q)
+        assert np.array_equal(result.p[:, others], without.p)
 
     def test_newton_goes_on_where_the_fixed_point_cannot(self):
         stepper = stepper_for("harmonic-oscillator", SVI(5))
@@ -185,20 +174,22 @@ class TestFailures:
         calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, every=7)
         assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
 
-    def test_a_block_without_trajectories_left_stops(self, kepler: Stepper):
-        q, p = states("kepler", 8)
+    def test_a_block_without_trajectories_left_stops(self):
+        stepper = stepper_for("relativistic-particle", SVI(5))
+        q, p = states("relativistic-particle", 8)
+        nothing = {name: 0.0 for name in stepper.parameters}
         began = time.perf_counter()
-        result = kepler.integrate_ensemble(0.0 * q, p, h=0.05, steps=10**9, every=10**8)
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, every=10**8, parameters=nothing)
         assert time.perf_counter() - began < 5.0  # an empty block would need minutes
-        assert not result.ok.any()
+        assert set(result.steps) == {0}
 
     @pytest.mark.parametrize("method", [SVI(5), SCVI(3), StoermerVerlet()], ids=lambda method: method.name)
     def test_methods_fail_one_trajectory_at_a_time(self, method: Method):
         stepper = stepper_for("runaway", method)
-        result = stepper.integrate_ensemble([[-1.0], [1.0], [-0.9]], [[-0.5], [1.0], [-0.4]], h=0.05, steps=50)
+        result = stepper.integrate_ensemble([[-1.0], [1.0], [-0.9]], [[-0.5], [1.0], [-0.4]], h=0.05, steps=60)
         assert result.ok.tolist() == [True, False, True]
         last = int(result.steps[1])
-        assert 0 < last < 50
+        assert 0 < last < 60
         assert np.isfinite(result.q[: last + 1, 1]).all()
         assert np.isnan(result.q[last + 1 :, 1]).all()
 
@@ -297,9 +288,8 @@ class TestArguments:
 class TestFiles:
     @pytest.fixture
     def result(self, kepler: Stepper) -> EnsembleTrajectory:
-        q, p = states("kepler", 3)
-        q[1] = 0.0
-        return kepler.integrate_ensemble(q, p, h=0.05, steps=100, every=10, parameters={"mu": [1.0, 1.1, 1.2]})
+        values = {"mu": [1.0, 1e9, 1.2]}  # the second falls into the centre
+        return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, every=10, parameters=values)
 
     def test_npz(self, result: EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.npz")

@@ -29,6 +29,7 @@ FLOORS = """
     methods
     equations lowering c_printer
     sweeps splitting rendering building
+    shooting_sweep
     trajectory
     binding
     run ensemble

@@ -1,4 +1,4 @@
-"""Work-precision plots: time against error, one panel a problem, one line a method."""
+"""Work-precision plots: time against error, one panel a problem, one line a method through its settings in their order."""
 
 from __future__ import annotations
 
@@ -65,7 +65,6 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
 
 def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> Artist:
     points = [found.point for found in result.measurements if found.method == method and not found.failure]
-    points.sort(key=lambda point: point.seconds)
     x, y = [1e3 * point.seconds for point in points], [max(point.error, 1e-18) for point in points]
     width, marker = (2.0, "o") if method.startswith(OURS) else (1.0, "s")
     line: Artist = axes.plot(x, y, color=color, linewidth=width, marker=marker, markersize=4)[0]

@@ -1,0 +1,99 @@
+"""The fixed-point solver of the shooting-based variational method: node and quadrature points as lanes.
+
+The order of the updates inside a sweep (accelerations, then the action along the new curve, then momentum, initial
+velocity and multipliers) makes it contract twice as fast as all at once. The equations, those of ``methods/shooting.py``
+in these unknowns, stand at :class:`scvi_codegen.program.ShootingSweep`.
+"""
+
+from __future__ import annotations
+
+from sympy import S
+
+from scvi_codegen.basis import cardinal_integrals, cardinal_values, extrapolation, matrix_product, transpose
+from scvi_codegen.derivatives import gradient
+from scvi_codegen.lowering import lower_kernel
+from scvi_codegen.mechanics import (
+    accelerations,
+    euler_lagrange,
+    force,
+    mass_entries,
+    momentum,
+    multiplied_residual,
+    multipliers,
+)
+from scvi_codegen.methods.galerkin import EXTRAPOLATION_DEGREE
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.precision import mp
+from scvi_codegen.program import Kernel, ShootingSweep
+from scvi_codegen.sweeps import MOST_POINTS, pad_matrix, pad_vector
+from scvi_codegen.system import LagrangianSystem
+
+__all__ = ["shooting_sweep_of"]
+
+LARGEST_DIMENSION = 8
+"""Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
+
+
+def shooting_sweep_of(system: LagrangianSystem, method: Method) -> ShootingSweep | None:
+    """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` for other methods."""
+    if not isinstance(method, SCVI) or not method.variational or method.degree == 1:
+        return None
+    tableau, rule = method.tableau, method.rule
+    nodes, points = len(tableau.b), len(rule)
+    if max(nodes, points) > MOST_POINTS or system.dimension > LARGEST_DIMENSION:
+        return None
+    lanes = 2
+    while lanes < max(nodes, points):
+        lanes *= 2
+    position = cardinal_integrals(tableau.c, rule.abscissae, 0)
+    velocity = cardinal_values(tableau.c, rule.abscissae)
+    kernel, entries = _node_kernel(system)
+    guess = extrapolation(tableau.c, 1, min(nodes - 1, EXTRAPOLATION_DEGREE))
+    return ShootingSweep(
+        points=points,
+        nodes=nodes,
+        lanes=lanes,
+        node_abscissae=pad_vector(tableau.c, lanes, repeat=True),
+        abscissae=pad_vector(rule.abscissae, lanes, repeat=True),
+        collocation=pad_matrix(tableau.A, lanes),
+        collocation_transposed=pad_matrix(transpose(tableau.A), lanes),
+        position=pad_matrix(position, lanes),
+        position_transposed=pad_matrix(transpose(position), lanes),
+        velocity=pad_matrix(velocity, lanes),
+        velocity_transposed=pad_matrix(transpose(velocity), lanes),
+        weights=pad_vector(rule.unit_weights, lanes),
+        end=pad_vector(tableau.b, lanes, repeat=True),
+        consistency=pad_vector(matrix_product((rule.unit_weights,), velocity)[0], lanes, repeat=True),
+        mask=pad_vector((mp.one,) * nodes, lanes),
+        extrapolation=pad_matrix(guess, lanes),
+        kernel=kernel,
+        action=_action_kernel(system),
+        mass_entries=entries,
+    )
+
+
+def _node_kernel(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+    """E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
+    scalar = multiplied_residual(system)
+    slopes = gradient(scalar, (*system.coordinates, *system.velocities))
+    mass = {key: entry for key, entry in mass_entries(system).items() if key[0] >= key[1]}
+    kernel = lower_kernel(
+        "node_lanes",
+        arguments=(*system.coordinates, *system.velocities, *accelerations(system), *multipliers(system)),
+        time=system.time,
+        parameters=system.parameters,
+        values=(*euler_lagrange(system), *(slopes.get(i, S.Zero) for i in range(2 * system.dimension))),
+        slopes=tuple(mass.values()),
+    )
+    return kernel, tuple(mass)
+
+
+def _action_kernel(system: LagrangianSystem) -> Kernel:
+    return lower_kernel(
+        "action_lanes",
+        arguments=(*system.coordinates, *system.velocities),
+        time=system.time,
+        parameters=system.parameters,
+        values=(*force(system), *momentum(system)),
+    )
