@@ -2,11 +2,12 @@
 
 The pilot covers the whole span, or its first part if that is long, with steps that are halved until two runs agree well
 enough; each run is judged by the finest one. Between the two steps that enclose the wanted error a few more are run, so
-the step advised was tried, not only fitted. What the pilot does not cover is extrapolated: in time by the growth seen in
-it, in h (for methods of low order, whose step would be too small to try) by the order of the method.
+that the step advised was tried, not only fitted. What the pilot does not cover is extrapolated: in time by the growth
+seen in it, in h (for methods of low order, whose step would be too small to try) by the order of the method. Two runs
+from nearly the same state tell whether the motion is chaotic.
 
-Error means |q - q_exact| / |q| at the end of the span, Euclidean norms over all coordinates; |q| is the root mean square
-over the later half of the pilot.
+Error means |q - q_exact| / |q| at the end of the span, with Euclidean norms over all coordinates; |q| is the root mean
+square over the later half of the pilot.
 """
 
 from __future__ import annotations
@@ -35,19 +36,29 @@ Array = NDArray[np.float64]
 DEGREES = (2, 4, 6, 8, 10, 12)
 SAFETY = 2.0
 """The error aimed at is the tolerance divided by this."""
-SAMPLES = 32
-"""States of each pilot run that are compared."""
-PILOT_LENGTH = 512
+SAMPLES, SAMPLES_OF_WHOLE = 64, 16
+"""States of each pilot run that are compared; few if the pilot covers the span and shows the end itself."""
+PILOT_LENGTH = 1024
 """In steps that are right to ``LOCAL_AGREEMENT``, each by itself."""
 LOCAL_AGREEMENT = 0.01
 HEADROOM = 4.0
 """The coarsest pilot run has steps that much longer still."""
 MOST_HALVINGS = 100
-MOST_TRIALS = 5
+SHORTER = 8.0
+SHORTEST = 4.0
+"""A pilot whose errors are too large to learn from is cut to an eighth, down to so many of those steps."""
+MOST_TRIALS = 8
 ROUND_OFF_GROWTH = 1.5
 """Random changes of the energy at every step move the positions in proportion to this power of time."""
-EXPONENTIAL = 2.3
-"""Power of time above which errors are taken to grow exponentially."""
+QUADRATIC = 2.4
+"""Power of time above which an extrapolation is not certain."""
+NUDGE = 1e-9
+"""Relative change of the initial positions whose growth tells chaos."""
+LONGEST_PROBE = 8192.0
+CHAOS = 1e3
+"""Growth of that change, for each step of the scale of the motion, above which it is exponential."""
+LOST = 1e-2
+"""Relative distance of two motions that have nothing in common any more."""
 NEARLY_LINEAR = 1.35
 EARLY, LATE = 0.38, 0.76
 """Times, in parts of the pilot, at which a steadily growing error has its root mean square over the second quarter and
@@ -55,7 +66,7 @@ over the second half."""
 RESOLVED = 0.05
 """Errors above are not yet proportional to a power of the step."""
 ORDER_MARGIN = 0.3
-FEWEST_STEPS, MOST_NUMBERS = 2**13, 2**20
+FEWEST_STEPS, MOST_NUMBERS = 2**13, 2**21
 """A pilot run may always have the first number of steps, and as many as make the second with the coordinates."""
 TIMINGS, TIMING_SECONDS = 3, 0.1
 
@@ -150,7 +161,7 @@ def advise(
         stepper = compile_stepper(system, candidate, solver=solver)
         start = _Start(stepper, q, p, t, parameters, options)
         try:
-            choice = _Choice(_Pilot(start, candidate, length, target / SAFETY), target)
+            choice = _Choice(_pilot(start, candidate, length, target / SAFETY), target)
         except StateError as error:
             failure = error
             continue
@@ -201,10 +212,11 @@ class _Start:
         self.q, self.p, self.t = run.q, run.p, run.t
         self.parameters, self.options = parameters, options
 
-    def states(self, h: float, steps: int, every: int) -> tuple[Array, float, float]:
+    def states(self, h: float, steps: int, every: int, q: Array | None = None) -> tuple[Array, float, float]:
         """(n, m) positions after each ``every`` steps, iterations a step, seconds. Raises StepFailedError."""
         began = time.perf_counter()
-        run = self.stepper.start(self.q, self.p, h=h, t=self.t, parameters=self.parameters, options=self.options)
+        q = self.q if q is None else q
+        run = self.stepper.start(q, self.p, h=h, t=self.t, parameters=self.parameters, options=self.options)
         trajectory = run.record(steps, every=every)
         seconds = time.perf_counter() - began
         return trajectory.q[1:], float(trajectory.iterations.sum()) / steps, seconds
@@ -225,6 +237,31 @@ class _Start:
                 agreed = False
             h /= 2.0
         raise StateError(f"no step from {span:g} down to {h:g} gets away from the initial state")
+
+    @property
+    def most_steps(self) -> int:
+        """The length of any pilot run."""
+        return max(FEWEST_STEPS, MOST_NUMBERS // max(8, self.stepper.dimension))
+
+    def rate_of_parting(self, span: float, scale: float) -> float:
+        """Rate of the exponential growth of a small change of the initial positions, 0 if it does not grow so."""
+        length = math.copysign(min(abs(span), scale * min(LONGEST_PROBE, self.most_steps / 4.0)), span)
+        steps = math.ceil(4.0 * abs(length / scale))
+        every = max(1, steps // SAMPLES)
+        pattern = 1.0 + np.cos(1.0 + np.arange(len(self.q)))
+        nudged = self.q + NUDGE * pattern * (float(np.linalg.norm(self.q)) or 1.0) / math.sqrt(len(self.q))
+        try:
+            first, second = (self.states(length / steps, steps, every, q)[0] for q in (self.q, nudged))
+        except StepFailedError:
+            return 0.0
+        size = _rms(np.linalg.norm(first, axis=1)) or 1.0
+        apart = np.linalg.norm(second - first, axis=1) / size
+        lost = np.flatnonzero(apart > LOST)
+        end = int(lost[0]) if len(lost) else len(apart) - 1
+        units = (end + 1) * every / 4.0
+        if apart[end] < NUDGE * CHAOS * units:
+            return 0.0
+        return math.log(apart[end] / NUDGE) / (units * scale)
 
     def _agrees(self, h: float) -> bool:
         once, twice = self._end(h, 1), self._end(h / 2.0, 2)
@@ -247,7 +284,7 @@ class _Start:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Leg:
-    """One pilot run: positions (samples, m), or the word for the failure of a step."""
+    """One pilot run: positions at equal distances, the last at the end, or the word for the failure of a step."""
 
     q: Array | None
     iterations: float
@@ -256,20 +293,20 @@ class _Leg:
 
 
 class _Pilot:
-    """Pilot runs of one method; each is known by its number n of steps between two samples."""
+    """Pilot runs of one method, each known by its number n of steps."""
 
-    def __init__(self, start: _Start, method: Method, span: float, goal: float) -> None:
-        self.start, self.method, self.span, self.goal = start, method, span, goal
+    def __init__(
+        self, start: _Start, method: Method, *, span: float, length: float, scale: float, goal: float, rate: float
+    ) -> None:
+        self.start, self.method, self.span, self.length, self.goal = start, method, span, length, goal
+        self.rate = 0.0 if length == span else rate
         self.order = float(method.order or 1)
-        scale = abs(start.longest_step(span))
-        self.length = math.copysign(min(abs(span), PILOT_LENGTH * scale), span)
-        self.whole = self.length == span
-        self.samples = max(4, min(SAMPLES, int(abs(self.length) / scale / 4.0)))
+        self.whole = length == span
+        self.samples = max(4, min(SAMPLES_OF_WHOLE if self.whole else SAMPLES, int(abs(length) / scale / 4.0)))
         self.legs: dict[int, _Leg] = {}
-        self.floored = False
-        self._descend(max(1, round(abs(self.length) / (HEADROOM * scale * self.samples))))
-        self.floor = self._late(self.good[-2]) if self.floored else 0.0
-        self.power = self._power()
+        self._descend(self.samples * max(1, round(abs(length) / (HEADROOM * scale * self.samples))))
+        self.floor = self._level()
+        self.power = self._growth()
 
     @property
     def good(self) -> list[int]:
@@ -283,23 +320,23 @@ class _Pilot:
 
     @property
     def exponential(self) -> bool:
-        """Whether errors grow so fast that no power of time describes it."""
-        return self.power > EXPONENTIAL
+        """Whether the motion is chaotic, and that matters because errors are extrapolated in time."""
+        return self.rate > 0.0
 
     def step_of(self, n: float) -> float:
-        """Step size of the run with n steps between two samples."""
-        return self.length / (n * self.samples)
+        """Step size of the run with n steps."""
+        return self.length / n
 
     def run(self, n: int) -> None:
-        """One more."""
+        """One more, sampled as often as its number of steps allows."""
         try:
-            q, iterations, seconds = self.start.states(self.step_of(n), n * self.samples, n)
+            q, iterations, seconds = self.start.states(self.step_of(n), n, n // math.gcd(n, self.samples))
             self.legs[n] = _Leg(q=q, iterations=iterations, seconds=seconds)
         except StepFailedError as failure:
             self.legs[n] = _Leg(q=None, iterations=0.0, seconds=0.0, failure=failure.status)
 
     def error(self, n: int) -> float:
-        """Expected at the end of the span of the run with n steps between two samples."""
+        """Expected at the end of the span of the run with n steps."""
         if n not in self.judged:
             return math.inf
         if self.whole:
@@ -307,7 +344,7 @@ class _Pilot:
         early, late = self._windows(n)
         ratio = self.span / self.length
         if self.exponential:
-            return late * math.exp(min(self.rate(n) * abs(self.span - self.length), 600.0))
+            return self._exploded(late)
         if self.method.symplectic and self.power < NEARLY_LINEAR:
             return late * ratio / LATE
         quadratic = max(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
@@ -316,18 +353,19 @@ class _Pilot:
 
     def floor_at_end(self) -> float:
         """What rounding makes of any step, 0 if the runs do not show it."""
+        if self.exponential:
+            return self._exploded(max(self.floor, 2.0**-52))
         return self._rounded(self.floor)
 
-    def rate(self, n: int) -> float:
-        """Of the exponential growth of the errors of a run."""
-        early, late = self._windows(n)
-        return math.log(late / early) / (abs(self.length) * (LATE - EARLY))
-
-    def horizon(self) -> float:
-        """Length of time after which the finest two runs are further apart than the goal."""
-        errors = self._errors(self.judged[-1])
+    def horizon(self, n: int) -> float:
+        """Length of time for which a run meets the goal."""
+        errors = self._errors(n)
         beyond = np.flatnonzero(errors > self.goal)
-        return abs(self.length) * float(beyond[0] if len(beyond) else len(errors)) / len(errors)
+        if len(beyond):
+            return abs(self.length) * float(beyond[0]) / len(errors)
+        if not self.exponential:
+            return abs(self.length)
+        return abs(self.length) + math.log(self.goal / max(self._late(n), 2.0**-52)) / self.rate
 
     def resolved(self, n: int) -> bool:
         """Whether a run is good enough for its error to follow the order of the method."""
@@ -335,14 +373,13 @@ class _Pilot:
 
     def _descend(self, n: int) -> None:
         """Halve the steps until two runs agree, or rounding or the cost ends it."""
-        most = max(FEWEST_STEPS, MOST_NUMBERS // max(8, self.start.stepper.dimension)) // self.samples
-        while not self.floored and (n <= most or not self.legs):
+        most = self.start.most_steps
+        while n <= most or not self.legs:
             self.run(n)
             if self.legs[n].q is not None and len(self.good) > 2:
                 before, last = (self._late(k) for k in self.judged[-2:])
-                if before >= last and self._rounded(last) <= self.goal:
+                if (before >= last and self._rounded(last) <= 0.5 * self.goal) or self._level() > 0.0:
                     return
-                self.floored = before < RESOLVED and last > before * max(0.5, 2.0 ** (-0.3 * self.order))
             n *= 2
         if len(self.good) < 3:
             words = [leg.failure for leg in self.legs.values() if leg.failure] or ["too many steps"]
@@ -351,22 +388,34 @@ class _Pilot:
                 f"({words[-1]}): the motion may end in a singularity; try a shorter span"
             )
 
+    def _level(self) -> float:
+        """Error of the pilot at which shorter steps no longer help, 0 if the runs do not show it."""
+        level = 0.0
+        for n in self.judged:
+            longer = [k for k in self.judged if 1.8 * k <= n]
+            if longer and self._late(longer[-1]) < RESOLVED:
+                last, least = self._late(n), min(self._late(k) for k in self.judged if k >= n)
+                levelled = last > self._late(longer[-1]) * max(0.5, 2.0 ** (-0.3 * self.order))
+                level = max(level, last) if levelled and last <= 4.0 * least else level
+        return level
+
     def _errors(self, n: int) -> Array:
-        """(samples,) errors of a run by the finest one, relative to the size of the motion."""
+        """Errors of a run at its samples by the finest one, relative to the size of the motion."""
         finest = self.good[-1]
         reference, positions = self.legs[finest].q, self.legs[n].q
         assert reference is not None  # only good runs are asked for
         assert positions is not None
         size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=1)) or 1.0
         missing = 1.0 - (n / finest) ** self.order  # the finest is not exact either
-        errors: Array = np.linalg.norm(positions - reference, axis=1) / (size * missing)
+        common = reference[len(reference) // len(positions) - 1 :: len(reference) // len(positions)]
+        errors: Array = np.linalg.norm(positions - common, axis=1) / (size * missing)
         return errors
 
     def _late(self, n: int) -> float:
         """Error of a run at the end of the pilot."""
         errors = self._errors(n)
         late = _rms(errors[-max(1, len(errors) // 4) :])
-        return max(late, float(errors[-1])) if self.whole else late
+        return max(late / 3.0, float(errors[-1])) if self.whole else late
 
     def _windows(self, n: int) -> tuple[float, float]:
         """Errors of a run in the second quarter and in the second half of the pilot."""
@@ -378,12 +427,27 @@ class _Pilot:
         """An error of the pilot at the end of the span, if it is due to rounding."""
         return size if self.whole else size * (self.span / self.length) ** ROUND_OFF_GROWTH
 
-    def _power(self) -> float:
-        """Power of time with which errors grow, of runs that show more than rounding and are not lost."""
+    def _exploded(self, size: float) -> float:
+        return size * math.exp(min(self.rate * abs(self.span - self.length), 600.0))
+
+    def _growth(self) -> float:
+        """Power of time with which errors grow, of the finest runs that show more than rounding and are not lost."""
         telling = [n for n in self.judged if 8.0 * self.floor < self._late(n) < RESOLVED][-3:]
         windows = [self._windows(n) for n in telling]
         powers = [math.log2(late / early) for early, late in windows if early > 0.0]
         return float(np.median(powers)) if powers else 1.0
+
+
+def _pilot(start: _Start, method: Method, span: float, goal: float) -> _Pilot:
+    """Over the whole span or a part of it, short enough that errors are seen before they are as large as the motion."""
+    scale = abs(start.longest_step(span))
+    length = math.copysign(min(abs(span), PILOT_LENGTH * scale), span)
+    rate = start.rate_of_parting(span, scale)
+    while True:
+        pilot = _Pilot(start, method, span=span, length=length, scale=scale, goal=goal, rate=rate)
+        if pilot.resolved(pilot.judged[-1]) or abs(length) < SHORTER * SHORTEST * scale:
+            return pilot
+        length /= SHORTER
 
 
 class _Choice:
@@ -391,29 +455,36 @@ class _Choice:
 
     def __init__(self, pilot: _Pilot, tolerance: float) -> None:
         self.pilot, self.tolerance = pilot, tolerance
-        self.goal = max(tolerance / SAFETY, 2.0 * pilot.floor_at_end())
         self.warnings: list[str] = []
         self.tried = True
-        self.number, self.error = self._enclosed() or self._extrapolated() or self._hopeless()
-        self._warn_of_rounding()
+        possible = pilot.floor_at_end() < (tolerance if pilot.exponential else RESOLVED)
+        found = (self._enclosed() or self._extrapolated()) if possible else None
+        self.number, self.error = found or self._hopeless()
+        self._warn_of_the_end()
         h = pilot.step_of(self.number)
         self.steps = max(1, math.ceil(pilot.span / h * (1.0 - 1e-12)))
+
+    @property
+    def goal(self) -> float:
+        """The error aimed at."""
+        return max(self.tolerance / SAFETY, 2.0 * self.pilot.floor_at_end())
 
     def _enclosed(self) -> tuple[float, float] | None:
         """The longest step that meets the goal as all shorter ones do, by trying steps between."""
         pilot = self.pilot
-        for _ in range(MOST_TRIALS):
+        for trial in range(MOST_TRIALS):
             fits = self._fitting()
             if not fits:
                 return None
             best = fits[0]
             coarser = [n for n in pilot.legs if n < best]
-            if not coarser or pilot.error(best) > self.goal / 3.0 or best <= 1.05 * max(coarser):
+            if not coarser or pilot.error(best) > self.goal / 3.0 or best <= 1.03 * max(coarser):
                 break
-            between = self._between(max(coarser), best)
-            number = min(math.ceil(between), best - 1)
+            between = self._between(max(coarser), best) if trial % 2 == 0 else math.sqrt(max(coarser) * best)
+            unit = 1 if pilot.whole else pilot.samples
+            number = min(math.ceil(between / unit) * unit, best - unit)
             if number <= max(coarser):
-                return (between, min(self.goal, pilot.error(max(coarser))))
+                break
             pilot.run(number)
         fits = self._fitting()
         return (float(fits[0]), pilot.error(fits[0])) if fits else None
@@ -440,7 +511,7 @@ class _Choice:
         pilot = self.pilot
         coarse, fine = pilot.judged[-2:]
         errors = pilot.error(coarse), pilot.error(fine)
-        if pilot.exponential or not pilot.resolved(fine) or not 0.0 < errors[1] < errors[0]:
+        if not pilot.resolved(fine) or not 0.0 < errors[1] < errors[0]:
             return None
         order = math.log(errors[0] / errors[1]) / math.log(fine / coarse)
         if abs(order - pilot.order) > ORDER_MARGIN * pilot.order:
@@ -449,25 +520,32 @@ class _Choice:
         return (fine * (errors[1] / self.goal) ** (1.0 / pilot.order), self.goal)
 
     def _hopeless(self) -> tuple[float, float]:
-        """No step meets the goal: the longest that is about as good as any."""
+        """No step meets the goal: the longest that keeps to it for about as long as any."""
         pilot = self.pilot
-        least = min(pilot.error(n) for n in pilot.judged)
-        number = next(n for n in pilot.judged if pilot.error(n) <= 4.0 * least)
-        if pilot.exponential or pilot.whole:
+        horizons = {n: pilot.horizon(n) for n in pilot.judged}
+        longest = max(horizons.values())
+        number = next(n for n in pilot.judged if horizons[n] >= 0.9 * longest > 0.0 or n == pilot.judged[-1])
+        if pilot.exponential and pilot.floor_at_end() > self.tolerance:
             self.warnings.append(
-                f"the tolerance cannot be met: nearby motions part too fast. Runs with different steps agree to "
-                f"{pilot.goal:.1g} for about {pilot.horizon():.3g} units of time only; the motion may be chaotic"
+                f"the tolerance cannot be met: nearby motions part by a factor of 10 every "
+                f"{math.log(10.0) / pilot.rate:.3g} units of time (chaos), so rounding alone spoils it"
             )
-        else:
+        elif pilot.floor_at_end() < self.tolerance / SAFETY:
             self.warnings.append(
                 f"the tolerance cannot be promised: the errors of runs with steps down to "
-                f"{pilot.step_of(pilot.good[-1]):.3g} do not follow the order of the method yet"
+                f"{abs(pilot.step_of(pilot.good[-1])):.3g} do not follow the order of the method yet"
             )
-        return float(number), min(1.0, pilot.error(number))
+        if horizons[number] < abs(pilot.span):
+            self.warnings.append(f"the step given keeps to it for about {horizons[number]:.3g} units of time")
+        return float(number), min(1.0, max(pilot.error(number), pilot.floor_at_end()))
 
-    def _warn_of_rounding(self) -> None:
-        floor = self.pilot.floor_at_end()
-        if floor > self.tolerance / SAFETY:
+    def _warn_of_the_end(self) -> None:
+        pilot, floor = self.pilot, self.pilot.floor_at_end()
+        if not pilot.whole and not pilot.exponential and pilot.power > QUADRATIC:
+            self.warnings.append(
+                f"errors grew like t^{pilot.power:.1f} in the pilot runs, which cannot be relied upon to go on so"
+            )
+        if floor > self.tolerance / SAFETY and not pilot.exponential:
             self.warnings.append(f"rounding alone leaves an error of about {floor:.1g} at the end, whatever the step")
 
     def cost(self) -> float:

@@ -2,8 +2,8 @@
 
 Each block runs in C without Python's lock, so threads share the work. One trajectory cannot spoil another: a lane whose
 step fails keeps its last good state and is continued alone by the single integrator (which has Newton's iteration to
-fall back on); if that fails too, its later states are NaN and its status says so. Results are the same, bit for bit, for
-any number of threads.
+fall back on); if that fails too, its later states are NaN and its status says so. Results are the same, bit for bit,
+for any number of threads.
 """
 
 from __future__ import annotations
@@ -68,12 +68,13 @@ class EnsembleTrajectory:
     stepper: Stepper = field(repr=False)
 
     def __len__(self) -> int:
-        return self.q.shape[1]
+        return len(self.status)
 
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(k,) which trajectories reached the end."""
-        return self.status == OK
+        reached: NDArray[np.bool_] = self.status == OK
+        return reached
 
     def energy(self) -> Array:
         """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
@@ -106,8 +107,8 @@ class EnsembleTrajectory:
             raise StateError(f"an ensemble is saved as .npz or .csv, not as {str(path)!r}")
 
     def _reached(self, j: int) -> NDArray[np.bool_]:
-        reached: NDArray[np.bool_] = np.isfinite(self.q[:, j]).all(axis=1)
-        return reached
+        """(n,) which states of a trajectory there are."""
+        return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
 
     def _write_npz(self, file: IO[bytes]) -> None:
         np.savez(
@@ -234,8 +235,9 @@ class Ensemble:
     def result(self) -> EnsembleTrajectory:
         """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
         unfinished = (self.status == OK) & (self.done < self.steps)
+        number = self.every * np.arange(len(self.q), dtype=np.float64)
         return EnsembleTrajectory(
-            t=self.t0 + self.every * np.arange(len(self.q)) * self.h,
+            t=self.t0 + number * self.h,
             q=self.q,
             p=self.p,
             status=np.where(unfinished, INTERRUPTED, self.status),
@@ -302,7 +304,7 @@ class _LaneBlock:
                 self._leave(lane, begin)
 
     def _leave(self, lane: int, begin: int) -> None:
-        """What the block stored of a resting lane in a call that began after ``begin`` steps gives way to its own run."""
+        """What a call that began after ``begin`` steps stored of a resting lane gives way to a run of its own."""
         work, j = self.work, self.first + lane
         if lane not in self.left:
             step = int(self.memory.last_step[lane])

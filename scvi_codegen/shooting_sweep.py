@@ -1,8 +1,8 @@
 """The fixed-point solver of the shooting-based variational method: node and quadrature points as lanes.
 
 The order of the updates inside a sweep (accelerations, then the action along the new curve, then momentum, initial
-velocity and multipliers) makes it contract twice as fast as all at once. The equations, those of ``methods/shooting.py``
-in these unknowns, stand at :class:`scvi_codegen.program.ShootingSweep`.
+velocity and multipliers) makes it contract twice as fast as all at once. The equations, those of
+``methods/shooting.py`` in these unknowns, stand at :class:`scvi_codegen.program.ShootingSweep`.
 """
 
 from __future__ import annotations

@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import gc
 import pickle
+import re
+import shutil
+import signal
+import subprocess
+import sys
 import threading
 import time
 import tracemalloc
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 from conftest import sample_named, stepper_for
 
 from scvi_codegen.binding import SolverOptions
+from scvi_codegen.cli import main
 from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory, integrate_ensemble
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.ensemble_file import load_ensemble
+from scvi_codegen.errors import ModelFileError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVerlet
+from scvi_codegen.model_file import Model
+from scvi_codegen.problems import problem
 from scvi_codegen.stepper import Stepper
 
 KINDS = {
@@ -177,7 +189,7 @@ class TestFailures:
     def test_a_block_without_trajectories_left_stops(self):
         stepper = stepper_for("relativistic-particle", SVI(5))
         q, p = states("relativistic-particle", 8)
-        nothing = {name: 0.0 for name in stepper.parameters}
+        nothing = dict.fromkeys(stepper.parameters, 0.0)
         began = time.perf_counter()
         result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, every=10**8, parameters=nothing)
         assert time.perf_counter() - began < 5.0  # an empty block would need minutes
@@ -312,6 +324,165 @@ class TestFiles:
     def test_other_suffixes(self, result: EnsembleTrajectory, tmp_path):
         with pytest.raises(StateError, match=r"saved as \.npz or \.csv"):
             result.save(tmp_path / "runs.txt")
+
+
+GRID = """
+[grid]
+q1 = { from = 0.8, to = 1.2, count = 3 }
+q2_dot = [0.9, 1.0]
+mu = 1.5
+"""
+
+
+def model(**changes: object) -> Model:
+    entry = Model.from_problem(problem("kepler"), SVI(4))
+    return replace(entry, h=0.1, span=None, steps=50, every=10, **changes)  # type: ignore[arg-type]
+
+
+class TestEnsembleFiles:
+    def test_a_grid_is_a_product_and_the_model_gives_the_rest(self, tmp_path):
+        (tmp_path / "grid.toml").write_text(GRID)
+        states = load_ensemble(tmp_path / "grid.toml", model())
+        assert len(states) == 6
+        assert states.q[:, 0].tolist() == [0.8, 0.8, 1.0, 1.0, 1.2, 1.2]
+        assert set(states.q[:, 1]) == {model().q[1]}
+        assert states.parameters.tolist() == [[1.5]] * 6
+        p = states.momenta(stepper_for("kepler", SVI(4)))
+        assert p[:, 1].tolist() == [0.9, 1.0] * 3
+        assert set(p[:, 0]) == {model().velocity[0]}  # type: ignore[index]
+
+    def test_a_table_has_a_line_a_trajectory(self, tmp_path):
+        (tmp_path / "table.csv").write_text("mu, p_q1,q2\n\n1.0,0.5,0.1\n 2e0 ,-0.5,0.2\n")
+        states = load_ensemble(tmp_path / "table.csv", model())
+        assert states.parameters[:, 0].tolist() == [1.0, 2.0]
+        assert states.q.tolist() == [[model().q[0], 0.1], [model().q[0], 0.2]]
+        stepper = stepper_for("kepler", SVI(4))
+        assert states.momenta(stepper).tolist() == [
+            [0.5, model().momenta(stepper)[1]],
+            [-0.5, model().momenta(stepper)[1]],
+        ]
+
+    def test_velocities_are_transformed_with_the_parameters_of_their_own(self, tmp_path):
+        (tmp_path / "table.csv").write_text("q,q_dot,m\n0.1,0.5,1.0\n0.1,0.5,3.0\n")
+        pendulum = Model.from_problem(problem("planar-pendulum"))
+        states = load_ensemble(tmp_path / "table.csv", pendulum)
+        p = states.momenta(stepper_for("planar-pendulum", SVI(4)))
+        assert p[1, 0] == 3.0 * p[0, 0]
+
+    def test_velocities_over_a_model_with_momenta_and_the_reverse(self, tmp_path):
+        stepper = stepper_for("kepler", SVI(4))
+        with_momenta = model(p=(0.3, 0.7), velocity=None)
+        (tmp_path / "a.csv").write_text("q1_dot\n0.1\n")
+        assert load_ensemble(tmp_path / "a.csv", with_momenta).momenta(stepper)[0].tolist() == [0.1, 0.7]
+        (tmp_path / "b.csv").write_text("q1\n1.1\n")
+        assert load_ensemble(tmp_path / "b.csv", with_momenta).momenta(stepper)[0].tolist() == [0.3, 0.7]
+
+    @pytest.mark.parametrize(
+        ("name", "text", "message"),
+        [
+            ("a.txt", "", "a grid in a .toml file or a table in a .csv file"),
+            ("missing.toml", None, "cannot be read: No such file"),
+            ("a.toml", "grid =", "this is not TOML"),
+            ("a.toml", "[mesh]\nq1 = 1", r"must have one section, \[grid\]"),
+            ("a.toml", "[grid]", r"must have one section, \[grid\]"),
+            (
+                "a.toml",
+                "[grid]\nq3 = 1",
+                "'q3' is no coordinate, velocity, momentum or parameter of the system; known: q1",
+            ),
+            ("a.toml", "[grid]\nq1 = []", r"\[grid\] q1 is an empty list"),
+            ("a.toml", "[grid]\nq1 = ['x']", r"\[grid\] q1 must be a finite number, not 'x'"),
+            ("a.toml", "[grid]\nq1 = nan", r"\[grid\] q1 must be a finite number"),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2}", "must have from, to and count, not from, to"),
+            ("a.toml", "[grid]\nq1 = {from = 1, to = 2, count = 0}", "count must be a whole number of at least 1"),
+            ("a.toml", "[grid]\nq1_dot = 1\np_q2 = 1", "both velocities and momenta"),
+            ("a.csv", "q1,q2\n", "a header of names and at least one line of numbers"),
+            ("a.csv", "q1,q1\n1,2", "the column 'q1' is there twice"),
+            ("a.csv", "q1,q2\n1,2\n3", "line 3 has 1 numbers for 2 names"),
+            ("a.csv", "q1,q2\n1,x", "line 2, q2: 'x' is not a number"),
+            ("a.csv", "q1\ninf", "line 2, q1: inf is not a finite number"),
+        ],
+    )
+    def test_faults_are_named(self, name: str, text: str | None, message: str, tmp_path):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        with pytest.raises(ModelFileError, match=message) as error:
+            load_ensemble(tmp_path / name, model())
+        assert str(error.value).startswith(str(tmp_path / name))
+
+
+class TestCommandLine:
+    @pytest.fixture(autouse=True)
+    def elsewhere(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        Path("grid.toml").write_text(GRID)
+
+    def invoke(self, words: str) -> Result:
+        return CliRunner().invoke(main, ["run", *words.split()])
+
+    @pytest.mark.parametrize("suffix", ["npz", "csv"])
+    def test_sums_up_and_writes(self, suffix: str):
+        result = self.invoke(
+            f"kepler --degree 4 --step 0.1 --steps 50 --every 10 --ensemble grid.toml -o runs.{suffix}"
+        )
+        assert result.exit_code == 0, result.output
+        assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states kept of each" in result.stdout
+        assert "\n6 ok\n" in result.stdout
+        assert float(re.search(r"relative energy error: (\S+) at most, of trajectory \d", result.stdout)[1]) < 1e-3  # type: ignore[index]
+        assert f"wrote runs.{suffix}" in result.stdout
+        if suffix == "npz":
+            with np.load("runs.npz") as file:
+                assert file["q"].shape == (6, 6, 2)
+        else:
+            assert len(Path("runs.csv").read_text().splitlines()) == 37
+
+    def test_failures_are_counted_and_the_rest_is_kept(self):
+        Path("table.csv").write_text("mu\n1\n1e9\n1.1\n")
+        result = self.invoke("kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv -o runs.npz")
+        assert result.exit_code == 0, result.output
+        assert re.search(r"^2 ok, 1 not \w+$", result.stdout, re.MULTILINE)
+        assert re.search(r"^  trajectory 1: step \d+ at t = \S+ failed: not \w+$", result.stdout, re.MULTILINE)
+        assert Path("runs.npz").exists()
+
+    def test_nothing_but_failures_is_a_failure(self):
+        Path("table.csv").write_text("mu\n1e9\n")
+        result = self.invoke("kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv")
+        assert result.exit_code == 1
+        assert "every trajectory failed" in result.stderr
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            ("kepler --ensemble none.toml", "none.toml cannot be read"),
+            ("kepler --ensemble grid.toml --plot a.png", "--plot is for one trajectory"),
+            ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is for one trajectory"),
+            ("kepler --ensemble grid.toml -o runs.txt", "written as .npz or .csv"),
+            ("planar-pendulum --ensemble grid.toml", "'q1' is no coordinate"),
+        ],
+    )
+    def test_mistakes_are_usage_errors(self, words: str, message: str):
+        result = self.invoke(words)
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+
+    def test_an_interruption_keeps_what_was_done(self):
+        command = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))
+        if command is None:
+            pytest.skip("the command is not installed beside this Python")
+        self.invoke("kepler --degree 4 --steps 1 --ensemble grid.toml")  # compiled and in the cache
+        words = (
+            "run kepler --degree 4 --step 0.05 --steps 10000000000 --every 1000000000 --ensemble grid.toml -o runs.npz"
+        )
+        process = subprocess.Popen([command, *words.split()], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(4.0)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=20)
+        assert process.returncode == 130, stderr
+        assert "0 ok, 6 interrupted" in stdout
+        assert "the states computed were kept: runs.npz" in stderr
+        with np.load("runs.npz") as file:
+            assert set(file["status"]) == {"interrupted"}
+            assert file["steps"].min() > 0
 
 
 def test_a_stepper_from_a_pickle_has_its_lanes(kepler: Stepper):

@@ -54,6 +54,11 @@ class Measurement:
         """Its place on the work-precision curve."""
         return Point(seconds=self.seconds, error=self.error)
 
+    @property
+    def fastest_point(self) -> Point:
+        """The same with its shortest time."""
+        return Point(seconds=self.fastest, error=self.error)
+
 
 @dataclass(slots=True)
 class _Record:

@@ -14,6 +14,7 @@ from scvi_codegen import building
 from scvi_codegen.benchmark.cases import Array, Case
 from scvi_codegen.benchmark.contenders import OURS, Contender
 from scvi_codegen.compiler import generate_source
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.stepper import Stepper
@@ -25,6 +26,9 @@ Advice = Callable[[Case, Method], float]
 
 RUNGS = 11
 RATIO = 2.0 ** (1.0 / 3.0)
+PILOT_STEPS = 2
+SLOWEST = 10.0
+"""Seconds for a trajectory beyond which a step is not measured: the stages of a large system then go to Newton."""
 
 
 def ladder(middle: float, rungs: int = RUNGS) -> list[float]:
@@ -86,8 +90,23 @@ def _cache_in(folder: str) -> Iterator[None]:
             os.environ[building.CACHE_VARIABLE] = before
 
 
+def _expected_seconds(stepper: Stepper, case: Case, momenta: Array, count: int) -> float:
+    """For a trajectory, from its first steps; 0 if they fail, since then it costs nothing to see them fail again."""
+    run = stepper.start(case.q[0], momenta[0], h=case.span / count)
+    began = time.thread_time()
+    try:
+        run.record(min(PILOT_STEPS, count))
+    except StepFailedError:
+        return 0.0
+    return (time.thread_time() - began) * max(1.0, count / PILOT_STEPS)
+
+
 def _preparation(stepper: Stepper, case: Case, momenta: Array, count: int) -> Callable[[int], Callable[[], Array]]:
+    expected = _expected_seconds(stepper, case, momenta, count)
+
     def prepare(index: int) -> Callable[[], Array]:
+        if expected > SLOWEST:
+            raise StateError(f"not measured, since it would take about {expected:.0f} s")
         run = stepper.start(case.q[index], momenta[index], h=case.span / count)
 
         def integrate() -> Array:

@@ -1,4 +1,4 @@
-"""Work-precision plots: time against error, one panel a problem, one line a method through its settings in their order."""
+"""Work-precision plots: time against error, one panel a problem, one line a method through its settings in order."""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ import click
 from scvi_codegen.cli.choices import Choices, model_arguments, read_model
 
 if TYPE_CHECKING:
+    from scvi_codegen.binding import SolverOptions
     from scvi_codegen.cli.running import Outcome
+    from scvi_codegen.model_file import Model
 
 __all__ = ["main"]
 
@@ -89,19 +91,30 @@ def main() -> None:
 
 @main.command(short_help="Integrate MODEL and sum up what was conserved.")
 @model_arguments
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory, .npz or .csv.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectories, .npz or .csv.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Picture, .png or .svg (needs matplotlib).")
+@click.option(
+    "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
+)
+@click.option(
+    "--tolerance",
+    type=float,
+    metavar="X",
+    help="Choose the step for this error of the positions at the end, relative to their size.",
+)
 @SOLVER_OPTION
 @click.option(
-    "--tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
+    "--solver-tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
 )
 @click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
 def run(
     model_name: str,
     output: str | None,
     plot: str | None,
-    solver: str,
+    ensemble: str | None,
     tolerance: float | None,
+    solver: str,
+    solver_tolerance: float | None,
     max_iterations: int | None,
     **choices: Any,
 ) -> None:
@@ -110,19 +123,41 @@ def run(
     A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
     asked for.
 
+    With --tolerance the step is chosen by short pilot runs, for the error wanted at the end; advice and evidence are
+    printed. With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
+
+    \b
+      [grid]
+      q1 = { from = 0.5, to = 1.5, count = 11 }
+      q2_dot = [0.9, 1.0, 1.1]
+      mu = 2.0
+
+    A table is a CSV file with the names in its first line. Names are those of coordinates, velocities (q1_dot) or
+    momenta (p_q1), and parameters; MODEL gives the others. An .npz file has arrays q and p of shape (states,
+    trajectories, coordinates); a .csv file has a line a state.
+
     \b
     Examples:
       scvi-codegen run outer-solar-system --plot orbits.png
       scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
+      scvi-codegen run kepler --tolerance 1e-9
     """  # noqa: D301  (click wants the character \b)
     _check_outputs(output, plot)
+    _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance)
     model = read_model(model_name, Choices(**choices))
     from scvi_codegen.binding import SolverOptions
     from scvi_codegen.cli.running import integrate_model, summary
 
-    given = {"tolerance": tolerance, "max_iterations": max_iterations}
+    given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen)
+    if ensemble is not None:
+        _run_ensemble(model, ensemble, output, solver, options)
+        return
+    if tolerance is not None:
+        from scvi_codegen.cli.advising import advised_model
+
+        model = advised_model(model, tolerance, solver=solver, options=options)
     outcome = integrate_model(model, solver=solver, options=options)
     click.echo(summary(model, outcome))
     written = _write_outputs(outcome, output, plot)
@@ -275,6 +310,36 @@ def _check_outputs(output: str | None, plot: str | None) -> None:
         from scvi_codegen.plotting import check_plot_path
 
         check_plot_path(plot)
+
+
+def _check_combination(
+    choices: dict[str, Any], *, plot: str | None, ensemble: str | None, tolerance: float | None
+) -> None:
+    if tolerance is not None:
+        for name in ("step", "steps"):
+            if choices[name] is not None:
+                raise click.UsageError(f"--tolerance chooses the step: leave out --{name} (--span is the length)")
+    for name, value in (("plot", plot), ("tolerance", tolerance)):
+        if ensemble is not None and value is not None:
+            raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
+
+
+def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions) -> None:
+    from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
+    from scvi_codegen.ensemble_file import load_ensemble
+
+    outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
+    click.echo(ensemble_summary(model, outcome))
+    kept = "the states computed were not written to a file (-o)"
+    if output is not None:
+        outcome.result.save(output)
+        kept = f"the states computed were kept: {output}"
+    if outcome.interrupted:
+        raise _Failure(f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{kept}", INTERRUPTED)
+    if not outcome.result.ok.any():
+        raise _Failure(f"every trajectory failed\n{kept}", FAILURE)
+    if output is not None:
+        click.echo(f"wrote {output}")
 
 
 def _check_writable(path: Path, hint: str) -> None:

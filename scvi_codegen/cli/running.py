@@ -22,7 +22,7 @@ from scvi_codegen.model_file import Model
 from scvi_codegen.run import Run
 from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["Outcome", "integrate_model", "summary"]
+__all__ = ["Outcome", "counted", "duration", "integrate_model", "interruptions", "progress_bar", "summary"]
 
 PORTION_SECONDS = 0.2
 SHOWN_COORDINATES = 6
@@ -61,7 +61,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
     preparation, seconds = time.perf_counter() - began, 0.0
     pieces, failure = [run.record(0, every=model.every)], None
-    with _interruptions() as caught, _progress(model.step_count) as advance:
+    with interruptions() as caught, progress_bar(model.step_count) as advance:
         portion = 1
         while run.steps < model.step_count and not caught and failure is None:
             before, started = run.steps, time.perf_counter()
@@ -94,8 +94,8 @@ def summary(model: Model, outcome: Outcome) -> str:
         model.system.name,
         f"{method.title}; {order}, {'' if method.symplectic else 'not '}symplectic, "
         f"{'' if method.symmetric else 'not '}symmetric",
-        f"{_counted(run.steps, 'step')} of {model.h:g} from t = {model.t:g} to t = {run.t:g}; "
-        f"{_counted(len(trajectory), 'state')} kept",
+        f"{counted(run.steps, 'step')} of {model.h:g} from t = {model.t:g} to t = {run.t:g}; "
+        f"{counted(len(trajectory), 'state')} kept",
     ]
     if run.steps:
         lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")
@@ -104,12 +104,13 @@ def summary(model: Model, outcome: Outcome) -> str:
     return "\n".join([*lines, *_final_state(model, run)])
 
 
-def _counted(count: int, what: str) -> str:
+def counted(count: int, what: str) -> str:
+    """A number with its noun, in the plural if need be."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _speed(outcome: Outcome, every: int) -> str:
-    text = f"{outcome.seconds:.3g} s, {_duration(outcome.seconds / outcome.run.steps)} a step"
+    text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
     counted = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
     if not counted:
         return text
@@ -135,7 +136,8 @@ def _final_state(model: Model, run: Run) -> Iterator[str]:
         yield f"  and {len(names) - SHOWN_COORDINATES} coordinates more"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time in a unit that suits it."""
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if seconds >= scale:
             return f"{seconds / scale:.3g} {unit}"
@@ -155,7 +157,7 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
 
 
 @contextlib.contextmanager
-def _interruptions() -> Iterator[list[int]]:
+def interruptions() -> Iterator[list[int]]:
     """Note the first SIGINT or SIGTERM instead of dying of it; a second one acts as always."""
     caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -178,7 +180,7 @@ def _interruptions() -> Iterator[list[int]]:
 
 
 @contextlib.contextmanager
-def _progress(steps: int) -> Iterator[Callable[[int], None]]:
+def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
     """A bar on stderr if that is a terminal; the function given adds steps done."""
     if not sys.stderr.isatty() or steps == 0:
         yield lambda count: None

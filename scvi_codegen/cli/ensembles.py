@@ -1,0 +1,136 @@
+"""``scvi-codegen run --ensemble``: all trajectories of a grid or a table, summed up together."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from scvi_codegen.binding import SolverOptions
+from scvi_codegen.cli.running import counted, duration, interruptions, progress_bar
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory
+from scvi_codegen.ensemble_file import EnsembleStates
+from scvi_codegen.model_file import Model
+
+__all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
+
+SHOWN_FAILURES = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnsembleOutcome:
+    """What came of an ensemble.
+
+    Attributes:
+        result: the states kept, of each trajectory as far as it went.
+        preparation: seconds to derive, compile and load the stepper.
+        seconds: spent in steps.
+        interrupted: whether the user or the system stopped it.
+    """
+
+    result: EnsembleTrajectory
+    preparation: float
+    seconds: float
+    interrupted: bool
+
+
+class _Stop(Exception):  # noqa: N818  (a wish, not an error)
+    """The user wants no more."""
+
+
+def integrate_states(
+    states: EnsembleStates, *, solver: str = "auto", options: SolverOptions | None = None
+) -> EnsembleOutcome:
+    """Run the model of the states from each of them, with a progress bar, as far as it goes.
+
+    Raises:
+        BuildError: without a C compiler.
+        MethodError: for a solver that the method does not have.
+        StateError: if a state is unfit.
+    """
+    model, began = states.model, time.perf_counter()
+    stepper = compile_stepper(model.system, model.method, solver=solver)
+    work = Ensemble(
+        stepper,
+        states.q,
+        states.momenta(stepper),
+        h=model.h,
+        steps=model.step_count,
+        every=model.every,
+        t=model.t,
+        parameters=states.parameters,
+        options=options,
+    )
+    started, shown, interrupted = time.perf_counter(), 0, False
+    with interruptions() as caught, progress_bar(model.step_count) as advance:
+
+        def look(done: int) -> None:
+            nonlocal shown
+            advance(done - shown)
+            shown = done
+            if caught and done < model.step_count:
+                raise _Stop
+
+        try:
+            work.run(progress=look)
+        except _Stop:
+            interrupted = True
+    return EnsembleOutcome(
+        result=work.result(),
+        preparation=started - began,
+        seconds=time.perf_counter() - started,
+        interrupted=interrupted,
+    )
+
+
+def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
+    """The ensemble in a few lines."""
+    result = outcome.result
+    steps = int(result.steps.sum())
+    lines = [
+        model.system.name,
+        model.method.title,
+        f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
+        f"{counted(model.step_count, 'step')} of {model.h:g} from t = {model.t:g}; "
+        f"{counted(len(result.t), 'state')} kept of each",
+        f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} a step of a trajectory; "
+        f"prepared in {outcome.preparation:.2f} s",
+        ", ".join(f"{number} {status}" for status, number in _statuses(result)),
+    ]
+    return "\n".join([*lines, *_failures(result), _energy_report(model, result)])
+
+
+def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
+    """Numbers of trajectories, those that reached the end first."""
+    counts = Counter(result.status.tolist())
+    return [("ok", counts.pop("ok", 0)), *sorted(counts.items())]
+
+
+def _failures(result: EnsembleTrajectory) -> Iterator[str]:
+    lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
+    for j in lost[:SHOWN_FAILURES]:
+        t = result.t[0] + result.steps[j] * result.h
+        yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {result.status[j]}"
+    if len(lost) > SHOWN_FAILURES:
+        yield f"  and {len(lost) - SHOWN_FAILURES} more"
+
+
+def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
+    """The largest change of the energy of any trajectory."""
+    energies = result.energy()
+    sizes = np.abs(energies[0])
+    relative = bool((sizes > 0.0).all())
+    changes = np.abs(energies - energies[0]) / (sizes if relative else 1.0)
+    if not np.isfinite(changes).any():
+        return "energy: no state has one"
+    state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
+    if model.system.time in model.system.lagrangian.free_symbols:
+        return (
+            f"energy: L depends on time, it changed by {abs(energies[state, worst] - energies[0, worst]):.3g} at most"
+        )
+    what = "relative energy error" if relative else "energy error"
+    return f"{what}: {changes[state, worst]:.2e} at most, of trajectory {worst}"
