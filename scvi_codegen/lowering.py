@@ -22,6 +22,7 @@ from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics import momentum
 from scvi_codegen.methods.method import Method
+from scvi_codegen.ordering import bandwidth, places
 from scvi_codegen.precision import Matrix, Vector
 from scvi_codegen.program import (
     Constant,
@@ -281,6 +282,9 @@ def lower(
     state = (*system.coordinates, *system.velocities)
     legendre = lower_kernel("legendre", arguments=state, values=momenta, slopes=tuple(mass.values()), **common)
     lagrangian = lower_kernel("lagrangian", arguments=state, values=(system.lagrangian,), **common)
+    families = tuple(_family(system, family) for family in stages.families)
+    met = [*mass, *_meetings(families if newton else ())]
+    order = places(met, system.dimension)
     return Program(
         prefix=prefix,
         title=_comment(f"{system.name}: {method.title}"),
@@ -289,7 +293,9 @@ def lower(
         parameter_names=tuple(parameter.name for parameter in system.parameters),
         parameter_defaults=system.defaults,
         blocks=len(stages.blocks),
-        families=tuple(_family(system, family) for family in stages.families),
+        families=families,
+        places=order,
+        bandwidth=bandwidth(met, order),
         momentum_rows=lower_vector(tuple(row.momentum for row in stages.rows)),
         end_position=lower_vector(stages.end_position.entries[0][1:]),
         straight=tuple(int(block.straight[1]) for block in stages.blocks),
@@ -302,6 +308,11 @@ def lower(
         splitting=splitting,
         newton=newton,
     )
+
+
+def _meetings(families: Sequence[Family]) -> list[tuple[int, int]]:
+    """Pairs of coordinates with a non-zero slope."""
+    return [pair for family in families for block in family.blocks for pair in block.entries]
 
 
 def _comment(text: str) -> str:

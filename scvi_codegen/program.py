@@ -27,6 +27,10 @@ __all__ = [
     "Sweep",
 ]
 
+WORTH_REMEMBERING = 32
+"""Unknowns from which on the factors of the Newton matrix are kept from step to step: with 16 (Kepler's problem, degree
+8) new ones are as quick as the iterations more that old ones need; with 34 they take twice the time, with 144 ten times."""
+
 
 @dataclass(frozen=True, slots=True)
 class Constant:
@@ -166,9 +170,9 @@ class Family:
         return self.uses_time or any(powers)
 
     @property
-    def weighted(self) -> bool:
-        """Whether any weight differs from 1."""
-        return any(weight != 1.0 for weight in self.weights)
+    def scratch(self) -> int:
+        """Arguments, values and slopes at all points."""
+        return self.points * (self.slope.arguments + len(self.slope.results))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -342,6 +346,8 @@ class Program:
         coordinate_names, parameter_names, parameter_defaults: for people and for Python.
         blocks: number of unknown blocks B; the unknowns are B m numbers.
         families: points and kernels.
+        places: (m,) the place of each coordinate in matrices, chosen so that those that meet are near each other.
+        bandwidth: how many places they are apart at most.
         momentum_rows: (B,) coefficient of p0 in each row.
         end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
         straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is zero.
@@ -363,6 +369,8 @@ class Program:
     parameter_defaults: tuple[float, ...]
     blocks: int
     families: tuple[Family, ...]
+    places: tuple[int, ...]
+    bandwidth: int
     momentum_rows: tuple[float, ...]
     end_position: tuple[float, ...]
     straight: tuple[int, ...]
@@ -394,8 +402,25 @@ class Program:
     @property
     def memory(self) -> int:
         """Numbers a run remembers of its last step to guess the next."""
+        if self.splitting:
+            return self.dimension
         points = self.sweep.memory(self.dimension) if self.sweep else 0
-        return max(points, self.unknowns if self.newton else 0, self.dimension if self.splitting else 0)
+        return max(points, self.unknowns + self.point if self.newton else 0)
+
+    @property
+    def remembers_factors(self) -> bool:
+        """Whether Newton's iteration begins a step with the factors of the one before: not if new ones cost little."""
+        return self.newton and not self.splitting and self.unknowns >= WORTH_REMEMBERING
+
+    @property
+    def point(self) -> int:
+        """Numbers that say where the factors were made: time, q0 with what rounding cut off, unknowns."""
+        return 1 + 2 * self.dimension + self.unknowns if self.remembers_factors else 0
+
+    def matrix_size(self, blocks: int) -> int:
+        """Numbers of a matrix with ``blocks`` unknowns a coordinate: its band with room for fill-in, or all of it."""
+        rows, reach = self.dimension * blocks, (self.bandwidth + 1) * blocks - 1
+        return rows * min(rows, 3 * reach + 1)
 
     def __str__(self) -> str:
         """Readable text of the whole program."""

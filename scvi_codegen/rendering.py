@@ -30,7 +30,8 @@ DEFAULT_TOLERANCE = 2.0**-52
 
 MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
-KEEP_FACTORS = 1e-5
+KEEP_CHANGE = 1e-2
+KEEP_RATE = 0.1
 ARGUMENT_NAMES = {1: "the argument alone", 2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
 POINT_SOURCES = ("u", "t")
 TRAJECTORY_SOURCES = ("u", "parameters")
@@ -106,20 +107,18 @@ def render_example(interface: Interface, start: ExampleRun) -> dict[str, str]:
 
 
 def workspace_size(program: Program) -> int:
-    """Doubles of workspace: scratch and memory; for Newton also memory, unknowns, Jacobian, update, pivots and rows."""
+    """Doubles of workspace: scratch, memory, and for Newton unknowns, point, update, pivots, rows and Jacobian."""
     if not program.newton:
         return scratch_size(program) + program.memory
-    size = program.unknowns + (program.dimension if program.action else 0)
     rows = program.unknowns + program.dimension
-    return scratch_size(program) + 2 * program.memory + program.unknowns + size * size + 2 * size + rows
+    jacobian = program.matrix_size(program.blocks + (1 if program.action else 0))
+    return scratch_size(program) + program.memory + program.unknowns + program.point + 3 * rows + jacobian
 
 
 def scratch_size(program: Program) -> int:
-    """Doubles for the slopes of one kernel, or for the mass matrix with its slopes."""
-    mass = program.dimension**2 + len(program.mass_entries)
-    if not program.newton:
-        return mass
-    return max(mass, *(len(family.slope.results) - family.slope.values for family in program.families))
+    """Doubles for the kernels of one family, or for the mass matrix with its slopes."""
+    mass = program.matrix_size(1) + len(program.mass_entries)
+    return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
 
 
 def _context(program: Program) -> dict[str, object]:
@@ -135,7 +134,8 @@ def _context(program: Program) -> dict[str, object]:
         "tolerance": DEFAULT_TOLERANCE,
         "max_iterations": MAX_ITERATIONS,
         "roundoff_level": ROUNDOFF_LEVEL,
-        "keep_factors": KEEP_FACTORS,
+        "keep_change": KEEP_CHANGE,
+        "keep_rate": KEEP_RATE,
         **_lane_context(program.sweep),
     }
 

@@ -1,0 +1,50 @@
+"""An order of the coordinates in which those that meet in the equations stand near each other.
+
+Two coordinates meet where a second derivative of the Lagrangian by both does not vanish. The Newton matrix has a block for
+every pair that meets; in a good order the blocks lie in a narrow band, outside of which nothing is stored or computed.
+A chain has bandwidth 1, a ring 2, and where all meet the band is the whole matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+__all__ = ["bandwidth", "places"]
+
+Pairs = Iterable[tuple[int, int]]
+
+
+def bandwidth(pairs: Pairs, places: tuple[int, ...]) -> int:
+    """Largest distance of two coordinates that meet, each in its place.
+
+    >>> bandwidth([(0, 2), (1, 2)], (0, 1, 2))
+    2
+    """
+    return max((abs(places[i] - places[j]) for i, j in pairs), default=0)
+
+
+def places(pairs: Pairs, count: int) -> tuple[int, ...]:
+    """The place of each of ``count`` coordinates: the given order, or the one of Cuthill and McKee if it is narrower.
+
+    >>> places([(0, 2), (1, 2)], 3)
+    (0, 2, 1)
+    """
+    met = {(max(pair), min(pair)) for pair in pairs if pair[0] != pair[1]}
+    given = tuple(range(count))
+    if bandwidth(met, given) <= 1 or 2 * len(met) == count * (count - 1):
+        return given
+    found = _cuthill_mckee(met, count)
+    return found if bandwidth(met, found) < bandwidth(met, given) else given
+
+
+def _cuthill_mckee(met: set[tuple[int, int]], count: int) -> tuple[int, ...]:
+    # Imported here because SciPy is slow to import and most systems do not come here.
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    rows, columns = np.array(sorted(met | {(j, i) for i, j in met})).T
+    graph = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+    return tuple(int(place) for place in np.argsort(order))
