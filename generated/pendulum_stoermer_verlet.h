@@ -19,7 +19,7 @@ extern "C" {
 #define PENDULUM_STOERMER_VERLET_PARAMETERS 3
 #define PENDULUM_STOERMER_VERLET_UNKNOWNS 2
 /* Length, in doubles, of the workspace that the functions below ask for. */
-#define PENDULUM_STOERMER_VERLET_WORKSPACE 26
+#define PENDULUM_STOERMER_VERLET_WORKSPACE 33
 
 /* What a function returns. A call that fails leaves its state untouched. */
 enum {
@@ -53,8 +53,8 @@ typedef struct {
   long long step; /* completed; the time is t0 + step h */
   double q[1], p[1];
   double carry_q[1], carry_p[1];
-  double memory[2];
-  long long guess;      /* whether memory can be extrapolated */
+  double memory[1];
+  long long guess;      /* what memory holds, 0 if nothing */
   long long iterations; /* since the last stored state */
 } pendulum_stoermer_verlet_run;
 

@@ -9,8 +9,10 @@ enum {
   M = 1, /* coordinates */
   B = 1, /* blocks of M unknowns */
   N = B * M,
+  POINTS = 2, /* most points of a family, or blocks */
+  BAND = 0, /* coordinates that meet are at most so many places apart */
   MEMORY = 2, /* numbers kept from step to step */
-  SCRATCH = 2 /* slopes of the largest kernel, or the mass matrix with its slopes */
+  SCRATCH = 12 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
 };
 
 /* Everything a step is made from. */
@@ -18,6 +20,7 @@ typedef struct {
   double t, h;
   const double *q0, *p0, *carry_q, *carry_p, *parameters;
   double *scratch; /* SCRATCH numbers */
+  int first; /* whether the workspace holds nothing of the step before */
 } step_data;
 
 /* fmax and fmin without their care for NaN, and without a call. */
@@ -31,8 +34,8 @@ static inline double smaller(double a, double b)
   return a < b ? a : b;
 }
 
-/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b] v0,
- * the guess from the step before sum_c EXTRAPOLATION[b][c] z_c. */
+/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b]
+ * v0. */
 static const double END_POSITION[1] = {
   1.0
 };
@@ -45,25 +48,20 @@ static const double STRAIGHT[1] = {
   1.0
 };
 
-static const double EXTRAPOLATION[1][1] = {
-  {1.0}
-};
-
 
 /* Quadrature: 2 points.
- * Gather tables have one column a block, scatter tables one column a row and a last one for p1. */
+ * Gather tables have one row a block and one column a point, scatter tables one row a point and one column a row of
+ * equations, a last one for p1. */
 static const double QUADRATURE_WEIGHT[2] = {
   0.5, 0.5
 };
 
-static const double QUADRATURE_GATHER_0[2][1] = {
-  {0.21132486540518713},
-  {0.7886751345948129}
+static const double QUADRATURE_GATHER_0[1][2] = {
+  {0.21132486540518713, 0.7886751345948129}
 };
 
-static const double QUADRATURE_GATHER_1[2][1] = {
-  {1.0},
-  {1.0}
+static const double QUADRATURE_GATHER_1[1][2] = {
+  {1.0, 1.0}
 };
 
 static const double QUADRATURE_SCATTER_0[2][2] = {
@@ -116,50 +114,93 @@ static void lagrangian(const double *u, const double *parameters, double *value)
   value[0] = 0.5*(parameters[0]*(parameters[1]*parameters[1])*(u[1]*u[1]) + 2.0*parameters[0]*parameters[1]*parameters[2]*cos(u[0]));
 }
 
-/* LU factors of the n x n matrix a, rows exchanged so that every pivot is the largest of its column. Returns 0 if one
- * vanishes or is not a number; pivot[k] is the row exchanged with k. */
-static int factorise(double *a, int n, double *pivot)
+/* Place of each coordinate in the order in which those that meet stand near each other. */
+static const int PLACE[M] = {
+  0
+};
+
+/* A square matrix with `blocks` unknowns a coordinate, coordinates in the order of PLACE. Those more than BAND places apart
+ * do not meet: entry (i, j) is zero for |i - j| > reach. It is number first + j stride + i: a band, with room for the
+ * fill-in of row exchanges, or the full matrix if that is smaller. */
+typedef struct {
+  int rows, reach, stride, first;
+} band;
+
+static band band_of(int blocks)
 {
-  for (int k = 0; k < n; k++) {
+  const int rows = M * blocks, reach = (BAND + 1) * blocks - 1, full = 3 * reach + 1 >= rows;
+  const band shape = {rows, reach, full ? rows : 3 * reach, full ? 0 : 2 * reach};
+  return shape;
+}
+
+/* How many numbers the matrix has. */
+static size_t band_size(const band *shape)
+{
+  return (size_t)shape->rows * (size_t)(shape->first ? shape->stride + 1 : shape->stride);
+}
+
+static int least(int a, int b)
+{
+  return a < b ? a : b;
+}
+
+static int most(int a, int b)
+{
+  return a > b ? a : b;
+}
+
+static void exchange(double *a, double *b)
+{
+  const double kept = *a;
+  *a = *b;
+  *b = kept;
+}
+
+/* Does to x what was done to the rows of the matrix at columns k < end: exchanges, and subtraction of multiples. */
+static void eliminate(const double *a, const band *shape, const double *pivot, int begin, int end, double *x)
+{
+  for (int k = begin; k < end; k++) {
+    const double *column = a + shape->first + k * shape->stride;
+    const int bottom = least(k + shape->reach, shape->rows - 1);
+    exchange(x + k, x + (int)pivot[k]);
+    if (x[k] != 0.0)
+      for (int i = k + 1; i <= bottom; i++)
+        x[i] -= column[i] * x[k];
+  }
+}
+
+/* LU factors of the matrix, rows exchanged so that every pivot is the largest of its column. Returns 0 if one vanishes or
+ * is not a number; pivot[k] is the row exchanged with k; the diagonal holds the inverses of the pivots. */
+static int factorise(double *a, const band *shape, double *pivot)
+{
+  for (int k = 0; k < shape->rows; k++) {
+    double *column = a + shape->first + k * shape->stride;
+    const int bottom = least(k + shape->reach, shape->rows - 1);
     int best = k;
-    for (int i = k + 1; i < n; i++)
-      if (fabs(a[i * n + k]) > fabs(a[best * n + k]))
+    eliminate(a, shape, pivot, most(k - 2 * shape->reach, 0), k, column);
+    for (int i = k + 1; i <= bottom; i++)
+      if (fabs(column[i]) > fabs(column[best]))
         best = i;
     pivot[k] = (double)best;
-    if (!(fabs(a[best * n + k]) > 0.0))
+    if (!(fabs(column[best]) > 0.0))
       return 0;
-    for (int j = 0; best != k && j < n; j++) {
-      const double exchanged = a[k * n + j];
-      a[k * n + j] = a[best * n + j];
-      a[best * n + j] = exchanged;
-    }
-    for (int i = k + 1; i < n; i++) {
-      const double factor = a[i * n + k] / a[k * n + k];
-      a[i * n + k] = factor;
-      if (factor != 0.0)
-        for (int j = k + 1; j < n; j++)
-          a[i * n + j] -= factor * a[k * n + j];
-    }
+    exchange(column + k, column + best);
+    column[k] = 1.0 / column[k];
+    for (int i = k + 1; i <= bottom; i++)
+      column[i] *= column[k];
   }
   return 1;
 }
 
 /* x = a^-1 x with the factors of a. */
-static void back_substitute(const double *a, int n, const double *pivot, double *x)
+static void back_substitute(const double *a, const band *shape, const double *pivot, double *x)
 {
-  for (int k = 0; k < n; k++) {
-    const int best = (int)pivot[k];
-    const double exchanged = x[best];
-    x[best] = x[k];
-    x[k] = exchanged;
-  }
-  for (int i = 1; i < n; i++)
-    for (int j = 0; j < i; j++)
-      x[i] -= a[i * n + j] * x[j];
-  for (int i = n - 1; i >= 0; i--) {
-    for (int j = i + 1; j < n; j++)
-      x[i] -= a[i * n + j] * x[j];
-    x[i] /= a[i * n + i];
+  eliminate(a, shape, pivot, 0, shape->rows, x);
+  for (int k = shape->rows - 1; k >= 0; k--) {
+    const double *column = a + shape->first + k * shape->stride;
+    x[k] *= column[k];
+    for (int i = most(k - 2 * shape->reach, 0); i < k; i++)
+      x[i] -= column[i] * x[k];
   }
 }
 
@@ -176,15 +217,16 @@ static int all_finite(const double *x, int n)
   return sum == 0.0;
 }
 
-/* Momenta at u = (q, v), and the mass matrix dp/dv in the first M M numbers of scratch. */
+/* Momenta at u = (q, v), and the mass matrix dp/dv in the first numbers of scratch. */
 static void momentum_and_mass(double t, const double *u, const double *parameters, double *value, double *scratch)
 {
-  double *mass = scratch, *slope = scratch + M * M;
+  const band shape = band_of(1);
+  double *mass = scratch, *slope = scratch + band_size(&shape);
   (void)t;
   legendre(u, parameters, value, slope);
-  memset(mass, 0, sizeof(double) * (size_t)(M * M));
+  memset(mass, 0, sizeof(double) * band_size(&shape));
   for (int e = 0; e < 1; e++)
-    mass[MASS_ENTRY[e][0] * M + MASS_ENTRY[e][1]] = slope[e];
+    mass[shape.first + PLACE[MASS_ENTRY[e][1]] * shape.stride + PLACE[MASS_ENTRY[e][0]]] = slope[e];
 }
 
 /* max |value - p|. */
@@ -213,24 +255,25 @@ int two_point_pendulum_momentum(double t, const double *q, const double *v, cons
  * nearer. */
 static int invert_momentum(double t, double *u, const double *p, const double *parameters, double *mass)
 {
+  const band shape = band_of(1);
   double value[M], update[M], pivot[M], misfit;
   momentum_and_mass(t, u, parameters, value, mass);
   misfit = largest_misfit(value, p);
   for (int k = 0; k < 50; k++) {
     double scale = 1.0, nearer, start[M], largest = 0.0;
-    if (!all_finite(value, M) || !all_finite(mass, M * M))
+    if (!all_finite(value, M) || !all_finite(mass, (int)band_size(&shape)))
       return TWO_POINT_PENDULUM_NOT_FINITE;
     if (misfit == 0.0)
       return TWO_POINT_PENDULUM_OK;
-    if (!factorise(mass, M, pivot))
+    if (!factorise(mass, &shape, pivot))
       return TWO_POINT_PENDULUM_SINGULAR;
     for (int i = 0; i < M; i++)
-      update[i] = p[i] - value[i];
-    back_substitute(mass, M, pivot, update);
+      update[PLACE[i]] = p[i] - value[i];
+    back_substitute(mass, &shape, pivot, update);
     memcpy(start, u + M, sizeof(double) * M);
     do {
       for (int i = 0; i < M; i++)
-        u[M + i] = start[i] + scale * update[i];
+        u[M + i] = start[i] + scale * update[PLACE[i]];
       momentum_and_mass(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
       scale *= 0.5;
@@ -294,90 +337,109 @@ int two_point_pendulum_energies(long long count, const double *t, const double *
   return TWO_POINT_PENDULUM_OK;
 }
 
-/* u = scale sum_b row[b] z_b, M numbers. */
-static void gather(const double *row, double scale, const double *z, double *u)
+/* scale sum_b table[b][n] z_b for every coordinate i and point n, into u[n * across + i * along]. */
+static inline void gather(const double *table, int points, double scale, const double *z, double *u, int across, int along)
 {
   for (int i = 0; i < M; i++) {
-    double sum = 0.0;
+    double sum[POINTS] = {0.0};
     for (int b = 0; b < B; b++)
-      sum += row[b] * z[b * M + i];
-    u[i] = scale * sum;
+      for (int n = 0; n < points; n++)
+        sum[n] += table[b * points + n] * z[i * B + b];
+    for (int n = 0; n < points; n++)
+      u[n * across + i * along] = scale * sum[n];
   }
 }
 
-/* u = q0 + u, with what rounding cut off q0 before. */
-static void offset(const step_data *step, double *u)
+/* u = q0 + u at every point, with what rounding cut off q0 before. */
+static inline void offset(const step_data *step, int points, double *u, int across)
 {
-  for (int i = 0; i < M; i++)
-    u[i] = step->q0[i] + (step->carry_q[i] + u[i]);
-}
-
-/* rows_r += scale row[r] value; the last row is p1, whose terms are also summed without sign into size. */
-static void scatter(const double *row, double scale, const double *value, double *rows, double *size)
-{
-  for (int r = 0; r <= B; r++)
+  for (int n = 0; n < points; n++)
     for (int i = 0; i < M; i++)
-      rows[r * M + i] += row[r] * (scale * value[i]);
-  for (int i = 0; i < M; i++)
-    size[i] += fabs(row[B] * (scale * value[i]));
+      u[n * across + i] = step->q0[i] + (step->carry_q[i] + u[n * across + i]);
 }
 
-/* Adds scale row[r] slope_e column[b] to the Jacobian entry of row (r, i_e) and column (b, j_e). */
-static void scatter_slope(const double *row, const double *column, double scale, const int (*entry)[2], int count,
-    const double *slope, double *jacobian, int stride)
+/* rows_r += sum_n weight[n] scale table[n][r] value_n for every coordinate; the last row is p1, whose terms are also summed
+ * without sign into size. */
+static inline void scatter(const double *table, int points, const double *weight, double scale, const double *value,
+    int across, double *rows, double *size)
 {
-  for (int r = 0; r < B; r++) {
+  for (int i = 0; i < M; i++) {
+    double sum[B + 1], end = size[i];
+    memcpy(sum, rows + i * (B + 1), sizeof sum);
+    for (int n = 0; n < points; n++) {
+      const double term = weight[n] * scale * value[n * across + i];
+      for (int r = 0; r <= B; r++)
+        sum[r] += table[n * (B + 1) + r] * term;
+      end += fabs(table[n * (B + 1) + B] * term);
+    }
+    memcpy(rows + i * (B + 1), sum, sizeof sum);
+    size[i] = end;
+  }
+}
+
+/* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns (j, b),
+ * for every slope and its pair of coordinates i, j. */
+static inline void scatter_slopes(const double *row, const double *column, int points, const double *weight, double scale,
+    const int (*pair)[2], int count, const double *slope, int across, double *jacobian, const band *shape)
+{
+  const int blocks = shape->rows / M;
+  for (int e = 0; e < count; e++) {
+    double *corner = jacobian + shape->first + PLACE[pair[e][1]] * blocks * shape->stride + PLACE[pair[e][0]] * blocks;
     for (int b = 0; b < B; b++) {
-      const double factor = scale * row[r] * column[b];
-      double *block = jacobian + (r * M) * stride + b * M;
-      if (factor != 0.0)
-        for (int e = 0; e < count; e++)
-          block[entry[e][0] * stride + entry[e][1]] += factor * slope[e];
+      double sum[B] = {0.0};
+      for (int n = 0; n < points; n++) {
+        const double term = weight[n] * scale * slope[n * across + e] * column[b * points + n];
+        if (term != 0.0)
+          for (int r = 0; r < B; r++)
+            sum[r] += row[n * (B + 1) + r] * term;
+      }
+      for (int r = 0; r < B; r++)
+        corner[b * shape->stride + r] += sum[r];
     }
   }
 }
 
 /* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */
-static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian, int stride)
+static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian, const band *shape)
 {
   const double h = step->h;
+  double *u = step->scratch, *value = u + 4, *slope = value + 4;
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 2, 1);
+  offset(step, 2, u + 0, 2);
+  gather(QUADRATURE_GATHER_1[0], 2, 1.0, z, u + 1, 2, 1);
   for (int n = 0; n < 2; n++) {
-    double u[2], value[2];
-    gather(QUADRATURE_GATHER_0[n], h, z, u + 0);
-    offset(step, u + 0);
-    gather(QUADRATURE_GATHER_1[n], 1.0, z, u + 1);
-    if (jacobian) {
-      double *slope = step->scratch;
-      quadrature_slope(u, step->parameters, value, slope);
-      scatter_slope(QUADRATURE_SCATTER_0[n], QUADRATURE_GATHER_0[n], QUADRATURE_WEIGHT[n] * h*h,
-          QUADRATURE_SLOPE_0, 1, slope + 0, jacobian, stride);
-      scatter_slope(QUADRATURE_SCATTER_1[n], QUADRATURE_GATHER_1[n], QUADRATURE_WEIGHT[n] * 1.0,
-          QUADRATURE_SLOPE_1, 1, slope + 1, jacobian, stride);
-    } else {
-      quadrature_value(u, step->parameters, value);
-    }
-    scatter(QUADRATURE_SCATTER_0[n], QUADRATURE_WEIGHT[n] * h, value + 0, rows, size);
-    scatter(QUADRATURE_SCATTER_1[n], QUADRATURE_WEIGHT[n] * 1.0, value + 1, rows, size);
+    if (jacobian)
+      quadrature_slope(u + n * 2, step->parameters, value + n * 2, slope + n * 2);
+    else
+      quadrature_value(u + n * 2, step->parameters, value + n * 2);
   }
+  scatter(QUADRATURE_SCATTER_0[0], 2, QUADRATURE_WEIGHT, h, value + 0, 2, rows, size);
+  scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1.0, value + 1, 2, rows, size);
+  if (!jacobian)
+    return;
+  scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h*h,
+      QUADRATURE_SLOPE_0, 1, slope + 0, 2, jacobian, shape);
+  scatter_slopes(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1.0,
+      QUADRATURE_SLOPE_1, 1, slope + 1, 2, jacobian, shape);
 }
 
-/* The stage equations: rows (B M residuals, then p1 - p0), the sizes of p1 and q1 before cancellation, the Jacobian. */
+/* The stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before cancellation; and
+ * the Jacobian, of the shape given, unless it is NULL. */
 static void evaluate(const step_data *step, const double *z, double *rows, double *size_p, double *size_q,
-    double *jacobian, int stride)
+    double *jacobian, const band *shape)
 {
-  for (int r = 0; r < B; r++)
-    for (int i = 0; i < M; i++)
-      rows[r * M + i] = MOMENTUM_ROW[r] * step->p0[i];
   for (int i = 0; i < M; i++) {
-    rows[N + i] = 0.0;
+    for (int r = 0; r < B; r++)
+      rows[i * (B + 1) + r] = MOMENTUM_ROW[r] * step->p0[i];
+    rows[i * (B + 1) + B] = 0.0;
     size_p[i] = fabs(step->p0[i]);
     size_q[i] = fabs(step->q0[i]);
     for (int b = 0; b < B; b++)
-      size_q[i] += fabs(step->h * END_POSITION[b] * z[b * M + i]);
+      size_q[i] += fabs(step->h * END_POSITION[b] * z[i * B + b]);
   }
   if (jacobian)
-    memset(jacobian, 0, sizeof(double) * (size_t)(stride * stride));
-  add_quadrature(step, z, rows, size_p, jacobian, stride);
+    memset(jacobian, 0, sizeof(double) * band_size(shape));
+  add_quadrature(step, z, rows, size_p, jacobian, shape);
 }
 
 /* How far the last update moved the stages and the end momentum: the largest ratio to its own size, the ratio of the
@@ -406,93 +468,116 @@ static void measure(movement *moved, const double *change, const double *size)
   moved->absolute = larger(moved->absolute, largest_change);
 }
 
-static void measure_stages(movement *moved, const step_data *step, const double *update, const double *size_q)
+/* What Newton's iteration works with: unknowns; rows and
+ * their update; factors of the Jacobian with their pivots. */
+typedef struct {
+  double *z, *rows, *update, *pivot, *factors;
+} newton_data;
+
+static newton_data newton_in(double *workspace)
 {
-  double change[M];
-  for (int i = 0; i < M; i++) {
-    change[i] = 0.0;
-    for (int b = 0; b < B; b++)
-      change[i] = larger(change[i], fabs(step->h * update[b * M + i]));
-  }
-  measure(moved, change, size_q);
+  newton_data data;
+  data.z = workspace;
+  data.rows = data.z + N;
+  data.update = data.rows + N + M;
+  data.pivot = data.update + N + M;
+  data.factors = data.pivot + N + M;
+  return data;
 }
 
-static void measure_momentum(movement *moved, const double *increment, const double *last_increment,
-    const double *size_p)
+/* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
+static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p, const double *size_q, movement *moved)
 {
+  const int blocks = shape->rows / M;
   double change[M];
   for (int i = 0; i < M; i++)
-    change[i] = increment[i] - last_increment[i];
-  measure(moved, change, size_p);
+    memcpy(data->update + PLACE[i] * blocks, data->rows + i * (B + 1), sizeof(double) * (size_t)blocks);
+  back_substitute(data->factors, shape, data->pivot, data->update);
+  for (int i = 0; i < M; i++) {
+    const double *update = data->update + PLACE[i] * blocks;
+    change[i] = 0.0;
+    for (int b = 0; b < B; b++) {
+      data->z[i * B + b] -= update[b];
+      change[i] = larger(change[i], fabs(h * update[b]));
+    }
+  }
+  measure(moved, change, size_q);
+  for (int i = 0; p0 && i < M; i++) {
+    change[i] = data->update[PLACE[i] * blocks + B];
+    p0[i] -= change[i];
+  }
+  if (p0)
+    measure(moved, change, size_p);
 }
 
 /* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
- * longer shrinking. */
-static int has_converged(const two_point_pendulum_options *options, const movement *moved, double last)
+ * longer shrinking. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off
+ * from slow progress. */
+static int has_converged(const two_point_pendulum_options *options, const movement *moved, double last, int trials)
 {
+  if (trials < 2)
+    return 0;
   if (options->absolute)
     return moved->absolute < options->tolerance;
   return moved->relative <= options->tolerance
-      || (moved->overall <= 1e-11 && moved->relative >= 0.25 * last);
+      || (trials > 2 && moved->overall <= 1e-11 && moved->relative >= 0.25 * last);
 }
 
-/* The rows q0 + h sum_b beta_b z_b = q1 behind the stage equations, with p0 as further unknown. */
-static void add_boundary(const step_data *step, const double *z, const double *q1, double *rows, double *jacobian)
+/* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
+static void add_boundary(const step_data *step, const newton_data *data, const double *q1, int linearise, const band *shape)
 {
   for (int i = 0; i < M; i++) {
-    rows[N + i] = -(q1[i] - step->q0[i]) / step->h;
+    double *row = data->rows + i * (B + 1) + B;
+    *row = -(q1[i] - step->q0[i]) / step->h;
     for (int b = 0; b < B; b++)
-      rows[N + i] += END_POSITION[b] * z[b * M + i];
+      *row += END_POSITION[b] * data->z[i * B + b];
   }
-  if (jacobian)
-    for (int b = 0; b < B; b++)
-      for (int i = 0; i < M; i++) {
-        jacobian[(b * M + i) * (N + M) + N + i] = MOMENTUM_ROW[b];
-        jacobian[(N + i) * (N + M) + b * M + i] = END_POSITION[b];
-      }
+  for (int i = 0; linearise && i < M; i++) {
+    double *corner = data->factors + shape->first + PLACE[i] * (B + 1) * (shape->stride + 1);
+    for (int b = 0; b < B; b++) {
+      corner[B * shape->stride + b] = MOMENTUM_ROW[b];
+      corner[b * shape->stride + B] = END_POSITION[b];
+    }
+  }
 }
 
-/* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. Once the
- * updates are small the factors are kept. With an end position q1, p0 is unknown too and found in place. */
-static int newton(const step_data *step, double *z, const double *q1, double *p0, double *increment,
-    const two_point_pendulum_options *options, two_point_pendulum_report *report, double *workspace)
+/* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. The factors, of
+ * an earlier step if *keep, serve as long as updates are small and shrink at least 10-fold. With an end position q1, p0
+ * is unknown too and found in place. */
+static int newton(const step_data *step, const newton_data *data, const double *q1, double *p0, double *increment, int *keep,
+    const two_point_pendulum_options *options, two_point_pendulum_report *report)
 {
-  const int size = q1 ? N + M : N;
-  double *jacobian = workspace, *update = jacobian + size * size, *pivot = update + size, *rows = pivot + size;
-  double size_q[M], size_p[M], last_increment[M], last = INFINITY;
+  const band shape = band_of(q1 ? B + 1 : B);
+  double size_q[M], size_p[M], change[M], last = INFINITY;
   movement moved = no_movement();
-  int keep = 0;
+  int trials = 0;
   memset(increment, 0, sizeof(double) * M);
   for (int k = 0;; k++) {
-    evaluate(step, z, rows, size_p, size_q, keep ? NULL : jacobian, size);
-    memcpy(last_increment, increment, sizeof(double) * M);
-    memcpy(increment, rows + N, sizeof(double) * M);
+    evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
+    for (int i = 0; i < M; i++) {
+      change[i] = data->rows[i * (B + 1) + B] - increment[i];
+      increment[i] = data->rows[i * (B + 1) + B];
+    }
     if (q1)
-      add_boundary(step, z, q1, rows, keep ? NULL : jacobian);
-    if (!all_finite(rows, size) || !all_finite(increment, M))
+      add_boundary(step, data, q1, !*keep, &shape);
+    if (!all_finite(data->rows, N + M) || !all_finite(increment, M))
       return TWO_POINT_PENDULUM_NOT_FINITE;
     if (k > 0) {
-      measure_momentum(&moved, increment, last_increment, size_p);
+      measure(&moved, change, size_p);
       report->change = options->absolute ? moved.absolute : moved.relative;
-      if (has_converged(options, &moved, last))
+      if (has_converged(options, &moved, last, trials))
         return TWO_POINT_PENDULUM_OK;
       last = moved.relative;
     }
     if (k >= options->max_iterations)
       return TWO_POINT_PENDULUM_NOT_CONVERGED;
-    if (!keep && !factorise(jacobian, size, pivot))
+    trials = *keep ? trials + 1 : 3;
+    if (!*keep && !factorise(data->factors, &shape, data->pivot))
       return TWO_POINT_PENDULUM_SINGULAR;
-    memcpy(update, rows, sizeof(double) * (size_t)size);
-    back_substitute(jacobian, size, pivot, update);
-    for (int i = 0; i < N; i++)
-      z[i] -= update[i];
     moved = no_movement();
-    measure_stages(&moved, step, update, size_q);
-    for (int i = 0; q1 && i < M; i++)
-      p0[i] -= update[N + i];
-    if (q1)
-      measure(&moved, update + N, size_p);
-    keep = moved.overall < 1e-05 && moved.relative < 0.1 * last;
+    apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
+    *keep = has_converged(options, &moved, last, trials)
+        || (moved.overall < 0.01 && moved.relative < 0.1 * last);
     report->iterations++;
   }
 }
@@ -728,45 +813,19 @@ two_point_pendulum_options two_point_pendulum_default_options(void)
   return options;
 }
 
-/* The guess that q moves on a straight line with its initial velocity. */
-static int guess_straight(const step_data *step, double *z)
+/* Newton's iteration from the guess that q moves on a straight line with its initial velocity. */
+static int newton_from_line(const step_data *step, const newton_data *data, double *dp, int *keep,
+    const two_point_pendulum_options *options, two_point_pendulum_report *report)
 {
   double v[M];
   const int status = two_point_pendulum_velocity(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
-  for (int b = 0; status == TWO_POINT_PENDULUM_OK && b < B; b++)
-    for (int i = 0; i < M; i++)
-      z[b * M + i] = STRAIGHT[b] * v[i];
-  return status;
-}
-
-/* The guess that the curve of the step before goes on. */
-static void guess_extrapolated(const double *memory, double *z)
-{
-  for (int b = 0; b < B; b++)
-    gather(EXTRAPOLATION[b], 1.0, memory, z + b * M);
-}
-
-/* The increments by Newton's iteration, from the extrapolated guess if there is one, and from the straight line if there
- * is none or it leads nowhere. */
-static int solve_newton(const step_data *step, double *memory, int guess, double *dq, double *dp,
-    const two_point_pendulum_options *options, two_point_pendulum_report *report, double *workspace)
-{
-  double *z = workspace;
-  int status = TWO_POINT_PENDULUM_NOT_CONVERGED;
-  if (guess) {
-    guess_extrapolated(memory, z);
-    status = newton(step, z, NULL, NULL, dp, options, report, z + N);
-  }
-  if (status != TWO_POINT_PENDULUM_OK) {
-    status = guess_straight(step, z);
-    if (status == TWO_POINT_PENDULUM_OK)
-      status = newton(step, z, NULL, NULL, dp, options, report, z + N);
-  }
-  if (status == TWO_POINT_PENDULUM_OK) {
-    gather(END_POSITION, step->h, z, dq);
-    memcpy(memory, z, sizeof(double) * N);
-  }
-  return status;
+  if (status != TWO_POINT_PENDULUM_OK)
+    return status;
+  for (int i = 0; i < M; i++)
+    for (int b = 0; b < B; b++)
+      data->z[i * B + b] = STRAIGHT[b] * v[i];
+  *keep = 0;
+  return newton(step, data, NULL, NULL, dp, keep, options, report);
 }
 #ifdef __GNUC__
 typedef sweep_data solver_data;
@@ -785,7 +844,10 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
   if (status != TWO_POINT_PENDULUM_OK && *guess)
     status = sweep(step, data, memory, 0, dq, dp, options, report);
   if (status != TWO_POINT_PENDULUM_OK) {
-    status = solve_newton(step, workspace, 0, dq, dp, options, report, workspace + MEMORY);
+    const newton_data newtons = newton_in(workspace);
+    int keep;
+    status = newton_from_line(step, &newtons, dp, &keep, options, report);
+    gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
     swept = 0;
   }
   if (status == TWO_POINT_PENDULUM_OK)
@@ -793,6 +855,12 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
   return status;
 }
 #else
+/* The guess from the step before is sum_c EXTRAPOLATION[c][b] z_c. */
+static const double EXTRAPOLATION[1][1] = {
+  {1.0}
+};
+
+
 typedef struct {
   int unused;
 } solver_data;
@@ -803,13 +871,25 @@ static void prepare(const step_data *step, solver_data *data)
   data->unused = 0;
 }
 
-static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+/* The increments by Newton's iteration, from the stages of the step before, extrapolated, and from the straight line if
+ * there are none or they lead nowhere. Memory holds the stages. */
+static int solve(const step_data *step, const solver_data *unused, double *memory, long long *guess, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report, double *workspace)
 {
-  const int status = solve_newton(step, memory, *guess != 0, dq, dp, options, report, workspace + MEMORY);
-  (void)data;
-  if (status == TWO_POINT_PENDULUM_OK)
-    *guess = 1;
+  const newton_data data = newton_in(workspace);
+  int status = TWO_POINT_PENDULUM_NOT_CONVERGED, keep = 0;
+  (void)unused;
+  if (*guess) {
+    gather(EXTRAPOLATION[0], B, 1.0, memory, data.z, 1, B);
+    status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
+  }
+  if (status != TWO_POINT_PENDULUM_OK)
+    status = newton_from_line(step, &data, dp, &keep, options, report);
+  if (status != TWO_POINT_PENDULUM_OK)
+    return status;
+  gather(END_POSITION, 1, step->h, data.z, dq, 0, 1);
+  memcpy(memory, data.z, sizeof(double) * N);
+  *guess = 1;
   return status;
 }
 #endif
@@ -819,7 +899,7 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
 {
   const two_point_pendulum_options standard = two_point_pendulum_default_options();
   const double nothing[M] = {0.0};
-  const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace};
+  const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace, 1};
   two_point_pendulum_report unread;
   solver_data data;
   double *memory = workspace + SCRATCH, dq[M], dp[M];
@@ -864,7 +944,7 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     two_point_pendulum_report *report, double *workspace)
 {
   const two_point_pendulum_options standard = two_point_pendulum_default_options();
-  step_data step = {run->t0, run->h, run->q, run->p, run->carry_q, run->carry_p, parameters, workspace};
+  step_data step = {run->t0, run->h, run->q, run->p, run->carry_q, run->carry_p, parameters, workspace, 1};
   two_point_pendulum_report unread;
   solver_data data;
   long long stored = 0;
@@ -875,6 +955,7 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
   for (long long k = 0; k < steps; k++) {
     const long long before = report->iterations;
     int status;
+    step.first = k == 0;
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
@@ -901,13 +982,13 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
 static double action_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
-  double sum = 0.0;
+  double *u = step->scratch, sum = 0.0;
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 2 * M, 1);
+  offset(step, 2, u + 0, 2 * M);
+  gather(QUADRATURE_GATHER_1[0], 2, 1.0, z, u + 1, 2 * M, 1);
   for (int n = 0; n < 2; n++) {
-    double u[2 * M], value[1];
-    gather(QUADRATURE_GATHER_0[n], h, z, u + 0);
-    offset(step, u + 0);
-    gather(QUADRATURE_GATHER_1[n], 1.0, z, u + 1);
-    lagrangian(u, step->parameters, value);
+    double value[1];
+    lagrangian(u + n * 2 * M, step->parameters, value);
     sum += QUADRATURE_WEIGHT[n] * value[0];
   }
   return h * sum;
@@ -920,25 +1001,26 @@ int two_point_pendulum_discrete_legendre(double t, double h, const double *q0, c
   const two_point_pendulum_options standard = two_point_pendulum_default_options();
   const double carry_q[M] = {0.0};
   two_point_pendulum_report unread;
-  double *z = workspace + SCRATCH, v[M], start_p[M], increment[M];
-  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace};
-  int status;
+  const newton_data data = newton_in(workspace + SCRATCH);
+  double v[M], start_p[M], increment[M];
+  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace, 1};
+  int keep = 0, status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   for (int i = 0; i < M; i++) {
     v[i] = (q1[i] - q0[i]) / h;
     for (int b = 0; b < B; b++)
-      z[b * M + i] = STRAIGHT[b] * v[i];
+      data.z[i * B + b] = STRAIGHT[b] * v[i];
   }
   status = two_point_pendulum_momentum(t, q0, v, parameters, start_p, workspace);
   if (status == TWO_POINT_PENDULUM_OK)
-    status = newton(&step, z, q1, start_p, increment, options ? options : &standard, report, z + N);
+    status = newton(&step, &data, q1, start_p, increment, &keep, options ? options : &standard, report);
   if (status != TWO_POINT_PENDULUM_OK)
     return status;
   for (int i = 0; i < M; i++) {
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  *action = action_sum(&step, z);
+  *action = action_sum(&step, data.z);
   return TWO_POINT_PENDULUM_OK;
 }
