@@ -187,16 +187,20 @@ static void exchange(double *a, double *b)
   *b = kept;
 }
 
-/* Does to x what was done to the rows of the matrix at columns k < end: exchanges, and subtraction of multiples. */
+/* x_i -= factor column_i for begin <= i < end. */
+static inline void subtract(const double *restrict column, double factor, int begin, int end, double *restrict x)
+{
+  for (int i = begin; i < end; i++)
+    x[i] -= factor * column[i];
+}
+
+/* Does to x what was done to the rows of the matrix at columns begin <= k < end: exchanges, subtraction of multiples. */
 static void eliminate(const double *a, const band *shape, const double *pivot, int begin, int end, double *x)
 {
   for (int k = begin; k < end; k++) {
-    const double *column = a + shape->first + k * shape->stride;
-    const int bottom = least(k + shape->reach, shape->rows - 1);
     exchange(x + k, x + (int)pivot[k]);
     if (x[k] != 0.0)
-      for (int i = k + 1; i <= bottom; i++)
-        x[i] -= column[i] * x[k];
+      subtract(a + shape->first + k * shape->stride, x[k], k + 1, least(k + shape->reach + 1, shape->rows), x);
   }
 }
 
@@ -206,10 +210,10 @@ static int factorise(double *a, const band *shape, double *pivot)
 {
   for (int k = 0; k < shape->rows; k++) {
     double *column = a + shape->first + k * shape->stride;
-    const int bottom = least(k + shape->reach, shape->rows - 1);
+    const int end = least(k + shape->reach + 1, shape->rows);
     int best = k;
     eliminate(a, shape, pivot, most(k - 2 * shape->reach, 0), k, column);
-    for (int i = k + 1; i <= bottom; i++)
+    for (int i = k + 1; i < end; i++)
       if (fabs(column[i]) > fabs(column[best]))
         best = i;
     pivot[k] = (double)best;
@@ -217,7 +221,7 @@ static int factorise(double *a, const band *shape, double *pivot)
       return 0;
     exchange(column + k, column + best);
     column[k] = 1.0 / column[k];
-    for (int i = k + 1; i <= bottom; i++)
+    for (int i = k + 1; i < end; i++)
       column[i] *= column[k];
   }
   return 1;
@@ -230,8 +234,7 @@ static void back_substitute(const double *a, const band *shape, const double *pi
   for (int k = shape->rows - 1; k >= 0; k--) {
     const double *column = a + shape->first + k * shape->stride;
     x[k] *= column[k];
-    for (int i = most(k - 2 * shape->reach, 0); i < k; i++)
-      x[i] -= column[i] * x[k];
+    subtract(column, x[k], most(k - 2 * shape->reach, 0), k, x);
   }
 }
 
@@ -432,7 +435,8 @@ static inline void scatter_slopes(const double *row, const double *column, int p
 }
 
 /* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */
-static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian, const band *shape)
+static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian,
+    const band *shape)
 {
   const double h = step->h;
   double *u = step->scratch, *value = u + 16, *slope = value + 16;
@@ -500,8 +504,7 @@ static void measure(movement *moved, const double *change, const double *size)
   moved->absolute = larger(moved->absolute, largest_change);
 }
 
-/* What Newton's iteration works with: unknowns; rows and
- * their update; factors of the Jacobian with their pivots. */
+/* What Newton's iteration works with: unknowns; rows and their update; pivots and factors of the Jacobian. */
 typedef struct {
   double *z, *rows, *update, *pivot, *factors;
 } newton_data;
@@ -518,7 +521,7 @@ static newton_data newton_in(double *workspace)
 }
 
 /* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p, const double *size_q, movement *moved)
+static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p,     const double *size_q, movement *moved)
 {
   const int blocks = shape->rows / M;
   double change[M];
@@ -556,7 +559,8 @@ static int has_converged(const kepler_svi_4_options *options, const movement *mo
 }
 
 /* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
-static void add_boundary(const step_data *step, const newton_data *data, const double *q1, int linearise, const band *shape)
+static void add_boundary(const step_data *step, const newton_data *data, const double *q1, int with_jacobian,
+    const band *shape)
 {
   for (int i = 0; i < M; i++) {
     double *row = data->rows + i * (B + 1) + B;
@@ -564,7 +568,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const d
     for (int b = 0; b < B; b++)
       *row += END_POSITION[b] * data->z[i * B + b];
   }
-  for (int i = 0; linearise && i < M; i++) {
+  for (int i = 0; with_jacobian && i < M; i++) {
     double *corner = data->factors + shape->first + PLACE[i] * (B + 1) * (shape->stride + 1);
     for (int b = 0; b < B; b++) {
       corner[B * shape->stride + b] = MOMENTUM_ROW[b];
@@ -576,8 +580,8 @@ static void add_boundary(const step_data *step, const newton_data *data, const d
 /* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. The factors, of
  * an earlier step if *keep, serve as long as updates are small and shrink at least 10-fold. With an end position q1, p0
  * is unknown too and found in place. */
-static int newton(const step_data *step, const newton_data *data, const double *q1, double *p0, double *increment, int *keep,
-    const kepler_svi_4_options *options, kepler_svi_4_report *report)
+static int newton(const step_data *step, const newton_data *data, const double *q1, double *p0, double *increment,
+    int *keep, const kepler_svi_4_options *options, kepler_svi_4_report *report)
 {
   const band shape = band_of(q1 ? B + 1 : B);
   double size_q[M], size_p[M], change[M], last = INFINITY;
@@ -872,6 +876,7 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
   return status;
 }
 #else
+
 /* The guess from the step before is sum_c EXTRAPOLATION[c][b] z_c. */
 static const double EXTRAPOLATION[4][4] = {
   {-0.3043475322896335, -1.956342611081263, -7.352359801851611, -14.971892910590412},
@@ -879,7 +884,6 @@ static const double EXTRAPOLATION[4][4] = {
   {-1.929896390297009, -9.46401244076669, -29.80681363156252, -55.9889724574008},
   {2.191699902136537, 6.173927437193185, 15.914967984193565, 27.864733549197386}
 };
-
 
 typedef struct {
   int unused;

@@ -153,16 +153,20 @@ static void exchange(double *a, double *b)
   *b = kept;
 }
 
-/* Does to x what was done to the rows of the matrix at columns k < end: exchanges, and subtraction of multiples. */
+/* x_i -= factor column_i for begin <= i < end. */
+static inline void subtract(const double *restrict column, double factor, int begin, int end, double *restrict x)
+{
+  for (int i = begin; i < end; i++)
+    x[i] -= factor * column[i];
+}
+
+/* Does to x what was done to the rows of the matrix at columns begin <= k < end: exchanges, subtraction of multiples. */
 static void eliminate(const double *a, const band *shape, const double *pivot, int begin, int end, double *x)
 {
   for (int k = begin; k < end; k++) {
-    const double *column = a + shape->first + k * shape->stride;
-    const int bottom = least(k + shape->reach, shape->rows - 1);
     exchange(x + k, x + (int)pivot[k]);
     if (x[k] != 0.0)
-      for (int i = k + 1; i <= bottom; i++)
-        x[i] -= column[i] * x[k];
+      subtract(a + shape->first + k * shape->stride, x[k], k + 1, least(k + shape->reach + 1, shape->rows), x);
   }
 }
 
@@ -172,10 +176,10 @@ static int factorise(double *a, const band *shape, double *pivot)
 {
   for (int k = 0; k < shape->rows; k++) {
     double *column = a + shape->first + k * shape->stride;
-    const int bottom = least(k + shape->reach, shape->rows - 1);
+    const int end = least(k + shape->reach + 1, shape->rows);
     int best = k;
     eliminate(a, shape, pivot, most(k - 2 * shape->reach, 0), k, column);
-    for (int i = k + 1; i <= bottom; i++)
+    for (int i = k + 1; i < end; i++)
       if (fabs(column[i]) > fabs(column[best]))
         best = i;
     pivot[k] = (double)best;
@@ -183,7 +187,7 @@ static int factorise(double *a, const band *shape, double *pivot)
       return 0;
     exchange(column + k, column + best);
     column[k] = 1.0 / column[k];
-    for (int i = k + 1; i <= bottom; i++)
+    for (int i = k + 1; i < end; i++)
       column[i] *= column[k];
   }
   return 1;
@@ -196,8 +200,7 @@ static void back_substitute(const double *a, const band *shape, const double *pi
   for (int k = shape->rows - 1; k >= 0; k--) {
     const double *column = a + shape->first + k * shape->stride;
     x[k] *= column[k];
-    for (int i = most(k - 2 * shape->reach, 0); i < k; i++)
-      x[i] -= column[i] * x[k];
+    subtract(column, x[k], most(k - 2 * shape->reach, 0), k, x);
   }
 }
 
@@ -397,7 +400,8 @@ static inline void scatter_slopes(const double *row, const double *column, int p
 }
 
 /* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */
-static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian, const band *shape)
+static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian,
+    const band *shape)
 {
   const double h = step->h;
   double *u = step->scratch, *value = u + 4, *slope = value + 4;
@@ -465,8 +469,7 @@ static void measure(movement *moved, const double *change, const double *size)
   moved->absolute = larger(moved->absolute, largest_change);
 }
 
-/* What Newton's iteration works with: unknowns; rows and
- * their update; factors of the Jacobian with their pivots. */
+/* What Newton's iteration works with: unknowns; rows and their update; pivots and factors of the Jacobian. */
 typedef struct {
   double *z, *rows, *update, *pivot, *factors;
 } newton_data;
@@ -483,7 +486,7 @@ static newton_data newton_in(double *workspace)
 }
 
 /* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p, const double *size_q, movement *moved)
+static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p,     const double *size_q, movement *moved)
 {
   const int blocks = shape->rows / M;
   double change[M];
@@ -521,7 +524,8 @@ static int has_converged(const pendulum_stoermer_verlet_options *options, const 
 }
 
 /* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
-static void add_boundary(const step_data *step, const newton_data *data, const double *q1, int linearise, const band *shape)
+static void add_boundary(const step_data *step, const newton_data *data, const double *q1, int with_jacobian,
+    const band *shape)
 {
   for (int i = 0; i < M; i++) {
     double *row = data->rows + i * (B + 1) + B;
@@ -529,7 +533,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const d
     for (int b = 0; b < B; b++)
       *row += END_POSITION[b] * data->z[i * B + b];
   }
-  for (int i = 0; linearise && i < M; i++) {
+  for (int i = 0; with_jacobian && i < M; i++) {
     double *corner = data->factors + shape->first + PLACE[i] * (B + 1) * (shape->stride + 1);
     for (int b = 0; b < B; b++) {
       corner[B * shape->stride + b] = MOMENTUM_ROW[b];
@@ -541,8 +545,8 @@ static void add_boundary(const step_data *step, const newton_data *data, const d
 /* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. The factors, of
  * an earlier step if *keep, serve as long as updates are small and shrink at least 10-fold. With an end position q1, p0
  * is unknown too and found in place. */
-static int newton(const step_data *step, const newton_data *data, const double *q1, double *p0, double *increment, int *keep,
-    const pendulum_stoermer_verlet_options *options, pendulum_stoermer_verlet_report *report)
+static int newton(const step_data *step, const newton_data *data, const double *q1, double *p0, double *increment,
+    int *keep, const pendulum_stoermer_verlet_options *options, pendulum_stoermer_verlet_report *report)
 {
   const band shape = band_of(q1 ? B + 1 : B);
   double size_q[M], size_p[M], change[M], last = INFINITY;

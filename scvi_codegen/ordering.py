@@ -1,8 +1,8 @@
 """An order of the coordinates in which those that meet in the equations stand near each other.
 
-Two coordinates meet where a second derivative of the Lagrangian by both does not vanish. The Newton matrix has a block for
-every pair that meets; in a good order the blocks lie in a narrow band, outside of which nothing is stored or computed.
-A chain has bandwidth 1, a ring 2, and where all meet the band is the whole matrix.
+Two coordinates meet where a second derivative of the Lagrangian by both does not vanish. The Newton matrix has a block
+for every pair that meets; in a good order the blocks lie in a narrow band, outside of which nothing is stored or
+computed. A chain has bandwidth 1, a ring 2, and where all meet the band is the whole matrix.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def places(pairs: Pairs, count: int) -> tuple[int, ...]:
     """The place of each of ``count`` coordinates: the given order, or the one of Cuthill and McKee if it is narrower.
 
     >>> places([(0, 2), (1, 2)], 3)
-    (0, 2, 1)
+    (2, 0, 1)
     """
     met = {(max(pair), min(pair)) for pair in pairs if pair[0] != pair[1]}
     given = tuple(range(count))

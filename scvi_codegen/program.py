@@ -28,8 +28,8 @@ __all__ = [
 ]
 
 WORTH_REMEMBERING = 32
-"""Unknowns from which on the factors of the Newton matrix are kept from step to step: with 16 (Kepler's problem, degree
-8) new ones are as quick as the iterations more that old ones need; with 34 they take twice the time, with 144 ten times."""
+"""Unknowns from which on factors of the Newton matrix go from step to step. With 16 (Kepler's problem, degree 8) new
+ones take as long as the additional iterations with old ones, with 34 twice as long, with 144 ten times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,7 +424,10 @@ class Program:
 
     def __str__(self) -> str:
         """Readable text of the whole program."""
-        head = [f"program {self.prefix}: {self.title}", f"  {self.blocks} blocks of {self.dimension} unknowns"]
+        head = [
+            f"program {self.prefix}: {self.title}",
+            f"  {self.blocks} blocks of {self.dimension} unknowns, bandwidth {self.bandwidth}",
+        ]
         for family in self.families:
             head.append(f"  family {family.name}: {family.points} points")
             head += [
