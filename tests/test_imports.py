@@ -17,7 +17,7 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source
+    errors precision program source ordering
     derivatives expression_text nodes arguments
     quadrature system
     basis mechanics stage_system
