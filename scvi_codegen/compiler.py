@@ -109,6 +109,6 @@ def c_identifier(name: str) -> str:
     A single letter (``X_OK`` is a macro of POSIX) and names of C headers get a longer name.
     """
     cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
-    if len(cleaned) < 2 or cleaned in C_HEADERS or not cleaned[0].isalpha():
+    if not cleaned[:1].isalpha():
         return f"integrator_{cleaned}".rstrip("_")
-    return cleaned
+    return f"{cleaned}_integrator" if len(cleaned) == 1 or cleaned in C_HEADERS else cleaned

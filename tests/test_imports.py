@@ -37,7 +37,7 @@ FLOORS = """
     compiler
     problems
     model_file
-    package plotting
+    package plotting advice distributed ensemble_file
     __init__
     benchmark
     cli
