@@ -18,7 +18,7 @@ extern "C" {
 #define KEPLER_SVI_4_PARAMETERS 1
 #define KEPLER_SVI_4_UNKNOWNS 8
 /* Length, in doubles, of the workspace that the functions below ask for. */
-#define KEPLER_SVI_4_WORKSPACE 160
+#define KEPLER_SVI_4_WORKSPACE 176
 
 /* What a function returns. A call that fails leaves its state untouched. */
 enum {
@@ -52,8 +52,8 @@ typedef struct {
   long long step; /* completed; the time is t0 + step h */
   double q[2], p[2];
   double carry_q[2], carry_p[2];
-  double memory[8];
-  long long guess;      /* whether memory can be extrapolated */
+  double memory[16];
+  long long guess;      /* from how many steps in memory the next is continued */
   long long iterations; /* since the last stored state */
 } kepler_svi_4_run;
 

@@ -54,7 +54,7 @@ typedef struct {
   double q[1], p[1];
   double carry_q[1], carry_p[1];
   double memory[2];
-  long long guess;      /* whether memory can be extrapolated */
+  long long guess;      /* from how many steps in memory the next is continued */
   long long iterations; /* since the last stored state */
 } pendulum_stoermer_verlet_run;
 

@@ -20,7 +20,6 @@ from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
 from scvi_codegen.rendering import render, render_ensemble, workspace_size
-from scvi_codegen.shooting_sweep import shooting_sweep_of
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.splitting import splitting_of
 from scvi_codegen.stepper import Stepper
@@ -80,7 +79,7 @@ def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: s
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = solver in ("auto", "fixed-point") and splitting is None
-    sweep = (shooting_sweep_of(system, method) or sweep_of(system, method)) if swept else None
+    sweep = sweep_of(system, method) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))
     return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton)
