@@ -7,7 +7,8 @@
       -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.stepper`)
 
-Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk.
+Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
+kept in the user's cache folder (:mod:`scvi_codegen.text_cache`), so the second time is quick.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from scvi_codegen.splitting import splitting_of
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.sweeps import check_solver, sweep_of
 from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.text_cache import Texts, remembered_texts
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
 
@@ -62,9 +64,13 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
-    program = _program(system, method, solver=solver, prefix=prefix)
-    interface = describe(program, system, method)
-    return Stepper(render(program), interface, ensemble=render_ensemble(program), flags=flags)
+
+    def make() -> Texts:
+        program = _program(system, method, solver=solver, prefix=prefix)
+        return render(program), describe(program, system, method), render_ensemble(program)
+
+    source, interface, ensemble = remembered_texts(system, method, solver, prefix, make)
+    return Stepper(source, interface, ensemble=ensemble, flags=flags)
 
 
 def generate_source(

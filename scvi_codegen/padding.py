@@ -54,7 +54,7 @@ def guess_tables(abscissae: Vector, lanes: int, through: Matrix | None = None) -
     ``through``: a matrix to apply to the guess.
     """
     alone = extrapolation(abscissae, 1, min(len(abscissae) - 1, DEGREE_OF_ONE))
-    tables = (alone, *continuation(abscissae, min(2 * len(abscissae) - 2, DEGREE_OF_TWO)))
+    tables: tuple[Matrix, ...] = (alone, *continuation(abscissae, min(2 * len(abscissae) - 2, DEGREE_OF_TWO)))
     if through is not None:
         tables = tuple(matrix_product(through, table) for table in tables)
     last_alone, last, before = (pad_matrix(table, lanes) for table in tables)

@@ -32,7 +32,7 @@ FLOORS = """
     separable_sweep coupled_sweep shooting_sweep
     sweeps
     trajectory
-    binding
+    binding text_cache
     run ensemble
     stepper
     compiler
