@@ -11,7 +11,7 @@ enum {
   N = B * M,
   POINTS = 5, /* most points of a family, or blocks */
   BAND = 1, /* coordinates that meet are at most so many places apart */
-  MEMORY = 10, /* numbers kept from step to step */
+  MEMORY = 14, /* numbers kept from step to step */
   SCRATCH = 64 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
 };
 
@@ -169,115 +169,132 @@ static const int NODE_SLOPE_4[2][2] = { /* {i, j}: d value_i / d u_j */
   {0, 0}, {1, 1}
 };
 
-/* L_q and L_v at u = (q, v). Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+/* x^(-1/2) */
+static inline double inverse_root_1(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*sqrt(x);
+}
+
+/* x^(-3/2) */
+static inline double inverse_root_3(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*inverse*sqrt(x);
+}
+
+/* x^(-5/2) */
+static inline double inverse_root_5(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*inverse*inverse*sqrt(x);
+}
+
+/* x^(-7/2) */
+static inline double inverse_root_7(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*inverse*inverse*inverse*sqrt(x);
+}
+
+/* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
-  const double w0 = u[0]*u[0] + u[1]*u[1];
-  const double w1 = 1.0/w0;
-  const double w2 = parameters[0]*(w1*w1*sqrt(w0));
-  value[0] = -(w2*u[0]);
-  value[1] = -(w2*u[1]);
+  const double w0 = parameters[0]*inverse_root_3(u[0]*u[0] + u[1]*u[1]);
+  value[0] = -(w0*u[0]);
+  value[1] = -(w0*u[1]);
   value[2] = u[2];
   value[3] = u[3];
 }
 
-/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
+/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1 inverse_root_5, 4 neg. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = u[0]*u[0];
   const double w1 = u[1]*u[1];
   const double w2 = w0 + w1;
-  const double w3 = sqrt(w2);
-  const double w4 = 1.0/w2;
-  const double w5 = w4*w4;
-  const double w6 = parameters[0]*(w5*w3);
-  const double w7 = w5*w4*w3;
-  const double w8 = 3.0*parameters[0];
-  const double w9 = w8*w7*u[0]*u[1];
-  value[0] = -(w6*u[0]);
-  value[1] = -(w6*u[1]);
+  const double w3 = parameters[0]*inverse_root_3(w2);
+  const double w4 = inverse_root_5(w2);
+  const double w5 = 3.0*parameters[0];
+  const double w6 = w5*w4*u[0]*u[1];
+  value[0] = -(w3*u[0]);
+  value[1] = -(w3*u[1]);
   value[2] = u[2];
   value[3] = u[3];
-  slope[0] = -(w6 - w8*w0*w7);
-  slope[1] = w9;
-  slope[2] = w9;
-  slope[3] = -(w6 - w8*w1*w7);
+  slope[0] = -(w3 - w5*w0*w4);
+  slope[1] = w6;
+  slope[2] = w6;
+  slope[3] = -(w3 - w5*w1*w4);
   slope[4] = 1.0;
   slope[5] = 1.0;
 }
 
-/* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 25 *, 3 +, 4 -, 1 /, 1 sqrt. */
+/* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
 static void node_value(const double *u, const double *parameters, double *value)
 {
   const double w0 = u[0]*u[0];
   const double w1 = u[1]*u[1];
   const double w2 = w0 + w1;
-  const double w3 = sqrt(w2);
-  const double w4 = 1.0/w2;
-  const double w5 = w4*w4;
-  const double w6 = parameters[0]*(w5*w3);
-  const double w7 = w5*w4*w3;
-  const double w8 = 3.0*parameters[0];
-  const double w9 = w8*w7;
-  value[0] = w6*u[6] - w8*w0*w7*u[6] - w9*u[0]*u[1]*u[7];
-  value[1] = w6*u[7] - w8*w1*w7*u[7] - w9*u[6]*u[0]*u[1];
+  const double w3 = parameters[0]*inverse_root_3(w2);
+  const double w4 = inverse_root_5(w2);
+  const double w5 = 3.0*parameters[0];
+  const double w6 = w5*w4;
+  value[0] = w3*u[6] - w5*w0*w4*u[6] - w6*u[0]*u[1]*u[7];
+  value[1] = w3*u[7] - w5*w1*w4*u[7] - w6*u[6]*u[0]*u[1];
   value[2] = 0.0;
   value[3] = 0.0;
   value[4] = u[6];
   value[5] = u[7];
-  value[6] = w6*u[0] + u[4];
-  value[7] = w6*u[1] + u[5];
+  value[6] = w3*u[0] + u[4];
+  value[7] = w3*u[1] + u[5];
 }
 
-/* The same, and the non-zero derivatives with respect to u = (q, v, a, lambda). Operations: 61 *, 6 +, 12 -, 1 /, 1 neg, 1 sqrt. */
+/* The same, and the non-zero derivatives with respect to u = (q, v, a, lambda). Operations: 55 *, 6 +, 12 -, 1 inverse_root_3, 1 inverse_root_5, 1 inverse_root_7, 1 neg. */
 static void node_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = u[0]*u[0];
   const double w1 = u[1]*u[1];
   const double w2 = w0 + w1;
-  const double w3 = sqrt(w2);
-  const double w4 = 1.0/w2;
-  const double w5 = w4*w4;
-  const double w6 = parameters[0]*(w5*w3);
-  const double w7 = w5*w4*w3;
-  const double w8 = parameters[0]*w7;
-  const double w9 = 3.0*parameters[0];
-  const double w10 = w9*w0*w7;
-  const double w11 = w9*w7;
-  const double w12 = w11*u[0]*u[1];
-  const double w13 = w8*u[6];
-  const double w14 = w9*w1*w7;
-  const double w15 = w11*u[6]*u[0];
-  const double w16 = w5*w5*w3;
-  const double w17 = 5.0*parameters[0];
-  const double w18 = w17*w0*w16;
-  const double w19 = w17*w1*w16;
-  const double w20 = (-3.0)*(w8*u[0]*u[7] + w13*u[1] - w19*u[0]*u[7] - w18*u[6]*u[1]);
-  const double w21 = w6 - w10;
-  const double w22 = -w12;
-  const double w23 = w6 - w14;
-  value[0] = w6*u[6] - w10*u[6] - w12*u[7];
-  value[1] = w6*u[7] - w14*u[7] - w15*u[1];
+  const double w3 = parameters[0]*inverse_root_3(w2);
+  const double w4 = inverse_root_5(w2);
+  const double w5 = parameters[0]*w4;
+  const double w6 = 3.0*parameters[0];
+  const double w7 = w6*w0*w4;
+  const double w8 = w6*w4;
+  const double w9 = w8*u[0]*u[1];
+  const double w10 = w5*u[6];
+  const double w11 = w6*w1*w4;
+  const double w12 = w8*u[6]*u[0];
+  const double w13 = inverse_root_7(w2);
+  const double w14 = 5.0*parameters[0];
+  const double w15 = w14*w0*w13;
+  const double w16 = w14*w1*w13;
+  const double w17 = (-3.0)*(w5*u[0]*u[7] + w10*u[1] - w16*u[0]*u[7] - w15*u[6]*u[1]);
+  const double w18 = w3 - w7;
+  const double w19 = -w9;
+  const double w20 = w3 - w11;
+  value[0] = w3*u[6] - w7*u[6] - w9*u[7];
+  value[1] = w3*u[7] - w11*u[7] - w12*u[1];
   value[2] = 0.0;
   value[3] = 0.0;
   value[4] = u[6];
   value[5] = u[7];
-  value[6] = w6*u[0] + u[4];
-  value[7] = w6*u[1] + u[5];
-  slope[0] = (-3.0)*(w15 + w8*u[1]*u[7] - w17*(w0*u[0])*w16*u[6] - w18*u[1]*u[7]);
-  slope[1] = w20;
-  slope[2] = w20;
-  slope[3] = (-3.0)*(w13*u[0] + w11*u[1]*u[7] - w17*w16*(w1*u[1])*u[7] - w19*u[6]*u[0]);
-  slope[4] = w21;
-  slope[5] = w22;
-  slope[6] = w22;
-  slope[7] = w23;
+  value[6] = w3*u[0] + u[4];
+  value[7] = w3*u[1] + u[5];
+  slope[0] = (-3.0)*(w12 + w5*u[1]*u[7] - w14*(w0*u[0])*w13*u[6] - w15*u[1]*u[7]);
+  slope[1] = w17;
+  slope[2] = w17;
+  slope[3] = (-3.0)*(w10*u[0] + w8*u[1]*u[7] - w14*w13*(w1*u[1])*u[7] - w16*u[6]*u[0]);
+  slope[4] = w18;
+  slope[5] = w19;
+  slope[6] = w19;
+  slope[7] = w20;
   slope[8] = 1.0;
   slope[9] = 1.0;
-  slope[10] = w21;
-  slope[11] = w22;
-  slope[12] = w22;
-  slope[13] = w23;
+  slope[10] = w18;
+  slope[11] = w19;
+  slope[12] = w19;
+  slope[13] = w20;
   slope[14] = 1.0;
   slope[15] = 1.0;
 }
@@ -291,11 +308,10 @@ static void legendre(const double *u, double *value, double *slope)
   slope[1] = 1.0;
 }
 
-/* L at u = (q, v). Operations: 8 *, 3 +, 1 /, 1 sqrt. */
+/* L at u = (q, v). Operations: 7 *, 3 +, 1 inverse_root_1. */
 static void lagrangian(const double *u, const double *parameters, double *value)
 {
-  const double w0 = u[0]*u[0] + u[1]*u[1];
-  value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*(1.0/w0*sqrt(w0)));
+  value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*inverse_root_1(u[0]*u[0] + u[1]*u[1]));
 }
 
 /* Place of each coordinate in the order in which those that meet stand near each other. */
@@ -824,12 +840,53 @@ static inline lanes lanes_of(double x)
   return zero + x;
 }
 
+#if defined(__AVX512F__) && 2 % 8 == 0
+static inline lanes lanes_estimate_inverse_root(lanes x)
+{
+  typedef double part __attribute__((vector_size(64)));
+  const part zero = {0.0};
+  union {
+    lanes all;
+    part parts[LANES / 8];
+  } view = {x};
+  for (int j = 0; j < LANES / 8; j++)
+    view.parts[j] = __builtin_ia32_rsqrt14pd512_mask(view.parts[j], zero, 255);
+  return view.all;
+}
+#endif
+
 static inline lanes lanes_sqrt(lanes x)
 {
   lane_view view = {x};
   for (int j = 0; j < LANES; j++)
     view.lane[j] = sqrt(view.lane[j]);
   return view.all;
+}
+
+/* x^(-3/2). AVX-512 has the inverse root to 14 bits; with e = 1 - x y^2 the rest is the series of (1 - e)^(-3/2). */
+static inline lanes lanes_inverse_root_3(lanes x)
+{
+#if defined(__AVX512F__) && 2 % 8 == 0
+  const lanes y = lanes_estimate_inverse_root(x), square = y * y, e = 1.0 - x * square;
+  const lanes power = square * y, first = 1.5 + 1.875 * e, then = 2.1875 + 2.4609375 * e;
+  return power + (power * e) * (first + (e * e) * then);
+#else
+  const lanes inverse = 1.0 / x;
+  return inverse * inverse * lanes_sqrt(x);
+#endif
+}
+
+/* x^(-5/2). AVX-512 has the inverse root to 14 bits; with e = 1 - x y^2 the rest is the series of (1 - e)^(-5/2). */
+static inline lanes lanes_inverse_root_5(lanes x)
+{
+#if defined(__AVX512F__) && 2 % 8 == 0
+  const lanes y = lanes_estimate_inverse_root(x), square = y * y, e = 1.0 - x * square;
+  const lanes power = square * square * y, first = 2.5 + 4.375 * e, then = 6.5625 + 9.0234375 * e;
+  return power + (power * e) * (first + (e * e) * then);
+#else
+  const lanes inverse = 1.0 / x;
+  return inverse * inverse * inverse * lanes_sqrt(x);
+#endif
 }
 
 /* Column j of a table multiplies node j, or point j of a transposed one. Lanes beyond repeat the last. */
@@ -857,9 +914,17 @@ static const lanes POINT_VELOCITY_T[2] = {
   {1.5773502691896257, -0.5773502691896257},
   {0.4226497308103742, 0.5773502691896257}
 };
-static const lanes NODE_EXTRAPOLATION[2] = {
+static const lanes LAST_ALONE[2] = {
   {-1.0, -2.0},
   {2.0, 3.0}
+};
+static const lanes LAST[2] = {
+  {-0.75, -2.15},
+  {2.25, 4.05}
+};
+static const lanes BEFORE[2] = {
+  {0.75, 1.95},
+  {-1.25, -2.85}
 };
 static const lanes POINT_WEIGHT = {0.5, 0.5};
 static const lanes NODE_END = {1.0, 0.0};
@@ -895,37 +960,55 @@ static inline void lanes_store(const lanes *x, double *memory)
   memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
-/* E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m). Operations: 23 *, 3 +, 4 -, 1 /, 1 sqrt. */
+/* What is kept at the points, continued into this step from the last one or from the last two. */
+static inline void continue_curve(const double *memory, long long steps, lanes *x)
+{
+  lanes before[M];
+  lanes_load(memory, x);
+  lanes_load(memory + M * LANES, before);
+  for (int i = 0; i < M; i++)
+    x[i] = steps == 1 ? lanes_apply(LAST_ALONE, x[i]) : lanes_apply(LAST, x[i]) + lanes_apply(BEFORE, before[i]);
+}
+
+static inline void remember_curve(const lanes *x, double *memory)
+{
+  memcpy(memory + M * LANES, memory, sizeof(double) * M * LANES);
+  lanes_store(x, memory);
+}
+
+/* From how many steps the next guess is best continued: a polynomial of high degree through two is the better one while
+ * guesses are good, and the worse one when the steps are long. */
+static inline long long steps_to_continue(long long steps, double first_change)
+{
+  return steps > 0 && first_change < 1e-06 ? 2 : 1;
+}
+
+/* E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m). Operations: 19 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
 static inline void node_lanes(const lanes *u, const double *parameters, lanes *value, lanes *slope)
 {
   const lanes w0 = u[0]*u[0];
   const lanes w1 = u[1]*u[1];
   const lanes w2 = w0 + w1;
-  const lanes w3 = lanes_sqrt(w2);
-  const lanes w4 = 1.0/w2;
-  const lanes w5 = w4*w4;
-  const lanes w6 = parameters[0]*(w5*w3);
-  const lanes w7 = w5*w4*w3;
-  const double w8 = 3.0*parameters[0];
-  const lanes w9 = w8*w7*u[0]*u[1];
-  value[0] = w6*u[0] + u[4];
-  value[1] = w6*u[1] + u[5];
-  value[2] = w6*u[6] - w8*w0*w7*u[6] - w9*u[7];
-  value[3] = w6*u[7] - w8*w1*w7*u[7] - w9*u[6];
+  const lanes w3 = parameters[0]*lanes_inverse_root_3(w2);
+  const lanes w4 = lanes_inverse_root_5(w2);
+  const double w5 = 3.0*parameters[0];
+  const lanes w6 = w5*w4*u[0]*u[1];
+  value[0] = w3*u[0] + u[4];
+  value[1] = w3*u[1] + u[5];
+  value[2] = w3*u[6] - w5*w0*w4*u[6] - w6*u[7];
+  value[3] = w3*u[7] - w5*w1*w4*u[7] - w6*u[6];
   value[4] = lanes_of(0.0);
   value[5] = lanes_of(0.0);
   slope[0] = lanes_of(1.0);
   slope[1] = lanes_of(1.0);
 }
 
-/* L_q and L_v at all points, u = (q, v). Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+/* L_q and L_v at all points, u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static inline void action_lanes(const lanes *u, const double *parameters, lanes *value)
 {
-  const lanes w0 = u[0]*u[0] + u[1]*u[1];
-  const lanes w1 = 1.0/w0;
-  const lanes w2 = parameters[0]*(w1*w1*lanes_sqrt(w0));
-  value[0] = -(w2*u[0]);
-  value[1] = -(w2*u[1]);
+  const lanes w0 = parameters[0]*lanes_inverse_root_3(u[0]*u[0] + u[1]*u[1]);
+  value[0] = -(w0*u[0]);
+  value[1] = -(w0*u[1]);
   value[2] = u[2];
   value[3] = u[3];
 }
@@ -945,29 +1028,21 @@ static inline void solve_mass(const lanes *mass, lanes *r)
 
 /* What follows a sweep would change the points by, squared, with a margin: the rate of contraction is that from the sweep
  * before, whose change is infinite before the first. */
-static inline double expected_change(double change, double last, const kepler_scvi_2_options *options)
+static inline double expected_change(double change, double last, int absolute)
 {
-  const double ratio = last < INFINITY ? smaller(larger(change / last, 1e-6), 0.25) : 1.0; /* squares, too */
-  return options->absolute ? change : 4.0 * ratio * change;
+  const double quotient = change / last, ratio = last < INFINITY ? smaller(larger(quotient, 1e-6), 0.25) : 1.0; /* squares */
+  return absolute ? change : 4.0 * ratio * change;
 }
 
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
  * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
- * contracts too slowly or not at all. */
-static int sweep_status(double change, double last, const kepler_scvi_2_options *options, int k)
+ * contracts too slowly or not at all. Without branches, for many at once. */
+static inline int sweep_status(double change, double last, double tolerance, int absolute, int max_iterations, int k)
 {
-  const double expected = expected_change(change, last, options);
-  if (!(change < INFINITY))
-    return -1;
-  if (change == 0.0)
-    return 1;
-  if (expected <= options->tolerance * options->tolerance)
-    return 1;
-  if (k > 0 && change >= last * 0.0625 && change < 1e-25)
-    return 1;
-  if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
-    return -1;
-  return 0;
+  const int small = expected_change(change, last, absolute) <= tolerance * tolerance;
+  const int stopped = (change == 0.0) | ((k > 0) & (change >= last * 0.0625) & (change < 1e-25));
+  const int slow = (k >= max_iterations) | ((k > 4) & (change > 0.5 * last) & (change > 1e-20));
+  return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
 typedef struct {
@@ -985,23 +1060,23 @@ typedef struct {
   lanes z[M], m[M];
 } shot;
 
+/* In memory: z of the last step and of the one before, m, v0. */
 static void save_shot(const shot *curve, double *memory)
 {
-  lanes_store(curve->z, memory);
-  lanes_store(curve->m, memory + M * LANES);
-  memcpy(memory + 2 * M * LANES, curve->v0, sizeof curve->v0);
+  remember_curve(curve->z, memory);
+  lanes_store(curve->m, memory + 2 * M * LANES);
+  memcpy(memory + 3 * M * LANES, curve->v0, sizeof curve->v0);
 }
 
-/* The curve of the step before, continued. */
-static void continue_shot(const double *memory, shot *curve)
+/* The curve of the last two steps, continued. */
+static void continue_shot(const double *memory, long long steps, shot *curve)
 {
+  lanes_load(memory + 2 * M * LANES, curve->m);
+  memcpy(curve->v0, memory + 3 * M * LANES, sizeof curve->v0);
   lanes_load(memory, curve->z);
-  lanes_load(memory + M * LANES, curve->m);
-  memcpy(curve->v0, memory + 2 * M * LANES, sizeof curve->v0);
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < M; i++)
     curve->v0[i] += lanes_total(NODE_MASK * NODE_END * curve->z[i]);
-    curve->z[i] = lanes_apply(NODE_EXTRAPOLATION, curve->z[i]);
-  }
+  continue_curve(memory, steps, curve->z);
 }
 
 /* Positions, velocities, accelerations and multipliers at the nodes. */
@@ -1032,16 +1107,16 @@ static inline double end_increment(const step_data *step, const sweep_data *data
 }
 
 /* One step. Accelerations, momentum, initial velocity and multipliers are corrected in turn until all rest. */
-static int sweep(const step_data *step, const sweep_data *data, double *memory, int guess, double *dq, double *dp,
+static int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const kepler_scvi_2_options *options, kepler_scvi_2_report *report)
 {
   shot curve;
   lanes V[M], u[4 * M], node[3 * M], action[2 * M], mass[M];
   const double h = step->h;
-  double inverse_size[M], last = INFINITY, largest = 0.0;
+  double inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
   int status = 0, settled = 0;
-  if (guess) {
-    continue_shot(memory, &curve);
+  if (*steps > 0) {
+    continue_shot(memory, *steps, &curve);
   } else {
     status = kepler_scvi_2_velocity(step->t, step->q0, step->p0, step->parameters, curve.v0, step->scratch);
     if (status != KEPLER_SCVI_2_OK)
@@ -1093,11 +1168,12 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
       curve.m[i] = -r[i];
     }
     total += lanes_total(change);
-    status = sweep_status(total, last, options, k);
+    status = sweep_status(total, last, options->tolerance, options->absolute, options->max_iterations, k);
     if (status > 0 && !settled) { /* once more: the rate of contraction shows late */
       settled = 1;
       status = 0;
     }
+    first = k == 0 ? total : first;
     last = total;
     report->iterations++;
   }
@@ -1115,6 +1191,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   if (!all_finite(dq, M) || !all_finite(dp, M))
     return KEPLER_SCVI_2_NOT_FINITE;
   save_shot(&curve, memory);
+  *steps = steps_to_continue(*steps, first);
   return KEPLER_SCVI_2_OK;
 }
 #endif
@@ -1147,23 +1224,26 @@ static void prepare(const step_data *step, solver_data *data)
   prepare_sweep(step, data);
 }
 
-/* The increments by sweeps, from the extrapolated guess and then from the straight line, else by Newton's iteration. On success
- * guess says whether memory can be extrapolated. */
+/* The increments by sweeps, from the curve of the last two steps continued and then from the straight line, else by
+ * Newton's iteration. On success guess says from how many steps the next is continued. */
 static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const kepler_scvi_2_options *options, kepler_scvi_2_report *report, double *workspace)
 {
-  int status = sweep(step, data, memory, *guess != 0, dq, dp, options, report), swept = 1;
-  if (status != KEPLER_SCVI_2_OK && *guess)
-    status = sweep(step, data, memory, 0, dq, dp, options, report);
+  long long steps = *guess;
+  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != KEPLER_SCVI_2_OK && steps > 0) {
+    steps = 0;
+    status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  }
   if (status != KEPLER_SCVI_2_OK) {
     const newton_data newtons = newton_in(workspace);
     int keep;
     status = newton_from_line(step, &newtons, dp, &keep, options, report);
     gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
-    swept = 0;
+    steps = 0;
   }
   if (status == KEPLER_SCVI_2_OK)
-    *guess = swept;
+    *guess = steps;
   return status;
 }
 #else

@@ -18,7 +18,7 @@ extern "C" {
 #define KEPLER_SCVI_2_PARAMETERS 1
 #define KEPLER_SCVI_2_UNKNOWNS 10
 /* Length, in doubles, of the workspace that the functions below ask for. */
-#define KEPLER_SCVI_2_WORKSPACE 264
+#define KEPLER_SCVI_2_WORKSPACE 268
 
 /* What a function returns. A call that fails leaves its state untouched. */
 enum {
@@ -52,8 +52,8 @@ typedef struct {
   long long step; /* completed; the time is t0 + step h */
   double q[2], p[2];
   double carry_q[2], carry_p[2];
-  double memory[10];
-  long long guess;      /* what memory holds, 0 if nothing */
+  double memory[14];
+  long long guess;      /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
 } kepler_scvi_2_run;
 

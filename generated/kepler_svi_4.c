@@ -11,7 +11,7 @@ enum {
   N = B * M,
   POINTS = 4, /* most points of a family, or blocks */
   BAND = 1, /* coordinates that meet are at most so many places apart */
-  MEMORY = 8, /* numbers kept from step to step */
+  MEMORY = 16, /* numbers kept from step to step */
   SCRATCH = 56 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
 };
 
@@ -92,39 +92,55 @@ static const int QUADRATURE_SLOPE_1[2][2] = { /* {i, j}: d value_i / d u_j */
   {0, 0}, {1, 1}
 };
 
-/* L_q and L_v at u = (q, v). Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+/* x^(-1/2) */
+static inline double inverse_root_1(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*sqrt(x);
+}
+
+/* x^(-3/2) */
+static inline double inverse_root_3(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*inverse*sqrt(x);
+}
+
+/* x^(-5/2) */
+static inline double inverse_root_5(double x)
+{
+  const double inverse = 1.0/x;
+  return inverse*inverse*inverse*sqrt(x);
+}
+
+/* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
-  const double w0 = u[0]*u[0] + u[1]*u[1];
-  const double w1 = 1.0/w0;
-  const double w2 = parameters[0]*(w1*w1*sqrt(w0));
-  value[0] = -(w2*u[0]);
-  value[1] = -(w2*u[1]);
+  const double w0 = parameters[0]*inverse_root_3(u[0]*u[0] + u[1]*u[1]);
+  value[0] = -(w0*u[0]);
+  value[1] = -(w0*u[1]);
   value[2] = u[2];
   value[3] = u[3];
 }
 
-/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 17 *, 1 +, 2 -, 1 /, 4 neg, 1 sqrt. */
+/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1 inverse_root_5, 4 neg. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = u[0]*u[0];
   const double w1 = u[1]*u[1];
   const double w2 = w0 + w1;
-  const double w3 = sqrt(w2);
-  const double w4 = 1.0/w2;
-  const double w5 = w4*w4;
-  const double w6 = parameters[0]*(w5*w3);
-  const double w7 = w5*w4*w3;
-  const double w8 = 3.0*parameters[0];
-  const double w9 = w8*w7*u[0]*u[1];
-  value[0] = -(w6*u[0]);
-  value[1] = -(w6*u[1]);
+  const double w3 = parameters[0]*inverse_root_3(w2);
+  const double w4 = inverse_root_5(w2);
+  const double w5 = 3.0*parameters[0];
+  const double w6 = w5*w4*u[0]*u[1];
+  value[0] = -(w3*u[0]);
+  value[1] = -(w3*u[1]);
   value[2] = u[2];
   value[3] = u[3];
-  slope[0] = -(w6 - w8*w0*w7);
-  slope[1] = w9;
-  slope[2] = w9;
-  slope[3] = -(w6 - w8*w1*w7);
+  slope[0] = -(w3 - w5*w0*w4);
+  slope[1] = w6;
+  slope[2] = w6;
+  slope[3] = -(w3 - w5*w1*w4);
   slope[4] = 1.0;
   slope[5] = 1.0;
 }
@@ -138,11 +154,10 @@ static void legendre(const double *u, double *value, double *slope)
   slope[1] = 1.0;
 }
 
-/* L at u = (q, v). Operations: 8 *, 3 +, 1 /, 1 sqrt. */
+/* L at u = (q, v). Operations: 7 *, 3 +, 1 inverse_root_1. */
 static void lagrangian(const double *u, const double *parameters, double *value)
 {
-  const double w0 = u[0]*u[0] + u[1]*u[1];
-  value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*(1.0/w0*sqrt(w0)));
+  value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*inverse_root_1(u[0]*u[0] + u[1]*u[1]));
 }
 
 /* Place of each coordinate in the order in which those that meet stand near each other. */
@@ -635,6 +650,21 @@ static inline lanes lanes_of(double x)
   return zero + x;
 }
 
+#if defined(__AVX512F__) && 4 % 8 == 0
+static inline lanes lanes_estimate_inverse_root(lanes x)
+{
+  typedef double part __attribute__((vector_size(64)));
+  const part zero = {0.0};
+  union {
+    lanes all;
+    part parts[LANES / 8];
+  } view = {x};
+  for (int j = 0; j < LANES / 8; j++)
+    view.parts[j] = __builtin_ia32_rsqrt14pd512_mask(view.parts[j], zero, 255);
+  return view.all;
+}
+#endif
+
 static inline lanes lanes_sqrt(lanes x)
 {
   lane_view view = {x};
@@ -643,35 +673,58 @@ static inline lanes lanes_sqrt(lanes x)
   return view.all;
 }
 
-/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 4 repeat it. */
-static const lanes POINT_DRIFT = {0.06943184420297373, 0.33000947820757165, 0.6699905217924279, 0.9305681557970265};
-static const lanes POINT_POSITION[4] = {
-  {0.5000000000000004, 1.0815897500322804, 0.961274073432115, 1.0204404206840407},
-  {-0.08158975003227997, 0.49999999999999956, 1.0855037514105188, 0.9612740734321141},
-  {0.03872592656788587, -0.08550375141051969, 0.49999999999999956, 1.08158975003228},
-  {-0.020440420684040728, 0.03872592656788587, -0.08158975003228042, 0.5000000000000004}
-};
-static const lanes POINT_POSITION_WEIGHT = {0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684};
-static const lanes POINT_MOMENTUM[4] = {
-  {0.49999999999999956, 1.08158975003228, 0.9612740734321141, 1.0204404206840407},
-  {-0.08158975003228042, 0.5000000000000004, 1.0855037514105197, 0.9612740734321141},
-  {0.03872592656788498, -0.0855037514105188, 0.5000000000000004, 1.0815897500322804},
-  {-0.020440420684040728, 0.03872592656788587, -0.08158975003227997, 0.49999999999999956}
-};
-static const lanes POINT_MOMENTUM_WEIGHT = {0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684};
-static const lanes POINT_END_POSITION = {1.0, 1.0, 1.0, 1.0};
-static const lanes POINT_END_MOMENTUM = {1.0, 1.0, 1.0, 1.0};
+/* x^(-3/2). AVX-512 has the inverse root to 14 bits; with e = 1 - x y^2 the rest is the series of (1 - e)^(-3/2). */
+static inline lanes lanes_inverse_root_3(lanes x)
+{
+#if defined(__AVX512F__) && 4 % 8 == 0
+  const lanes y = lanes_estimate_inverse_root(x), square = y * y, e = 1.0 - x * square;
+  const lanes power = square * y, first = 1.5 + 1.875 * e, then = 2.1875 + 2.4609375 * e;
+  return power + (power * e) * (first + (e * e) * then);
+#else
+  const lanes inverse = 1.0 / x;
+  return inverse * inverse * lanes_sqrt(x);
+#endif
+}
+
+/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 4 repeat it.
+ * The method's numbers are those here and in the _LOW tables together. */
+static const lanes POINT_DRIFT = {0.06943184420297377, 0.33000947820757176, 0.669990521792428, 0.9305681557970265};
+static const lanes POINT_DRIFT_LOW = {0.0, 0.0, 0.0, 0.0};
 static const lanes POINT_PRODUCT[4] = {
-  {0.004038191450846721, 0.04356358090239619, 0.1058643526335763, 0.14879849619263774},
-  {-0.003295860944944712, 0.013818951406296064, 0.10651836096505306, 0.19847049885237736},
-  {0.002644782952066832, -0.004340134194435029, 0.013818951406296128, 0.0816713597958777},
-  {-0.000976722963255885, 0.0014107297391595358, -0.001758015359080553, 0.004038191450846721}
+  {0.004038191450846724, 0.0435635809023962, 0.1058643526335763, 0.14879849619263774},
+  {-0.003295860944944722, 0.01381895140629609, 0.10651836096505307, 0.19847049885237733},
+  {0.002644782952066807, -0.0043401341944350295, 0.013818951406296107, 0.08167135979587767},
+  {-0.0009767229632558895, 0.0014107297391595273, -0.0017580153590805582, 0.004038191450846724}
 };
-static const lanes POINT_EXTRAPOLATION[4] = {
-  {-0.3043475322896335, -1.956342611081263, -7.352359801851611, -14.971892910590412},
-  {1.0425440204501055, 6.246427614654768, 22.244205449220566, 44.09613181879383},
-  {-1.929896390297009, -9.46401244076669, -29.80681363156252, -55.9889724574008},
-  {2.191699902136537, 6.173927437193185, 15.914967984193565, 27.864733549197386}
+static const lanes POINT_PRODUCT_LOW[4] = {
+  {2.969832286390496e-19, 3.92700054182345e-19, 2.0415291784078956e-18, -2.537765970837727e-18},
+  {-1.819477670872445e-19, -9.620710259334002e-20, -4.784156577918922e-18, -9.692155994116688e-18},
+  {1.5106023101830726e-19, -9.622051427704511e-20, 5.456755741398015e-19, -2.2149380791266858e-18},
+  {-7.155028231069932e-20, -6.907655213282067e-20, 9.409968381595206e-20, 2.969832286390496e-19}
+};
+static const lanes POINT_END_POSITION = {0.16185132086231022, 0.21846553629538065, 0.10760704113589256, 0.012076101706416587};
+static const lanes POINT_END_POSITION_LOW = {-4.851905682326445e-19, 1.1305955096787434e-17, 5.5855503045684676e-18, 2.946120982047505e-20};
+static const lanes POINT_END_MOMENTUM = {0.17392742256872684, 0.32607257743127316, 0.32607257743127316, 0.17392742256872684};
+static const lanes POINT_END_MOMENTUM_LOW = {0.0, 0.0, 0.0, 0.0};
+
+/* From the forces of the last step and of the one before to the product with the forces of the next. */
+static const lanes LAST_ALONE[4] = {
+  {0.00039681535159890826, -0.02950413821661833, -0.31588704803200196, -1.094499341752408},
+  {-0.0006159736538563859, 0.09740091828951876, 1.005597396377794, 3.3896437163261783},
+  {-0.0007480595782675967, -0.164475663000625, -1.5258677609838456, -4.825950141339047},
+  {0.0033776083752379937, 0.15103201078114137, 1.0606010622838986, 2.9637843130570163}
+};
+static const lanes LAST[4] = {
+  {0.08319060417123256, -0.3459646936280077, -3.7072096171583175, -17.265518328081257},
+  {-0.1424769150297597, 0.7499144190568944, 8.074520972710324, 35.53430983434071},
+  {0.06696855362323173, -0.5045293117408256, -5.242038557529745, -21.40152619388321},
+  {-0.013677087017423196, 0.2416275660243162, 2.0561002176020393, 7.353446066197164}
+};
+static const lanes BEFORE[4] = {
+  {-0.009794687367041414, 0.0364161505564335, 0.3789777164120157, 1.8163169430229182},
+  {0.04555177197165664, -0.17664461024167727, -1.8543116628735528, -8.786915109053952},
+  {-0.11924868100977012, 0.5010961200119063, 5.325243917524658, 24.716673635935383},
+  {0.09189683115258643, -0.44746251218562305, -4.806839337041577, -21.533808302186017}
 };
 
 /* sum_j table[j] x_j, in four sums that do not wait for each other. */
@@ -703,14 +756,35 @@ static inline void lanes_store(const lanes *x, double *memory)
   memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
-/* L_q at all points. Operations: 7 *, 1 +, 1 /, 2 neg, 1 sqrt. */
+/* What is kept at the points, continued into this step from the last one or from the last two. */
+static inline void continue_curve(const double *memory, long long steps, lanes *x)
+{
+  lanes before[M];
+  lanes_load(memory, x);
+  lanes_load(memory + M * LANES, before);
+  for (int i = 0; i < M; i++)
+    x[i] = steps == 1 ? lanes_apply(LAST_ALONE, x[i]) : lanes_apply(LAST, x[i]) + lanes_apply(BEFORE, before[i]);
+}
+
+static inline void remember_curve(const lanes *x, double *memory)
+{
+  memcpy(memory + M * LANES, memory, sizeof(double) * M * LANES);
+  lanes_store(x, memory);
+}
+
+/* From how many steps the next guess is best continued: a polynomial of high degree through two is the better one while
+ * guesses are good, and the worse one when the steps are long. */
+static inline long long steps_to_continue(long long steps, double first_change)
+{
+  return steps > 0 && first_change < 1e-06 ? 2 : 1;
+}
+
+/* L_q at all points. Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
 {
-  const lanes w0 = u[0]*u[0] + u[1]*u[1];
-  const lanes w1 = 1.0/w0;
-  const lanes w2 = parameters[0]*(w1*w1*lanes_sqrt(w0));
-  value[0] = -(w2*u[0]);
-  value[1] = -(w2*u[1]);
+  const lanes w0 = parameters[0]*lanes_inverse_root_3(u[0]*u[0] + u[1]*u[1]);
+  value[0] = -(w0*u[0]);
+  value[1] = -(w0*u[1]);
 }
 
 /* The constant masses, of the parameters alone. */
@@ -720,90 +794,75 @@ static void mass(double *value)
   value[1] = 1.0;
 }
 
-/* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */
+/* What the steps of a run share: h^2 = square + square_low. */
 typedef struct {
-  lanes position_weight, momentum_weight; /* h beta, h w: the same rounded numbers everywhere */
-  lanes drift, product[LANES]; /* h times the row sums of a, h^2 (a A) */
-  double inverse_mass[M];
+  double inverse_mass[M], square, square_low;
 } sweep_data;
 
-static void prepare_sweep(const step_data *step, sweep_data *sweep)
+static void prepare_sweep(const step_data *step, sweep_data *data)
 {
-  const double h = step->h;
-  sweep->position_weight = h * POINT_POSITION_WEIGHT;
-  sweep->momentum_weight = h * POINT_MOMENTUM_WEIGHT;
-  sweep->drift = h * POINT_DRIFT;
-  for (int j = 0; j < LANES; j++)
-    sweep->product[j] = h * (h * POINT_PRODUCT[j]);
-  mass(sweep->inverse_mass);
+  data->square = step->h * step->h;
+  data->square_low = fma(step->h, step->h, -data->square);
+  mass(data->inverse_mass);
   for (int i = 0; i < M; i++)
-    sweep->inverse_mass[i] = 1.0 / sweep->inverse_mass[i];
+    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
 }
 
 /* What follows a sweep would change the points by, squared, with a margin: the rate of contraction is that from the sweep
  * before, whose change is infinite before the first. */
-static inline double expected_change(double change, double last, const kepler_svi_4_options *options)
+static inline double expected_change(double change, double last, int absolute)
 {
-  const double ratio = last < INFINITY ? smaller(larger(change / last, 1e-6), 0.25) : 1.0; /* squares, too */
-  return options->absolute ? change : 4.0 * ratio * change * ratio;
+  const double quotient = change / last, ratio = last < INFINITY ? smaller(larger(quotient, 1e-6), 0.25) : 1.0; /* squares */
+  return absolute ? change : 4.0 * ratio * change * ratio;
 }
 
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
  * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
- * contracts too slowly or not at all. */
-static int sweep_status(double change, double last, const kepler_svi_4_options *options, int k)
+ * contracts too slowly or not at all. Without branches, for many at once. */
+static inline int sweep_status(double change, double last, double tolerance, int absolute, int max_iterations, int k)
 {
-  const double expected = expected_change(change, last, options);
-  if (!(change < INFINITY))
-    return -1;
-  if (change == 0.0)
-    return 1;
-  if (expected <= options->tolerance * options->tolerance)
-    return 1;
-  if (k > 0 && change >= last * 0.0625 && change < 1e-25)
-    return 1;
-  if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
-    return -1;
-  return 0;
+  const int small = expected_change(change, last, absolute) <= tolerance * tolerance;
+  const int stopped = (change == 0.0) | ((k > 0) & (change >= last * 0.0625) & (change < 1e-25));
+  const int slow = (k >= max_iterations) | ((k > 4) & (change > 0.5 * last) & (change > 1e-20));
+  return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
-/* One step of a separable system. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; a last sweep in the
- * two-table form, whose rounding keeps a generating function, gives the increments. The forces stay in memory. */
-static int sweep(const step_data *step, const sweep_data *data, double *memory, int guess, double *dq, double *dp,
+/* One step. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; then once more, and the increments, with
+ * all digits of the coefficients. The forces stay in memory. */
+static int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const kepler_svi_4_options *options, kepler_svi_4_report *report)
 {
   lanes X[M], base[M], F[M];
-  double inverse_size[M], last = INFINITY, largest = 0.0;
+  double drift[M], inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
   int status = 0;
   for (int i = 0; i < M; i++) {
-    const double v = data->inverse_mass[i] * step->p0[i];
-    base[i] = step->q0[i] + (data->drift * v + step->carry_q[i]);
-    inverse_size[i] = fabs(step->q0[i]) + fabs(step->h * v);
+    drift[i] = step->h * (data->inverse_mass[i] * step->p0[i]);
+    base[i] = step->q0[i] + (POINT_DRIFT * drift[i] + (POINT_DRIFT_LOW * drift[i] + step->carry_q[i]));
+    inverse_size[i] = fabs(step->q0[i]) + fabs(drift[i]);
     largest = larger(largest, inverse_size[i]);
     X[i] = base[i];
   }
   for (int i = 0; i < M; i++)
     inverse_size[i] = options->absolute ? 1.0 : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
-  if (guess) {
-    lanes_load(memory, F);
-    for (int i = 0; i < M; i++) {
-      F[i] = lanes_apply(POINT_EXTRAPOLATION, F[i]);
-      X[i] = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
-    }
+  if (*steps > 0) {
+    continue_curve(memory, *steps, F);
+    for (int i = 0; i < M; i++)
+      X[i] += (data->square * data->inverse_mass[i]) * F[i];
   }
   force_lanes(X, step->parameters, F);
   for (int k = 0; status == 0; k++) {
     lanes change = lanes_of(0.0);
     double total;
     for (int i = 0; i < M; i++) {
-      const lanes x = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
+      const lanes x = base[i] + (data->square * data->inverse_mass[i]) * lanes_apply(POINT_PRODUCT, F[i]);
       const lanes moved = (x - X[i]) * inverse_size[i];
       change += moved * moved;
       X[i] = x;
     }
     force_lanes(X, step->parameters, F);
     total = lanes_total(change);
-    status = sweep_status(total, last, options, k);
+    status = sweep_status(total, last, options->tolerance, options->absolute, options->max_iterations, k);
+    first = k == 0 ? total : first;
     last = total;
     report->iterations++;
   }
@@ -811,19 +870,20 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   if (status < 0)
     return last < INFINITY ? KEPLER_SVI_4_NOT_CONVERGED : KEPLER_SVI_4_NOT_FINITE;
   for (int i = 0; i < M; i++) {
-    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, data->momentum_weight * F[i]));
-    X[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, data->position_weight * (P * data->inverse_mass[i])));
+    const lanes sum = lanes_apply(POINT_PRODUCT, F[i]) + lanes_apply(POINT_PRODUCT_LOW, F[i]);
+    X[i] = base[i] + data->inverse_mass[i] * (data->square * sum + data->square_low * sum);
   }
   force_lanes(X, step->parameters, F);
   for (int i = 0; i < M; i++) {
-    const lanes impulse = data->momentum_weight * F[i];
-    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, impulse));
-    dq[i] = lanes_total(POINT_END_POSITION * (data->position_weight * (P * data->inverse_mass[i])));
-    dp[i] = lanes_total(POINT_END_MOMENTUM * impulse);
+    const double impulse = lanes_total(POINT_END_MOMENTUM * F[i] + POINT_END_MOMENTUM_LOW * F[i]);
+    const double sum = lanes_total(POINT_END_POSITION * F[i] + POINT_END_POSITION_LOW * F[i]);
+    dp[i] = step->h * impulse;
+    dq[i] = drift[i] + data->inverse_mass[i] * (data->square * sum + (data->square_low * sum + step->h * step->carry_p[i]));
   }
   if (!all_finite(dq, M) || !all_finite(dp, M))
     return KEPLER_SVI_4_NOT_FINITE;
-  lanes_store(F, memory);
+  remember_curve(F, memory);
+  *steps = steps_to_continue(*steps, first);
   return KEPLER_SVI_4_OK;
 }
 #endif
@@ -856,23 +916,26 @@ static void prepare(const step_data *step, solver_data *data)
   prepare_sweep(step, data);
 }
 
-/* The increments by sweeps, from the extrapolated guess and then from the straight line, else by Newton's iteration. On success
- * guess says whether memory can be extrapolated. */
+/* The increments by sweeps, from the curve of the last two steps continued and then from the straight line, else by
+ * Newton's iteration. On success guess says from how many steps the next is continued. */
 static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const kepler_svi_4_options *options, kepler_svi_4_report *report, double *workspace)
 {
-  int status = sweep(step, data, memory, *guess != 0, dq, dp, options, report), swept = 1;
-  if (status != KEPLER_SVI_4_OK && *guess)
-    status = sweep(step, data, memory, 0, dq, dp, options, report);
+  long long steps = *guess;
+  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != KEPLER_SVI_4_OK && steps > 0) {
+    steps = 0;
+    status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  }
   if (status != KEPLER_SVI_4_OK) {
     const newton_data newtons = newton_in(workspace);
     int keep;
     status = newton_from_line(step, &newtons, dp, &keep, options, report);
     gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
-    swept = 0;
+    steps = 0;
   }
   if (status == KEPLER_SVI_4_OK)
-    *guess = swept;
+    *guess = steps;
   return status;
 }
 #else

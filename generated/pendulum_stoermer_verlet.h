@@ -54,7 +54,7 @@ typedef struct {
   double q[1], p[1];
   double carry_q[1], carry_p[1];
   double memory[1];
-  long long guess;      /* what memory holds, 0 if nothing */
+  long long guess;      /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
 } pendulum_stoermer_verlet_run;
 

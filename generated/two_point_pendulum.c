@@ -11,7 +11,7 @@ enum {
   N = B * M,
   POINTS = 2, /* most points of a family, or blocks */
   BAND = 0, /* coordinates that meet are at most so many places apart */
-  MEMORY = 2, /* numbers kept from step to step */
+  MEMORY = 4, /* numbers kept from step to step */
   SCRATCH = 12 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
 };
 
@@ -639,27 +639,35 @@ static inline lanes lanes_sin(lanes x)
 }
 #endif
 
-/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 2 repeat it. */
-static const lanes POINT_DRIFT = {0.2113248654051869, 0.7886751345948131};
-static const lanes POINT_POSITION[2] = {
-  {0.2113248654051869, 0.7886751345948131},
-  {0.0, 0.0}
-};
-static const lanes POINT_POSITION_WEIGHT = {1.0, 0.0};
-static const lanes POINT_MOMENTUM[2] = {
-  {0.7886751345948129, 0.7886751345948129},
-  {0.21132486540518713, 0.21132486540518713}
-};
-static const lanes POINT_MOMENTUM_WEIGHT = {0.5, 0.5};
-static const lanes POINT_END_POSITION = {1.0, 0.0};
-static const lanes POINT_END_MOMENTUM = {1.0, 1.0};
+/* Column j of a table multiplies point j: POINT_x holds what one point gives to all. Lanes beyond point 2 repeat it.
+ * The method's numbers are those here and in the _LOW tables together. */
+static const lanes POINT_DRIFT = {0.21132486540518713, 0.7886751345948129};
+static const lanes POINT_DRIFT_LOW = {0.0, 0.0};
 static const lanes POINT_PRODUCT[2] = {
-  {0.08333333333333325, 0.3110042339640732},
-  {0.022329099369260207, 0.08333333333333336}
+  {0.08333333333333334, 0.3110042339640731},
+  {0.022329099369260228, 0.08333333333333334}
 };
-static const lanes POINT_EXTRAPOLATION[2] = {
-  {-0.7320508075688773, -1.7320508075688772},
-  {1.7320508075688772, 2.732050807568877}
+static const lanes POINT_PRODUCT_LOW[2] = {
+  {-4.423726391208987e-18, -2.3331849224419927e-17},
+  {9.542794392553726e-19, -4.423726391208987e-18}
+};
+static const lanes POINT_END_POSITION = {0.39433756729740643, 0.10566243270259357};
+static const lanes POINT_END_POSITION_LOW = {0.0, 0.0};
+static const lanes POINT_END_MOMENTUM = {0.5, 0.5};
+static const lanes POINT_END_MOMENTUM_LOW = {0.0, 0.0};
+
+/* From the forces of the last step and of the one before to the product with the forces of the next. */
+static const lanes LAST_ALONE[2] = {
+  {-0.099679368558886, -0.37200846792814624},
+  {0.20534180126147958, 0.7663460352255527}
+};
+static const lanes LAST[2] = {
+  {-0.08851481887425589, -0.33034180126147955},
+  {0.24700846792814624, 0.9218481522075892}
+};
+static const lanes BEFORE[2] = {
+  {0.08034180126147955, 0.299839684279443},
+  {-0.13317301761277633, -0.49700846792814624}
 };
 
 /* sum_j table[j] x_j, in four sums that do not wait for each other. */
@@ -691,6 +699,29 @@ static inline void lanes_store(const lanes *x, double *memory)
   memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
+/* What is kept at the points, continued into this step from the last one or from the last two. */
+static inline void continue_curve(const double *memory, long long steps, lanes *x)
+{
+  lanes before[M];
+  lanes_load(memory, x);
+  lanes_load(memory + M * LANES, before);
+  for (int i = 0; i < M; i++)
+    x[i] = steps == 1 ? lanes_apply(LAST_ALONE, x[i]) : lanes_apply(LAST, x[i]) + lanes_apply(BEFORE, before[i]);
+}
+
+static inline void remember_curve(const lanes *x, double *memory)
+{
+  memcpy(memory + M * LANES, memory, sizeof(double) * M * LANES);
+  lanes_store(x, memory);
+}
+
+/* From how many steps the next guess is best continued: a polynomial of high degree through two is the better one while
+ * guesses are good, and the worse one when the steps are long. */
+static inline long long steps_to_continue(long long steps, double first_change)
+{
+  return steps > 0 && first_change < 1e-06 ? 2 : 1;
+}
+
 /* L_q at all points. Operations: 3 *, 1 neg, 1 sin. */
 static inline void force_lanes(const lanes *u, const double *parameters, lanes *value)
 {
@@ -703,90 +734,75 @@ static void mass(const double *parameters, double *value)
   value[0] = parameters[0]*(parameters[1]*parameters[1]);
 }
 
-/* What the sweeps of a run share: scaled tables, masses, sizes of the state are made once a call. */
+/* What the steps of a run share: h^2 = square + square_low. */
 typedef struct {
-  lanes position_weight, momentum_weight; /* h beta, h w: the same rounded numbers everywhere */
-  lanes drift, product[LANES]; /* h times the row sums of a, h^2 (a A) */
-  double inverse_mass[M];
+  double inverse_mass[M], square, square_low;
 } sweep_data;
 
-static void prepare_sweep(const step_data *step, sweep_data *sweep)
+static void prepare_sweep(const step_data *step, sweep_data *data)
 {
-  const double h = step->h;
-  sweep->position_weight = h * POINT_POSITION_WEIGHT;
-  sweep->momentum_weight = h * POINT_MOMENTUM_WEIGHT;
-  sweep->drift = h * POINT_DRIFT;
-  for (int j = 0; j < LANES; j++)
-    sweep->product[j] = h * (h * POINT_PRODUCT[j]);
-  mass(step->parameters, sweep->inverse_mass);
+  data->square = step->h * step->h;
+  data->square_low = fma(step->h, step->h, -data->square);
+  mass(step->parameters, data->inverse_mass);
   for (int i = 0; i < M; i++)
-    sweep->inverse_mass[i] = 1.0 / sweep->inverse_mass[i];
+    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
 }
 
 /* What follows a sweep would change the points by, squared, with a margin: the rate of contraction is that from the sweep
  * before, whose change is infinite before the first. */
-static inline double expected_change(double change, double last, const two_point_pendulum_options *options)
+static inline double expected_change(double change, double last, int absolute)
 {
-  const double ratio = last < INFINITY ? smaller(larger(change / last, 1e-6), 0.25) : 1.0; /* squares, too */
-  return options->absolute ? change : 4.0 * ratio * change * ratio;
+  const double quotient = change / last, ratio = last < INFINITY ? smaller(larger(quotient, 1e-6), 0.25) : 1.0; /* squares */
+  return absolute ? change : 4.0 * ratio * change * ratio;
 }
 
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
  * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
- * contracts too slowly or not at all. */
-static int sweep_status(double change, double last, const two_point_pendulum_options *options, int k)
+ * contracts too slowly or not at all. Without branches, for many at once. */
+static inline int sweep_status(double change, double last, double tolerance, int absolute, int max_iterations, int k)
 {
-  const double expected = expected_change(change, last, options);
-  if (!(change < INFINITY))
-    return -1;
-  if (change == 0.0)
-    return 1;
-  if (expected <= options->tolerance * options->tolerance)
-    return 1;
-  if (k > 0 && change >= last * 0.0625 && change < 1e-25)
-    return 1;
-  if (k >= options->max_iterations || (k > 4 && change > 0.5 * last && change > 1e-20))
-    return -1;
-  return 0;
+  const int small = expected_change(change, last, absolute) <= tolerance * tolerance;
+  const int stopped = (change == 0.0) | ((k > 0) & (change >= last * 0.0625) & (change < 1e-25));
+  const int slow = (k >= max_iterations) | ((k > 4) & (change > 0.5 * last) & (change > 1e-20));
+  return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
-/* One step of a separable system. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; a last sweep in the
- * two-table form, whose rounding keeps a generating function, gives the increments. The forces stay in memory. */
-static int sweep(const step_data *step, const sweep_data *data, double *memory, int guess, double *dq, double *dp,
+/* One step. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; then once more, and the increments, with
+ * all digits of the coefficients. The forces stay in memory. */
+static int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report)
 {
   lanes X[M], base[M], F[M];
-  double inverse_size[M], last = INFINITY, largest = 0.0;
+  double drift[M], inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
   int status = 0;
   for (int i = 0; i < M; i++) {
-    const double v = data->inverse_mass[i] * step->p0[i];
-    base[i] = step->q0[i] + (data->drift * v + step->carry_q[i]);
-    inverse_size[i] = fabs(step->q0[i]) + fabs(step->h * v);
+    drift[i] = step->h * (data->inverse_mass[i] * step->p0[i]);
+    base[i] = step->q0[i] + (POINT_DRIFT * drift[i] + (POINT_DRIFT_LOW * drift[i] + step->carry_q[i]));
+    inverse_size[i] = fabs(step->q0[i]) + fabs(drift[i]);
     largest = larger(largest, inverse_size[i]);
     X[i] = base[i];
   }
   for (int i = 0; i < M; i++)
     inverse_size[i] = options->absolute ? 1.0 : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
-  if (guess) {
-    lanes_load(memory, F);
-    for (int i = 0; i < M; i++) {
-      F[i] = lanes_apply(POINT_EXTRAPOLATION, F[i]);
-      X[i] = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
-    }
+  if (*steps > 0) {
+    continue_curve(memory, *steps, F);
+    for (int i = 0; i < M; i++)
+      X[i] += (data->square * data->inverse_mass[i]) * F[i];
   }
   force_lanes(X, step->parameters, F);
   for (int k = 0; status == 0; k++) {
     lanes change = lanes_of(0.0);
     double total;
     for (int i = 0; i < M; i++) {
-      const lanes x = base[i] + lanes_apply(data->product, F[i] * data->inverse_mass[i]);
+      const lanes x = base[i] + (data->square * data->inverse_mass[i]) * lanes_apply(POINT_PRODUCT, F[i]);
       const lanes moved = (x - X[i]) * inverse_size[i];
       change += moved * moved;
       X[i] = x;
     }
     force_lanes(X, step->parameters, F);
     total = lanes_total(change);
-    status = sweep_status(total, last, options, k);
+    status = sweep_status(total, last, options->tolerance, options->absolute, options->max_iterations, k);
+    first = k == 0 ? total : first;
     last = total;
     report->iterations++;
   }
@@ -794,19 +810,20 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   if (status < 0)
     return last < INFINITY ? TWO_POINT_PENDULUM_NOT_CONVERGED : TWO_POINT_PENDULUM_NOT_FINITE;
   for (int i = 0; i < M; i++) {
-    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, data->momentum_weight * F[i]));
-    X[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, data->position_weight * (P * data->inverse_mass[i])));
+    const lanes sum = lanes_apply(POINT_PRODUCT, F[i]) + lanes_apply(POINT_PRODUCT_LOW, F[i]);
+    X[i] = base[i] + data->inverse_mass[i] * (data->square * sum + data->square_low * sum);
   }
   force_lanes(X, step->parameters, F);
   for (int i = 0; i < M; i++) {
-    const lanes impulse = data->momentum_weight * F[i];
-    const lanes P = step->p0[i] + (step->carry_p[i] + lanes_apply(POINT_MOMENTUM, impulse));
-    dq[i] = lanes_total(POINT_END_POSITION * (data->position_weight * (P * data->inverse_mass[i])));
-    dp[i] = lanes_total(POINT_END_MOMENTUM * impulse);
+    const double impulse = lanes_total(POINT_END_MOMENTUM * F[i] + POINT_END_MOMENTUM_LOW * F[i]);
+    const double sum = lanes_total(POINT_END_POSITION * F[i] + POINT_END_POSITION_LOW * F[i]);
+    dp[i] = step->h * impulse;
+    dq[i] = drift[i] + data->inverse_mass[i] * (data->square * sum + (data->square_low * sum + step->h * step->carry_p[i]));
   }
   if (!all_finite(dq, M) || !all_finite(dp, M))
     return TWO_POINT_PENDULUM_NOT_FINITE;
-  lanes_store(F, memory);
+  remember_curve(F, memory);
+  *steps = steps_to_continue(*steps, first);
   return TWO_POINT_PENDULUM_OK;
 }
 #endif
@@ -839,23 +856,26 @@ static void prepare(const step_data *step, solver_data *data)
   prepare_sweep(step, data);
 }
 
-/* The increments by sweeps, from the extrapolated guess and then from the straight line, else by Newton's iteration. On success
- * guess says whether memory can be extrapolated. */
+/* The increments by sweeps, from the curve of the last two steps continued and then from the straight line, else by
+ * Newton's iteration. On success guess says from how many steps the next is continued. */
 static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report, double *workspace)
 {
-  int status = sweep(step, data, memory, *guess != 0, dq, dp, options, report), swept = 1;
-  if (status != TWO_POINT_PENDULUM_OK && *guess)
-    status = sweep(step, data, memory, 0, dq, dp, options, report);
+  long long steps = *guess;
+  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != TWO_POINT_PENDULUM_OK && steps > 0) {
+    steps = 0;
+    status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  }
   if (status != TWO_POINT_PENDULUM_OK) {
     const newton_data newtons = newton_in(workspace);
     int keep;
     status = newton_from_line(step, &newtons, dp, &keep, options, report);
     gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
-    swept = 0;
+    steps = 0;
   }
   if (status == TWO_POINT_PENDULUM_OK)
-    *guess = swept;
+    *guess = steps;
   return status;
 }
 #else

@@ -19,7 +19,7 @@ extern "C" {
 #define TWO_POINT_PENDULUM_PARAMETERS 3
 #define TWO_POINT_PENDULUM_UNKNOWNS 1
 /* Length, in doubles, of the workspace that the functions below ask for. */
-#define TWO_POINT_PENDULUM_WORKSPACE 25
+#define TWO_POINT_PENDULUM_WORKSPACE 27
 
 /* What a function returns. A call that fails leaves its state untouched. */
 enum {
@@ -53,8 +53,8 @@ typedef struct {
   long long step; /* completed; the time is t0 + step h */
   double q[1], p[1];
   double carry_q[1], carry_p[1];
-  double memory[2];
-  long long guess;      /* what memory holds, 0 if nothing */
+  double memory[4];
+  long long guess;      /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
 } two_point_pendulum_run;
 

@@ -24,6 +24,7 @@ __all__ = [
     "cardinal_integrals",
     "cardinal_slopes",
     "cardinal_values",
+    "continuation",
     "differentiation_matrix",
     "extrapolation",
     "matrix_product",
@@ -167,11 +168,26 @@ def extrapolation(points: Iterable[Number], shift: Number, degree: int | None = 
     return rounded(rows)
 
 
+def continuation(points: Iterable[Number], degree: int) -> tuple[Matrix, Matrix]:
+    """Return (E, E') with (E f + E' f')_i = p(x_i + 1).
+
+    p is the least-squares polynomial of that degree through the values f at the points x in [0, 1] and f' at x - 1.
+    Raises ``MethodError`` for a degree that they do not determine.
+    """
+    numbers = checked_points(points)
+    sources = (*numbers, *(point - 1 for point in numbers))
+    if not 0 <= degree < len(set(sources)):
+        raise MethodError(f"degree {degree} does not fit {len(set(sources))} points")
+    with mp.workdps(guard_digits(numbers) + 2 * len(sources)):
+        rows = rounded(least_squares_shift(sources, [point + 1 for point in numbers], degree))
+    return tuple(row[: len(numbers)] for row in rows), tuple(row[len(numbers) :] for row in rows)
+
+
 def least_squares_shift(points: Vector, targets: Sequence[Number], degree: int) -> list[list[Number]]:
     """Return the sum over orthogonal polynomials that ``extrapolation`` describes."""
     count = len(points)
     rows = [[mp.zero] * count for _ in targets]
-    before, here = [mp.zero] * (2 * count), [mp.one] * (2 * count)
+    before, here = [mp.zero] * (count + len(targets)), [mp.one] * (count + len(targets))
     everywhere, norm_before = [*points, *targets], mp.inf
     for _ in range(degree + 1):
         norm = mp.fdot(here[:count], here[:count])

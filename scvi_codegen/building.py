@@ -20,6 +20,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -38,6 +39,7 @@ PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
 
 CACHE_VARIABLE = "SCVI_CODEGEN_CACHE"
+FLAGS_VARIABLE = "CFLAGS"
 COMPILE_SECONDS = 600
 _loaded: dict[str, ModuleType] = {}
 
@@ -74,6 +76,8 @@ def find_compiler() -> tuple[str, ...]:
 def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
     """The compiled module of a source, from memory, from the cache or built now.
 
+    Flags in the environment variable ``CFLAGS`` follow, and so override, those given.
+
     Returns:
         A cffi module with attributes ``lib`` and ``ffi``.
 
@@ -95,6 +99,7 @@ def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> s
         " ".join(compiler),
         _compiler_version(compiler),
         " ".join(flags),
+        os.environ.get(FLAGS_VARIABLE, ""),
         str(sysconfig.get_config_var("SOABI")),
         _processor() if "-march=native" in flags else platform.machine(),
     ]
@@ -103,6 +108,12 @@ def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> s
 
 @cache
 def _compiler_version(compiler: tuple[str, ...]) -> str:
+    """What tells compilers apart: the file that is run, or what a command of several words says of itself."""
+    if len(compiler) == 1:
+        file = Path(shutil.which(compiler[0]) or compiler[0]).resolve()
+        with suppress(OSError):
+            status = file.stat()
+            return f"{file} {status.st_size} {status.st_mtime_ns}"
     try:
         result = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -204,10 +215,11 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     include = sysconfig.get_paths()["include"]
     python = [] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
     shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
+    wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
     _run([*compiler, *shared, "-O1", "-c", "binding.c", "-o", "binding.o"], folder)
-    objects = ["-shared", *python, "binding.o", "integrator.o"]
+    objects = ["-shared", *wanted, *python, "binding.o", "integrator.o"]
     for define, libraries in _mathematics(flags):
-        _run([*compiler, *shared, *flags, *define, "-c", f"{source.prefix}.c", "-o", "integrator.o"], folder)
+        _run([*compiler, *shared, *flags, *define, *wanted, "-c", f"{source.prefix}.c", "-o", "integrator.o"], folder)
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeAlias
 
-from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, ShootingSweep, Sweep
+from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, Sweep
 
-__all__ = ["lane_functions", "print_expression", "print_lane_results", "print_lane_temporaries", "print_number"]
+__all__ = [
+    "lane_functions",
+    "print_expression",
+    "print_lane_results",
+    "print_lane_temporaries",
+    "print_number",
+    "scalar_functions",
+]
 
 Sources: TypeAlias = tuple[str, ...]
 """Loads that differ from lane to lane: ``("u", "t")`` where lanes are points, ``("u", "parameters")`` where they are
@@ -51,11 +59,25 @@ def _load(load: Load) -> str:
 
 
 def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
-    """The elementary functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
+    """The functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
     vectors = _Vectors(kernel, sources)
+    return _functions(kernel, vectors.has)
+
+
+def scalar_functions(kernel: Kernel) -> set[str]:
+    """All functions that occur in a kernel."""
+    return _functions(kernel, lambda expression: True)
+
+
+def _functions(kernel: Kernel, wanted: Callable[[Expression], bool]) -> set[str]:
     found: set[str] = set()
-    for expression in (*kernel.temporaries, *kernel.results):
-        _collect_functions(expression, vectors, found)
+    pending: list[Expression] = [*kernel.temporaries, *kernel.results]
+    while pending:
+        expression = pending.pop()
+        if isinstance(expression, Operation):
+            pending.extend(expression.operands)
+            if expression.operator not in PRECEDENCE and wanted(expression):
+                found.add(expression.operator)
     return found
 
 
@@ -68,7 +90,7 @@ def print_lane_temporaries(kernel: Kernel, sources: Sources) -> list[tuple[str, 
     ]
 
 
-def print_lane_results(kernel: Kernel, sweep: Sweep | ShootingSweep, sources: Sources) -> list[str]:
+def print_lane_results(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
     """Statements that store the results as vectors; slopes go to their places in the (lower) mass matrix."""
     vectors = _Vectors(kernel, sources)
     targets = [f"value[{k}]" for k in range(kernel.values)]
@@ -96,15 +118,6 @@ class _Vectors:
                 expression.source == "w" and expression.index in self.temporaries
             )
         return isinstance(expression, Operation) and any(self.has(operand) for operand in expression.operands)
-
-
-def _collect_functions(expression: Expression, vectors: _Vectors, found: set[str]) -> None:
-    if not isinstance(expression, Operation):
-        return
-    if expression.operator not in PRECEDENCE and vectors.has(expression):
-        found.add(expression.operator)
-    for operand in expression.operands:
-        _collect_functions(operand, vectors, found)
 
 
 def _print_lanes(expression: Expression, vectors: _Vectors) -> str:

@@ -7,7 +7,8 @@
       -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.stepper`)
 
-Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk.
+Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
+kept in the user's cache folder (:mod:`scvi_codegen.text_cache`), so the second time is quick.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
 from scvi_codegen.rendering import render, render_ensemble, workspace_size
-from scvi_codegen.shooting_sweep import shooting_sweep_of
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.splitting import splitting_of
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.sweeps import check_solver, sweep_of
 from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.text_cache import Texts, remembered_texts
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
 
@@ -63,9 +64,13 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
-    program = _program(system, method, solver=solver, prefix=prefix)
-    interface = describe(program, system, method)
-    return Stepper(render(program), interface, ensemble=render_ensemble(program), flags=flags)
+
+    def make() -> Texts:
+        program = _program(system, method, solver=solver, prefix=prefix)
+        return render(program), describe(program, system, method), render_ensemble(program)
+
+    source, interface, ensemble = remembered_texts(system, method, solver, prefix, make)
+    return Stepper(source, interface, ensemble=ensemble, flags=flags)
 
 
 def generate_source(
@@ -80,7 +85,7 @@ def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: s
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = solver in ("auto", "fixed-point") and splitting is None
-    sweep = (shooting_sweep_of(system, method) or sweep_of(system, method)) if swept else None
+    sweep = sweep_of(system, method) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))
     return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton)
@@ -109,6 +114,6 @@ def c_identifier(name: str) -> str:
     A single letter (``X_OK`` is a macro of POSIX) and names of C headers get a longer name.
     """
     cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
-    if len(cleaned) < 2 or cleaned in C_HEADERS or not cleaned[0].isalpha():
+    if not cleaned[:1].isalpha():
         return f"integrator_{cleaned}".rstrip("_")
-    return cleaned
+    return f"{cleaned}_integrator" if len(cleaned) == 1 or cleaned in C_HEADERS else cleaned

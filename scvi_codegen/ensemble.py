@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -256,29 +257,41 @@ class _LaneBlock:
         self.ffi, self.lib = module.ffi, module.lib
         self.memory = self.ffi.new(f"{prefix}_block *")
         self._call("start")(self.memory, work.t0, work.h)
-        width = len(self.memory.active)
-        self.count, self.step = min(width, work.count - first), 0
+        self.active = np.frombuffer(self.ffi.buffer(self.memory.active), dtype=np.float64)
+        self.count, self.step = min(len(self.active), work.count - first), 0
         self.left: dict[int, _Alone] = {}
-        for lane in range(width):
-            self._fill(lane, first + min(lane, self.count - 1))
+        self._fill()
 
     def _call(self, name: str) -> Callable[..., Any]:
         function: Callable[..., Any] = getattr(self.lib, f"{self.prefix}_{name}")
         return function
 
-    def _fill(self, lane: int, j: int) -> None:
-        """Trajectory j into a lane, which rests if it is one too many or the velocity is not to be had."""
-        work = self.work
-        q, p, values = work.q[0, j].copy(), work.p[0, j].copy(), work.parameters[j].copy()
-        active = lane < self.count
-        try:
-            v = work.stepper.velocity(q, p, work.t0, values)
-        except StateError:
-            v, active = np.zeros_like(q), False
-        pointers = (self.ffi.from_buffer("double[]", array) for array in (q, p, v))
-        given = self.ffi.from_buffer("double[]", values) if values.size else self.ffi.NULL
-        self._call("set")(self.memory, lane, *pointers, given)
-        self.memory.active[lane] = float(active)
+    def _fill(self) -> None:
+        """A trajectory into each lane; those too many repeat the last one and rest."""
+        work, call = self.work, self._call("set")
+        q, p = (self.ffi.from_buffer("double[]", array) for array in (work.q, work.p))
+        values, m, P = self.ffi.from_buffer("double[]", work.parameters), *work.q.shape[2:], work.parameters.shape[1]
+        v = self._velocities()
+        velocities = self.ffi.NULL if v is None else self.ffi.from_buffer("double[]", v)
+        for lane in range(len(self.active)):
+            k = min(lane, self.count - 1)
+            j = self.first + k
+            given = velocities if v is None else velocities + k * m
+            call(self.memory, lane, q + j * m, p + j * m, given, values + j * P if P else self.ffi.NULL)
+        self.active[self.count :] = 0.0
+        if v is not None:
+            self.active[: self.count] *= np.isfinite(v).all(axis=1)
+
+    def _velocities(self) -> Array | None:
+        """(count, m) initial velocities if the lanes need them, not numbers where there are none."""
+        if not getattr(self.lib, f"{self.prefix.upper()}_NEEDS_VELOCITIES"):
+            return None
+        work, v = self.work, np.full((self.count, self.work.stepper.dimension), np.nan)
+        for k in range(self.count):
+            j = self.first + k
+            with suppress(StateError):
+                v[k] = work.stepper.velocity(work.q[0, j], work.p[0, j], work.t0, work.parameters[j])
+        return v
 
     def advance(self, size: int) -> None:
         """``size`` steps on."""
@@ -297,11 +310,10 @@ class _LaneBlock:
                 self.ffi.from_buffer("double[]", work.p) + place,
                 stride,
             )
-        for lane in range(self.count):
-            if lane not in self.left and self.memory.active[lane] > 0.0:
-                work.done[self.first + lane] = self.step
-            else:
-                self._leave(lane, begin)
+        running = self.active[: self.count] > 0.0
+        work.done[self.first : self.first + self.count][running] = self.step
+        for lane in np.flatnonzero(~running):
+            self._leave(int(lane), begin)
 
     def _leave(self, lane: int, begin: int) -> None:
         """What a call that began after ``begin`` steps stored of a resting lane gives way to a run of its own."""

@@ -37,13 +37,6 @@ INTERFACE_FILE = "interface.json"
 FORMAT = 1
 OUTPUTS = 20
 LONGEST_PREFIX = 64
-C_HEADERS = frozenset(
-    """
-    assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef stdint
-    stdio stdlib string tgmath time wchar wctype
-    """.split()  # noqa: SIM905  (a paragraph of words reads better than twenty quoted ones)
-)
-"""Folder names whose header would hide one of the standard library's."""
 
 OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
 """Folder names that would collide with ``main.c`` or hide what the package imports."""
@@ -121,7 +114,7 @@ def _prefix(folder: Path) -> str:
             f"the folder's name begins every C name and is the name of the Python package; '{name}' does not serve "
             f"(lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): call it '{cleaned}'"
         )
-    if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in C_HEADERS | OTHER_NAMES:
+    if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
         raise PackageError(f"'{name}' has a meaning in C or Python: call the folder '{name}_integrator'")
     return name
 

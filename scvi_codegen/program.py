@@ -1,28 +1,34 @@
 """The intermediate representation: a program is kernels, tables and loops, C without syntax. It prints itself.
 
 A kernel is straight-line arithmetic over ``u[i]`` (its arguments), ``t`` and ``parameters[i]``: temporaries, each used
-more than once, then results. Operations are ``+ - * / neg sqrt`` and calls of elementary functions on binary64 numbers;
-there are no branches, loops or integers. Everything around the kernels (gather, scatter, Newton, sweeps, the run) is a
-loop over tables, the same for every method and system, and stands in the templates.
+more than once, then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary
+functions on binary64 numbers; there are no branches, loops or integers. Everything around the kernels (gather, scatter,
+Newton, sweeps, the run) is a loop over tables, the same for every method and system, and stands in the templates.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 __all__ = [
     "Constant",
+    "CoupledSweep",
     "Expression",
     "Family",
     "GatherLoop",
+    "GuessTables",
     "Kernel",
+    "LaneTable",
     "Load",
     "Operation",
     "Program",
     "ScatterLoop",
+    "SeparableSweep",
     "ShootingSweep",
     "SlopeBlock",
+    "SplitMatrix",
+    "SplitVector",
     "Splitting",
     "Sweep",
 ]
@@ -175,68 +181,128 @@ class Family:
         return self.points * (self.slope.arguments + len(self.slope.results))
 
 
+LaneTable: TypeAlias = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SplitVector:
+    """Numbers in twice the precision of a double: ``high + low``."""
+
+    high: tuple[float, ...]
+    low: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SplitMatrix:
+    """The same for a table."""
+
+    high: LaneTable
+    low: LaneTable
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sweep:
-    """A fixed-point iteration whose points are the lanes of a vector; all tables are padded to ``lanes`` rows.
+class GuessTables:
+    """(lanes, lanes) tables that continue what was kept at the points: ``last_alone``, or ``last`` and ``before``."""
 
-    With V the velocities and F = L_q at the points,
+    last_alone: LaneTable
+    last: LaneTable
+    before: LaneTable
 
-        q_n = q0 + sum_j position[n][j] (h position_weights[j] V_j),    q1 = q0 + sum_j end_position[j] (h .. V_j),
-        P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j).
 
-    Separable systems (constant diagonal mass, forces of position and time) iterate on the points,
-    q_n = q0 + h drift[n] v0 + h^2 sum_j product[n][j] F_j / mass; others on the velocities, V += L_vv^-1 (P - L_v).
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeparableSweep:
+    """A fixed-point iteration for constant diagonal mass m and forces F of position and time; points are lanes.
+
+        q_n = q0 + h drift[n] v0 + h^2 sum_j product[n][j] F_j / m,     v0 = p0 / m,
+        q1 = q0 + h v0 + h^2 sum_j end_position[j] F_j / m,             p1 = p0 + h sum_j end_momentum[j] F_j.
+
+    All tables are padded to ``lanes`` rows and columns, and split, so that what their rounding does to the map is
+    2^-53 times less than what one rounding of a sum does: the energy of a variational method does not drift.
 
     Attributes:
-        separable: which of the two.
-        points: real points g; lanes beyond repeat the last one and have weight 0.
-        blocks: velocities s that give the curve, g unless the method is an SVI with other points.
+        points: real points; lanes beyond repeat the last one and have weight 0.
         lanes: a power of two.
         abscissae: (lanes,) c_n, where time stands.
-        drift: (lanes,) row sums of the position table, c_n for collocation methods.
-        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, for coupled systems with
-            other points than blocks; else empty.
-        extrapolation: (lanes, lanes), of F or of z, to the next step.
-        kernel: F at (q, t); or F, L_v and the mass at (q, V, t).
-        force: F alone.
-        mass: constant diagonal (no arguments), separable only.
-        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+        drift, end_position, end_momentum: (lanes,); product: (lanes, lanes).
+        guess: from the forces of former steps to sum_j product[n][j] F_j.
+        force: F at (q, t).
+        mass: m (no arguments).
     """
 
-    separable: bool
     points: int
-    blocks: int
     lanes: int
     abscissae: tuple[float, ...]
-    drift: tuple[float, ...]
-    position: tuple[tuple[float, ...], ...]
-    position_weights: tuple[float, ...]
-    momentum: tuple[tuple[float, ...], ...]
-    momentum_weights: tuple[float, ...]
-    end_position: tuple[float, ...]
-    end_momentum: tuple[float, ...]
-    product: tuple[tuple[float, ...], ...]
-    velocity: tuple[tuple[float, ...], ...]
-    projection: tuple[tuple[float, ...], ...]
-    extrapolation: tuple[tuple[float, ...], ...]
-    kernel: Kernel
+    drift: SplitVector
+    product: SplitMatrix
+    end_position: SplitVector
+    end_momentum: SplitVector
+    guess: GuessTables
     force: Kernel
-    mass: Kernel | None
-    mass_entries: tuple[tuple[int, int], ...]
+    mass: Kernel
 
-    @property
-    def kind(self) -> str:
-        """For the templates."""
-        return "points"
+    kind: ClassVar[str] = "separable"
+    mass_entries: ClassVar[tuple[tuple[int, int], ...]] = ()
+    diagonal: ClassVar[bool] = True
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those with lanes."""
-        return (self.kernel,) if self.separable else (self.kernel, self.force)
+        return (self.force,)
 
     def memory(self, dimension: int) -> int:
-        """The forces, or the velocities, at the points."""
-        return dimension * self.lanes
+        """The forces at the points in the last two steps."""
+        return 2 * dimension * self.lanes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoupledSweep:
+    """A fixed-point iteration on velocities for any regular Lagrangian; points are lanes, tables padded to ``lanes``.
+
+    With V the velocities and F = L_q at the points, V += L_vv^-1 (P - L_v) until nothing moves, where
+
+        q_n = q0 + sum_j position[n][j] (h position_weights[j] V_j),    q1 = q0 + sum_j end_position[j] (h .. V_j),
+        P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j).
+
+    Attributes:
+        points: real points g; lanes beyond repeat the last one and have weight 0.
+        blocks: velocities s that give the curve, g unless the method is an SVI with other points.
+        lanes: a power of two.
+        abscissae: (lanes,) c_n, where time stands.
+        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, with other points than
+            blocks; else empty.
+        guess: from z of former steps to z.
+        kernel: F, L_v and the mass at (q, V, t).
+        force: F alone.
+        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+    """
+
+    points: int
+    blocks: int
+    lanes: int
+    abscissae: tuple[float, ...]
+    position: LaneTable
+    position_weights: tuple[float, ...]
+    momentum: LaneTable
+    momentum_weights: tuple[float, ...]
+    end_position: tuple[float, ...]
+    end_momentum: tuple[float, ...]
+    velocity: LaneTable
+    projection: LaneTable
+    guess: GuessTables
+    kernel: Kernel
+    force: Kernel
+    mass_entries: tuple[tuple[int, int], ...]
+
+    kind: ClassVar[str] = "coupled"
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes."""
+        return (self.kernel, self.force)
+
+    def memory(self, dimension: int) -> int:
+        """The velocities z of the last two steps."""
+        return 2 * dimension * self.lanes
 
     @property
     def projected(self) -> bool:
@@ -265,7 +331,7 @@ class ShootingSweep:
         node_abscissae, abscissae: (lanes,) times.
         collocation: A; position, velocity: a, l; their transposes act on what is gathered back.
         weights: (lanes,) w; end: (lanes,) b; consistency: (lanes,) l^T w; mask: (lanes,) 1 for nodes.
-        extrapolation: (lanes, lanes), of z to the next step.
+        guess: from z of former steps to z.
         kernel: E, (m . E)_q, (m . E)_v and the mass at (q, V, a, m, t).
         action: L_q and L_v at (q, v, t).
         mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
@@ -276,30 +342,22 @@ class ShootingSweep:
     lanes: int
     node_abscissae: tuple[float, ...]
     abscissae: tuple[float, ...]
-    collocation: tuple[tuple[float, ...], ...]
-    collocation_transposed: tuple[tuple[float, ...], ...]
-    position: tuple[tuple[float, ...], ...]
-    position_transposed: tuple[tuple[float, ...], ...]
-    velocity: tuple[tuple[float, ...], ...]
-    velocity_transposed: tuple[tuple[float, ...], ...]
+    collocation: LaneTable
+    collocation_transposed: LaneTable
+    position: LaneTable
+    position_transposed: LaneTable
+    velocity: LaneTable
+    velocity_transposed: LaneTable
     weights: tuple[float, ...]
     end: tuple[float, ...]
     consistency: tuple[float, ...]
     mask: tuple[float, ...]
-    extrapolation: tuple[tuple[float, ...], ...]
+    guess: GuessTables
     kernel: Kernel
     action: Kernel
     mass_entries: tuple[tuple[int, int], ...]
 
-    @property
-    def kind(self) -> str:
-        """For the templates."""
-        return "shooting"
-
-    @property
-    def separable(self) -> bool:
-        """The sweep is one for any system."""
-        return False
+    kind: ClassVar[str] = "shooting"
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -312,8 +370,12 @@ class ShootingSweep:
         return all(i == j for i, j in self.mass_entries)
 
     def memory(self, dimension: int) -> int:
-        """z, m and v0."""
-        return dimension * (2 * self.lanes + 1)
+        """Z of the last two steps, m and v0."""
+        return dimension * (3 * self.lanes + 1)
+
+
+Sweep: TypeAlias = SeparableSweep | CoupledSweep | ShootingSweep
+"""A fixed-point iteration; ``kind`` says which."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -379,7 +441,7 @@ class Program:
     mass_entries: tuple[tuple[int, int], ...]
     lagrangian: Kernel
     action: str | None
-    sweep: Sweep | ShootingSweep | None
+    sweep: Sweep | None
     splitting: Splitting | None
     newton: bool
 

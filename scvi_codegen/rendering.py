@@ -19,8 +19,9 @@ from scvi_codegen.c_printer import (
     print_lane_results,
     print_lane_temporaries,
     print_number,
+    scalar_functions,
 )
-from scvi_codegen.program import Family, Kernel, Program, ShootingSweep, Sweep
+from scvi_codegen.program import CoupledSweep, Family, Kernel, Program, SeparableSweep, Sweep
 from scvi_codegen.source import Interface, Source
 
 __all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "render", "render_example", "template_folder"]
@@ -32,10 +33,13 @@ MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
 KEEP_CHANGE = 1e-2
 KEEP_RATE = 0.1
+GOOD_GUESS = 1e-3
+"""Relative error below which the next guess is continued from two steps, not one."""
 ARGUMENT_NAMES = {1: "the argument alone", 2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
 POINT_SOURCES = ("u", "t")
 TRAJECTORY_SOURCES = ("u", "parameters")
 ENSEMBLE_LANES = 8
+INVERSE_ROOT = "inverse_root_"
 VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
@@ -76,7 +80,8 @@ def render(program: Program) -> Source:
 
 def render_ensemble(program: Program) -> Source | None:
     """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
-    if not isinstance(program.sweep, Sweep) or program.sweep.projected:
+    sweep = program.sweep
+    if not isinstance(sweep, SeparableSweep | CoupledSweep) or (isinstance(sweep, CoupledSweep) and sweep.projected):
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
@@ -87,8 +92,7 @@ def render_ensemble(program: Program) -> Source | None:
         "max_iterations": MAX_ITERATIONS,
         "width": ENSEMBLE_LANES,
         "lane_meaning": "trajectories",
-        "memory_points": program.sweep.points if program.sweep.separable else program.sweep.blocks,
-        **_vector_context(program.sweep, TRAJECTORY_SOURCES),
+        **_vector_context(sweep, TRAJECTORY_SOURCES),
     }
     environment = _environment()
     return Source(
@@ -126,6 +130,7 @@ def _context(program: Program) -> dict[str, object]:
         "program": program,
         "prefix": program.prefix,
         "kernels": program.kernels,
+        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, program.kernels))),
         "purpose": _purposes(program),
         "legendre": program.legendre,
         "lagrangian": program.lagrangian,
@@ -165,25 +170,43 @@ def _results(family: Family) -> str:
     return "L_q" if family.name == "kick" else "L_v"
 
 
-def _lane_context(sweep: Sweep | ShootingSweep | None) -> dict[str, object]:
+def _lane_context(sweep: Sweep | None) -> dict[str, object]:
     """What the templates of the fixed-point solver need; nothing without one."""
     if sweep is None:
         return {}
     return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points"}
 
 
-def _vector_context(sweep: Sweep | ShootingSweep, sources: tuple[str, ...]) -> dict[str, object]:
+def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]:
     """Kernels in vectors, with the functions they call; ``sources`` differ from lane to lane."""
     kernels = applied = sweep.kernels
-    if isinstance(sweep, Sweep) and sweep.mass is not None and "t" not in sources:
+    if isinstance(sweep, SeparableSweep) and sources == TRAJECTORY_SOURCES:
         applied = (*kernels, sweep.mass)
+    functions = set().union(*(lane_functions(kernel, sources) for kernel in applied))
+    roots = _inverse_roots(functions)
     return {
         "sweep": sweep,
         "lane_kernels": kernels,
-        "lane_functions": sorted(set().union(*(lane_functions(kernel, sources) for kernel in applied))),
+        "lane_functions": sorted(functions - {f"{INVERSE_ROOT}{k}" for k in roots} | ({"sqrt"} if roots else set())),
+        "inverse_roots_in_lanes": roots,
+        "series": _binomial_series,
+        "good_guess": GOOD_GUESS**2,
         "vector_library": VECTOR_LIBRARY,
         "vector_sources": sources,
     }
+
+
+def _inverse_roots(functions: set[str]) -> list[int]:
+    """The k of all ``inverse_root_k``."""
+    return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in functions if name.startswith(INVERSE_ROOT))
+
+
+def _binomial_series(k: int) -> list[float]:
+    """Coefficients of e, .., e^4 in (1 - e)^(-k/2)."""
+    coefficients = [1.0]
+    for j in range(1, 5):
+        coefficients.append(coefficients[-1] * (k / 2 + j - 1) / j)
+    return coefficients[1:]
 
 
 def _signature(kernel: Kernel) -> str:

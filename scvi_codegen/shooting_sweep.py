@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from sympy import S
 
-from scvi_codegen.basis import cardinal_integrals, cardinal_values, extrapolation, matrix_product, transpose
+from scvi_codegen.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
 from scvi_codegen.derivatives import gradient
 from scvi_codegen.lowering import lower_kernel
 from scvi_codegen.mechanics import (
@@ -21,35 +21,29 @@ from scvi_codegen.mechanics import (
     multiplied_residual,
     multipliers,
 )
-from scvi_codegen.methods.galerkin import EXTRAPOLATION_DEGREE
-from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.precision import mp
 from scvi_codegen.program import Kernel, ShootingSweep
-from scvi_codegen.sweeps import MOST_POINTS, pad_matrix, pad_vector
 from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["shooting_sweep_of"]
+__all__ = ["shooting_sweep"]
 
 LARGEST_DIMENSION = 8
 """Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
 
 
-def shooting_sweep_of(system: LagrangianSystem, method: Method) -> ShootingSweep | None:
-    """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` for other methods."""
-    if not isinstance(method, SCVI) or not method.variational or method.degree == 1:
-        return None
+def shooting_sweep(system: LagrangianSystem, method: SCVI) -> ShootingSweep | None:
+    """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
     tableau, rule = method.tableau, method.rule
     nodes, points = len(tableau.b), len(rule)
-    if max(nodes, points) > MOST_POINTS or system.dimension > LARGEST_DIMENSION:
+    lanes = lane_count(max(nodes, points))
+    if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
         return None
-    lanes = 2
-    while lanes < max(nodes, points):
-        lanes *= 2
     position = cardinal_integrals(tableau.c, rule.abscissae, 0)
     velocity = cardinal_values(tableau.c, rule.abscissae)
     kernel, entries = _node_kernel(system)
-    guess = extrapolation(tableau.c, 1, min(nodes - 1, EXTRAPOLATION_DEGREE))
+    guess = guess_tables(tableau.c, lanes)
     return ShootingSweep(
         points=points,
         nodes=nodes,
@@ -66,7 +60,7 @@ def shooting_sweep_of(system: LagrangianSystem, method: Method) -> ShootingSweep
         end=pad_vector(tableau.b, lanes, repeat=True),
         consistency=pad_vector(matrix_product((rule.unit_weights,), velocity)[0], lanes, repeat=True),
         mask=pad_vector((mp.one,) * nodes, lanes),
-        extrapolation=pad_matrix(guess, lanes),
+        guess=guess,
         kernel=kernel,
         action=_action_kernel(system),
         mass_entries=entries,

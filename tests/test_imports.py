@@ -28,16 +28,17 @@ FLOORS = """
     methods.shooting
     methods
     equations lowering c_printer
-    sweeps splitting rendering building
-    shooting_sweep
+    velocity_tables padding splitting rendering building
+    separable_sweep coupled_sweep shooting_sweep
+    sweeps
     trajectory
-    binding
+    binding text_cache
     run ensemble
     stepper
     compiler
-    problems
+    problems pilot
     model_file
-    package plotting
+    package plotting advice distributed ensemble_file
     __init__
     benchmark
     cli

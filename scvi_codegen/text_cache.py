@@ -1,0 +1,88 @@
+"""Generated texts, kept beside the compiled ones: what was derived once is not derived again.
+
+The name of an entry is made from everything the text depends on: the system, the method, the solver, and the generator
+itself, of which the sizes and times of all files are taken. An entry that cannot be read or written is no error: the
+text is then made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import TypeAlias
+
+from sympy import srepr
+
+from scvi_codegen.building import cache_folder
+from scvi_codegen.methods.method import Method
+from scvi_codegen.rendering import template_folder
+from scvi_codegen.source import Interface, Source
+from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.trajectory import write_atomically
+
+__all__ = ["Texts", "remembered_texts"]
+
+Texts: TypeAlias = tuple[Source, Interface, Source | None]
+"""An integrator, its interface, and its ensemble if it has one."""
+
+
+def remembered_texts(
+    system: LagrangianSystem, method: Method, solver: str, prefix: str | None, make: Callable[[], Texts]
+) -> Texts:
+    """What ``make`` returns for these arguments, from the cache if it was made before."""
+    path = cache_folder() / "texts" / f"{_key(system, method, solver, prefix)}.json"
+    found = _read(path)
+    if found is None:
+        found = make()
+        _write(path, found)
+    return found
+
+
+def _key(system: LagrangianSystem, method: Method, solver: str, prefix: str | None) -> str:
+    symbols = (*system.coordinates, *system.velocities, *system.parameters, system.time)
+    parts = [
+        system.name,
+        srepr(system.lagrangian),
+        " ".join(symbol.name for symbol in symbols),
+        repr((len(system.coordinates), system.defaults)),
+        repr(method),
+        solver,
+        str(prefix),
+        _generator(),
+    ]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+@cache
+def _generator() -> str:
+    """Which version of this package, to the file."""
+    package = Path(__file__).parent
+    files = sorted([*package.rglob("*.py"), *template_folder().rglob("*.jinja")])
+    return "\n".join(f"{path} {(stat := path.stat()).st_size} {stat.st_mtime_ns}" for path in files)
+
+
+def _read(path: Path) -> Texts | None:
+    try:
+        entry = json.loads(path.read_text(encoding="utf-8"))
+        ensemble = entry["ensemble"]
+        source, interface = Source(**entry["source"]), Interface.from_json(entry["interface"])
+        return source, interface, None if ensemble is None else Source(**ensemble)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _write(path: Path, texts: Texts) -> None:
+    source, interface, ensemble = texts
+    entry = {
+        "source": asdict(source),
+        "interface": interface.to_json(),
+        "ensemble": None if ensemble is None else asdict(ensemble),
+    }
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda file: file.write(json.dumps(entry).encode()))
