@@ -29,6 +29,8 @@ from scvi_codegen.methods import (
     StoermerVerlet,
 )
 from scvi_codegen.methods.method import Method
+from scvi_codegen.problems import fput_chain
+from scvi_codegen.program import WORTH_REMEMBERING
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.system import LagrangianSystem
 
@@ -351,6 +353,17 @@ BRIEFLY = [name for name in METHODS if name.startswith(("svi-3", "scvi", "sc-3",
 def test_method_families_pass_the_sanitizers(command, tmp_path):
     tool(command[0])
     check_sanitized([generated(method)["pumped-cart-pole"] for method in BRIEFLY], command, tmp_path)
+
+
+@pytest.mark.parametrize("command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"])
+def test_bands_and_kept_factors_pass_the_sanitizers(command, tmp_path):
+    tool(command[0])
+    choices = [(5, SVI(8)), (12, SVI(3, "gauss-lobatto:4")), (12, SCVI(2)), (12, Gauss(3)), (9, SpectralCollocation(3))]
+    pairs = [generate_source(fput_chain(n), method, solver="newton") for n, method in choices]
+    assert all(interface.unknowns >= WORTH_REMEMBERING for _, interface in pairs)
+    files = write([source for source, _ in pairs], tmp_path)
+    run([tool(command[0]), *C99, "-c", *files], tmp_path)
+    check_sanitized(pairs, command, tmp_path)
 
 
 @pytest.mark.full
