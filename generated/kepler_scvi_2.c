@@ -920,11 +920,11 @@ static inline void solve_mass(const lanes *mass, lanes *r)
 static inline double expected_change(double change, double last, int absolute)
 {
   const double quotient = change / last, ratio = last < INFINITY ? smaller(larger(quotient, 1e-6), 0.25) : 1.0; /* squares */
-  return absolute ? change : 4.0 * ratio * change;
+  return absolute ? change : 16.0 * ratio * change;
 }
 
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
- * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
+ * follows it would change them by less than a quarter of the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
  * contracts too slowly or not at all. Without branches, for many at once. */
 static inline int sweep_status(double change, double last, double tolerance, int absolute, int max_iterations, int k)
 {
