@@ -367,7 +367,8 @@ static inline void subtract(const double *restrict column, double factor, int be
 static void eliminate(const double *a, const band *shape, const double *pivot, int begin, int end, double *x)
 {
   for (int k = begin; k < end; k++) {
-    exchange(x + k, x + (int)pivot[k]);
+    if ((int)pivot[k] != k)
+      exchange(x + k, x + (int)pivot[k]);
     if (x[k] != 0.0)
       subtract(a + shape->first + k * shape->stride, x[k], k + 1, least(k + shape->reach + 1, shape->rows), x);
   }
@@ -726,7 +727,8 @@ static newton_data newton_in(double *workspace)
 }
 
 /* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p,     const double *size_q, movement *moved)
+static void apply_update(const newton_data *data, const band *shape, double h,
+double *p0, const double *size_p, const double *size_q, movement *moved)
 {
   const int blocks = shape->rows / M;
   double change[M];
@@ -1031,11 +1033,11 @@ static inline void solve_mass(const lanes *mass, lanes *r)
 static inline double expected_change(double change, double last, int absolute)
 {
   const double quotient = change / last, ratio = last < INFINITY ? smaller(larger(quotient, 1e-6), 0.25) : 1.0; /* squares */
-  return absolute ? change : 4.0 * ratio * change;
+  return absolute ? change : 16.0 * ratio * change;
 }
 
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
- * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
+ * follows it would change them by less than a quarter of the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
  * contracts too slowly or not at all. Without branches, for many at once. */
 static inline int sweep_status(double change, double last, double tolerance, int absolute, int max_iterations, int k)
 {

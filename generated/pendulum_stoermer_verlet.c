@@ -164,7 +164,8 @@ static inline void subtract(const double *restrict column, double factor, int be
 static void eliminate(const double *a, const band *shape, const double *pivot, int begin, int end, double *x)
 {
   for (int k = begin; k < end; k++) {
-    exchange(x + k, x + (int)pivot[k]);
+    if ((int)pivot[k] != k)
+      exchange(x + k, x + (int)pivot[k]);
     if (x[k] != 0.0)
       subtract(a + shape->first + k * shape->stride, x[k], k + 1, least(k + shape->reach + 1, shape->rows), x);
   }
@@ -486,7 +487,8 @@ static newton_data newton_in(double *workspace)
 }
 
 /* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p,     const double *size_q, movement *moved)
+static void apply_update(const newton_data *data, const band *shape, double h,
+double *p0, const double *size_p, const double *size_q, movement *moved)
 {
   const int blocks = shape->rows / M;
   double change[M];

@@ -167,7 +167,8 @@ static inline void subtract(const double *restrict column, double factor, int be
 static void eliminate(const double *a, const band *shape, const double *pivot, int begin, int end, double *x)
 {
   for (int k = begin; k < end; k++) {
-    exchange(x + k, x + (int)pivot[k]);
+    if ((int)pivot[k] != k)
+      exchange(x + k, x + (int)pivot[k]);
     if (x[k] != 0.0)
       subtract(a + shape->first + k * shape->stride, x[k], k + 1, least(k + shape->reach + 1, shape->rows), x);
   }
@@ -489,7 +490,8 @@ static newton_data newton_in(double *workspace)
 }
 
 /* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
-static void apply_update(const newton_data *data, const band *shape, double h, double *p0, const double *size_p,     const double *size_q, movement *moved)
+static void apply_update(const newton_data *data, const band *shape, double h,
+double *p0, const double *size_p, const double *size_q, movement *moved)
 {
   const int blocks = shape->rows / M;
   double change[M];
@@ -734,15 +736,23 @@ static void mass(const double *parameters, double *value)
   value[0] = parameters[0]*(parameters[1]*parameters[1]);
 }
 
-/* What the steps of a run share: h^2 = square + square_low. */
+/* What the steps of a run share: h^2 = square + square_low, h w = weight + weight_low. */
 typedef struct {
+  lanes weight, weight_low;
   double inverse_mass[M], square, square_low;
 } sweep_data;
 
 static void prepare_sweep(const step_data *step, sweep_data *data)
 {
-  data->square = step->h * step->h;
-  data->square_low = fma(step->h, step->h, -data->square);
+  const double h = step->h;
+  const lane_view w = {POINT_END_MOMENTUM}, w_low = {POINT_END_MOMENTUM_LOW};
+  lane_view low;
+  data->square = h * h;
+  data->square_low = fma(h, h, -data->square);
+  data->weight = h * w.all;
+  for (int j = 0; j < LANES; j++)
+    low.lane[j] = fma(h, w.lane[j], -(h * w.lane[j])) + h * w_low.lane[j];
+  data->weight_low = low.all;
   mass(step->parameters, data->inverse_mass);
   for (int i = 0; i < M; i++)
     data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
@@ -753,11 +763,11 @@ static void prepare_sweep(const step_data *step, sweep_data *data)
 static inline double expected_change(double change, double last, int absolute)
 {
   const double quotient = change / last, ratio = last < INFINITY ? smaller(larger(quotient, 1e-6), 0.25) : 1.0; /* squares */
-  return absolute ? change : 4.0 * ratio * change * ratio;
+  return absolute ? change : 16.0 * ratio * change * ratio;
 }
 
 /* Whether a sweep that changed the points by the square root of `change` (relative to the state) was good enough: what
- * follows it would change them by less than half the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
+ * follows it would change them by less than a quarter of the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
  * contracts too slowly or not at all. Without branches, for many at once. */
 static inline int sweep_status(double change, double last, double tolerance, int absolute, int max_iterations, int k)
 {
@@ -768,16 +778,19 @@ static inline int sweep_status(double change, double last, double tolerance, int
 }
 
 /* One step. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; then once more, and the increments, with
- * all digits of the coefficients. The forces stay in memory. */
+ * all digits of the coefficients. Small terms are summed first: added to a rounded sum, they would be rounded away. The
+ * forces stay in memory. */
 static int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report)
 {
   lanes X[M], base[M], F[M];
-  double drift[M], inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
+  double drift[M], drift_low[M], inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
   int status = 0;
   for (int i = 0; i < M; i++) {
-    drift[i] = step->h * (data->inverse_mass[i] * step->p0[i]);
-    base[i] = step->q0[i] + (POINT_DRIFT * drift[i] + (POINT_DRIFT_LOW * drift[i] + step->carry_q[i]));
+    const double v = data->inverse_mass[i] * step->p0[i], v_low = fma(data->inverse_mass[i], step->p0[i], -v);
+    drift[i] = step->h * v;
+    drift_low[i] = fma(step->h, v, -drift[i]) + step->h * (v_low + data->inverse_mass[i] * step->carry_p[i]);
+    base[i] = step->q0[i] + POINT_DRIFT * drift[i];
     inverse_size[i] = fabs(step->q0[i]) + fabs(drift[i]);
     largest = larger(largest, inverse_size[i]);
     X[i] = base[i];
@@ -810,15 +823,16 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   if (status < 0)
     return last < INFINITY ? TWO_POINT_PENDULUM_NOT_CONVERGED : TWO_POINT_PENDULUM_NOT_FINITE;
   for (int i = 0; i < M; i++) {
-    const lanes sum = lanes_apply(POINT_PRODUCT, F[i]) + lanes_apply(POINT_PRODUCT_LOW, F[i]);
-    X[i] = base[i] + data->inverse_mass[i] * (data->square * sum + data->square_low * sum);
+    const lanes sum = lanes_apply(POINT_PRODUCT, F[i]), low = lanes_apply(POINT_PRODUCT_LOW, F[i]);
+    const lanes small = step->carry_q[i] + POINT_DRIFT * drift_low[i] + POINT_DRIFT_LOW * drift[i];
+    const lanes rest = data->inverse_mass[i] * (data->square * low + data->square_low * sum);
+    X[i] = step->q0[i] + ((POINT_DRIFT * drift[i] + (small + rest)) + data->inverse_mass[i] * (data->square * sum));
   }
   force_lanes(X, step->parameters, F);
   for (int i = 0; i < M; i++) {
-    const double impulse = lanes_total(POINT_END_MOMENTUM * F[i] + POINT_END_MOMENTUM_LOW * F[i]);
     const double sum = lanes_total(POINT_END_POSITION * F[i] + POINT_END_POSITION_LOW * F[i]);
-    dp[i] = step->h * impulse;
-    dq[i] = drift[i] + data->inverse_mass[i] * (data->square * sum + (data->square_low * sum + step->h * step->carry_p[i]));
+    dp[i] = lanes_total(data->weight * F[i] + data->weight_low * F[i]);
+    dq[i] = drift[i] + (drift_low[i] + data->inverse_mass[i] * (data->square * sum + data->square_low * sum));
   }
   if (!all_finite(dq, M) || !all_finite(dp, M))
     return TWO_POINT_PENDULUM_NOT_FINITE;

@@ -20,7 +20,9 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
+    "advice": ("Advice", "advise"),
     "compiler": ("compile_stepper", "generate_source"),
+    "ensemble": ("EnsembleTrajectory",),
     "equations": ("StepEquations", "derive"),
     "errors": (
         "BuildError",

@@ -85,7 +85,7 @@ def _client(address: str | None) -> Iterator[Any]:
         ) from error
     if address is None:
         with (
-            distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
+            distributed.LocalCluster(n_workers=1, processes=False, dashboard_address="127.0.0.1:0") as cluster,
             distributed.Client(cluster) as client,
         ):
             yield client

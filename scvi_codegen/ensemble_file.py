@@ -24,8 +24,9 @@ import difflib
 import math
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,10 @@ if TYPE_CHECKING:
 __all__ = ["EnsembleStates", "load_ensemble"]
 
 Array = NDArray[np.float64]
+Check = Callable[[Sequence[str]], None]
+
+MOST = 10**8
+"""Trajectories of a grid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,8 +124,7 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     try:
         if suffix not in readers:
             raise ModelFileError("an ensemble is a grid in a .toml file or a table in a .csv file")
-        columns = readers[suffix](Path(path).read_text(encoding="utf-8"))
-        _check_names(columns, model)
+        columns = readers[suffix](Path(path).read_text(encoding="utf-8-sig"), partial(_check_names, model))
     except OSError as error:
         raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -130,7 +134,7 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     return EnsembleStates(columns=columns, model=model)
 
 
-def _read_grid(text: str) -> dict[str, Array]:
+def _read_grid(text: str, check: Check) -> dict[str, Array]:
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -138,7 +142,11 @@ def _read_grid(text: str) -> dict[str, Array]:
     grid = document.get("grid")
     if set(document) != {"grid"} or not isinstance(grid, dict) or not grid:
         raise ModelFileError("the file must have one section, [grid], with a line for each quantity that varies")
+    check(list(grid))
     axes = [_axis(value, f"[grid] {name}") for name, value in grid.items()]
+    count = math.prod(map(len, axes))
+    if count > MOST:
+        raise ModelFileError(f"the grid has {count} combinations, of at most {MOST}")
     combined = np.meshgrid(*axes, indexing="ij")
     return {name: values.ravel() for name, values in zip(grid, combined, strict=True)}
 
@@ -149,8 +157,8 @@ def _axis(value: Any, where: str) -> Array:
         if set(value) != {"from", "to", "count"}:
             raise ModelFileError(f"{where} must have from, to and count, not {', '.join(value) or 'nothing'}")
         count = value["count"]
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ModelFileError(f"{where} count must be a whole number of at least 1, not {count!r}")
+        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST:
+            raise ModelFileError(f"{where} count must be a whole number from 1 to {MOST}, not {count!r}")
         return np.linspace(_real(value["from"], f"{where} from"), _real(value["to"], f"{where} to"), count)
     values = value if isinstance(value, list) else [value]
     if not values:
@@ -164,7 +172,7 @@ def _real(value: Any, where: str) -> float:
     return float(value)
 
 
-def _read_table(text: str) -> dict[str, Array]:
+def _read_table(text: str, check: Check) -> dict[str, Array]:
     reader = csv.reader(text.splitlines(), skipinitialspace=True)
     lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
     if len(lines) < 2:
@@ -173,13 +181,16 @@ def _read_table(text: str) -> dict[str, Array]:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise ModelFileError(f"the column '{repeated[0]}' is there twice")
+    if "" in names:
+        raise ModelFileError(f"column {names.index('') + 1} has no name in the first line")
+    check(names)
     rows = [_row(cells, names, number) for number, cells in lines[1:]]
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
 def _row(cells: list[str], names: list[str], number: int) -> list[float]:
     if len(cells) != len(names):
-        raise ModelFileError(f"line {number} has {len(cells)} numbers for {len(names)} names")
+        raise ModelFileError(f"line {number} must have a number for each of {len(names)} names, and has {len(cells)}")
     values = []
     for name, cell in zip(names, cells, strict=True):
         try:
@@ -191,15 +202,15 @@ def _row(cells: list[str], names: list[str], number: int) -> list[float]:
     return values
 
 
-def _check_names(columns: Mapping[str, Array], model: Model) -> None:
+def _check_names(model: Model, names: Sequence[str]) -> None:
     coordinates = [coordinate.name for coordinate in model.system.coordinates]
     parameters = [symbol.name for symbol in model.system.parameters]
     velocities, momenta = [f"{name}_dot" for name in coordinates], [f"p_{name}" for name in coordinates]
     known = [*coordinates, *velocities, *momenta, *parameters]
-    for name in columns:
+    for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known[:12])}"
             raise ModelFileError(f"'{name}' is no coordinate, velocity, momentum or parameter of the system{hint}")
-    if any(name in columns for name in velocities) and any(name in columns for name in momenta):
+    if not set(names).isdisjoint(velocities) and not set(names).isdisjoint(momenta):
         raise ModelFileError("there are both velocities and momenta: give one or the other")

@@ -53,6 +53,10 @@ def pendulum() -> LagrangianSystem:
     return problem("planar-pendulum").system.with_parameters(m=1.0, l=1.0, g=1.0)
 
 
+def name(value: object) -> str:
+    return value.name if isinstance(value, Method) else str(value)
+
+
 def achieved(
     system: LagrangianSystem, advice: Advice, q: list[float], p: list[float], exact: np.ndarray, size: float
 ) -> float:
@@ -60,54 +64,58 @@ def achieved(
     return float(np.linalg.norm(run.q[-1] - exact)) / size
 
 
+def assert_as_promised(advice: Advice, error: float, tolerance: float) -> None:
+    """Half the tolerance is aimed at; high orders miss it where the error is no smooth function of the step.
+
+    Measured: 0.05 to 0.5 of the tolerance, nearly always above 0.3, and 0.9 to 1.3 of the error expected.
+    """
+    assert advice.warnings == ()
+    assert 0.04 * tolerance < advice.expected_error < 0.51 * tolerance
+    assert advice.expected_error / 3.0 < error < 3.0 * advice.expected_error
+
+
 class TestAchievedErrors:
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("eccentricity", [0.2, 0.5])
-    @pytest.mark.parametrize("method", [SVI(8), SVI(4), Gauss(3), RadauIIA(3), SCVI(4)], ids=lambda method: method.name)
+    @pytest.mark.parametrize("method", [SVI(8), SVI(4), Gauss(3), RadauIIA(3), SCVI(4)], ids=name)
     def test_kepler(self, method: Method, eccentricity: float, tolerance: float):
         system, (q, p), span = problem("kepler").system, kepler_start(eccentricity), 100.0
         advice = advise(system, method, q, p, span, tolerance)
-        assert advice.warnings == ()
-        assert advice.expected_error <= tolerance
         size = math.sqrt(1.0 + 1.5 * eccentricity**2)  # in the mean over an orbit
         error = achieved(system, advice, q, p, kepler_end(eccentricity, span), size)
-        # measured 0.13 to 0.5 of the tolerance, and down to 0.05 at 1e-11
-        assert (0.02 if tolerance < 1e-10 else 0.1) * tolerance < error < 2.0 * tolerance
+        assert_as_promised(advice, error, tolerance)
 
     @pytest.mark.parametrize(
         ("method", "span", "tolerance"),
         [
             (SVI(8), 2000.0, 1e-6),
             (SVI(8), 2000.0, 1e-9),
-            (SVI(8), 2000.0, 1e-11),
+            (SVI(8), 2000.0, 1e-10),
             (SVI(8), 50_000.0, 1e-6),
-            (SVI(8), 50_000.0, 1e-9),
+            (SVI(8), 50_000.0, 1e-8),
             (SVI(4), 50_000.0, 1e-6),
             (RadauIIA(3), 2000.0, 1e-6),
             (StoermerVerlet(), 100.0, 1e-6),
         ],
-        ids=str,
+        ids=name,
     )
     def test_runs_longer_than_the_pilot(self, method: Method, span: float, tolerance: float):
         """Errors are extrapolated: linearly, and quadratically for Radau; the step of Stoermer-Verlet by its order."""
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, method, q, p, span, tolerance)
-        assert advice.warnings == ()
         error = achieved(system, advice, q, p, kepler_end(0.2, span), 1.0)
-        # measured 0.2 to 0.5 of the tolerance; 1.1 where rounding adds to it
-        assert 0.1 * tolerance < error < (2.0 if tolerance < 1e-10 else 4.0) * tolerance
+        assert_as_promised(advice, error, tolerance)
 
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
-    @pytest.mark.parametrize("method", [SVI(8), SVI(4), RadauIIA(3)], ids=lambda method: method.name)
+    @pytest.mark.parametrize("method", [SVI(8), SVI(4), RadauIIA(3)], ids=name)
     def test_pendulum(self, method: Method, tolerance: float):
-        q, p, span = [1.5], [0.0], 1000.0
+        q, p, span = [1.5], [0.0], 1100.0
         advice = advise(pendulum(), method, q, p, span, tolerance)
-        assert advice.warnings == ()
         error = achieved(pendulum(), advice, q, p, pendulum_end(span), 1.5 / math.sqrt(2.0))
-        assert (0.02 if tolerance < 1e-10 else 0.1) * tolerance < error < 2.0 * tolerance
+        assert_as_promised(advice, error, tolerance)
 
     @pytest.mark.parametrize(
-        ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=str
+        ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=name
     )
     def test_outer_solar_system(self, method: Method, tolerance: float):
         system, span = problem("outer-solar-system").system, 100_000.0
@@ -115,10 +123,9 @@ class TestAchievedErrors:
         q, v = np.array(POSITIONS).ravel().tolist(), np.array(VELOCITIES).ravel().tolist()
         p = stepper.momentum(q, v).tolist()
         advice = advise(system, method, q, p, span, tolerance)
-        assert advice.warnings == ()
         exact = outer_reference(span)
         error = achieved(system, advice, q, p, exact, float(np.linalg.norm(exact)))
-        assert (0.02 if tolerance < 1e-10 else 0.1) * tolerance < error < 2.0 * tolerance
+        assert_as_promised(advice, error, tolerance)
 
     def test_backward_with_parameters_and_time(self):
         system, span = problem("duffing").system, -40.0
@@ -134,6 +141,12 @@ class TestAchievedErrors:
         assert 1e-10 < abs(rough - fine)[0] < 4e-8
 
 
+def cost(advice: Advice, points: int) -> float:
+    """Evaluations for a unit of time, with three iterations' worth beside those of each step."""
+    (row,) = (row for row in advice.evidence if row.h == pytest.approx(advice.h))
+    return (row.iterations + 3.0) * math.ceil(points / 8) * 8 / advice.h
+
+
 @cache
 def outer_reference(span: float) -> np.ndarray:
     q, _ = integrate(POSITIONS, VELOCITIES, MASSES, GRAVITY, span, 500)
@@ -141,15 +154,23 @@ def outer_reference(span: float) -> np.ndarray:
 
 
 class TestDegree:
-    def test_the_cheapest_degree_is_higher_for_a_smaller_error(self):
+    @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-11])
+    def test_the_degree_with_the_fewest_evaluations(self, tolerance: float):
+        """By count, hence the same each time: degree 8 fills a register, which degrees below pay for without use."""
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
-        loose, strict = (advise(system, SVI(4), q, p, 200.0, tolerance, degree=True) for tolerance in (1e-2, 1e-11))
-        assert loose.degree is not None
-        assert strict.degree is not None
-        assert loose.degree < strict.degree
-        assert strict.degree >= 6
-        assert strict.method == SVI(strict.degree)
-        assert achieved(system, strict, q, p, kepler_end(0.2, 200.0), 1.0) < 2e-11
+        advice = advise(system, SVI(4), q, p, 200.0, tolerance, degree=True)
+        costs = {n: cost(advise(system, SVI(n), q, p, 200.0, tolerance), n) for n in (4, 6, 8, 10, 12)}
+        assert advice.degree == min(costs, key=costs.__getitem__) == 8
+        assert advice.method == SVI(8)
+        assert costs[4] > 1.8 * costs[8]
+        assert achieved(system, advice, q, p, kepler_end(0.2, 200.0), 1.0) < tolerance
+
+    def test_the_choice_does_not_depend_on_the_clock(self, monkeypatch: pytest.MonkeyPatch):
+        system, (q, p) = problem("kepler").system, kepler_start(0.2)
+        times = iter(np.random.default_rng(1).uniform(0.0, 1e9, 10_000).cumsum())
+        monkeypatch.setattr("scvi_codegen.pilot.time.perf_counter", lambda: next(times))
+        first, second = (advise(system, Gauss(4), q, p, 50.0, 1e-8, degree=True) for _ in range(2))
+        assert (first.degree, first.h, first.message) == (second.degree, second.h, second.message)
 
     def test_stages_of_a_runge_kutta_method_are_its_degree(self):
         assert advise(pendulum(), Gauss(5), [1.5], [0.0], 20.0, 1e-6).degree == 5
@@ -167,11 +188,11 @@ class TestHonesty:
         with pytest.raises(FrozenInstanceError):
             advice.h = 1.0  # type: ignore[misc]
         assert advice.h == 100.0 / advice.steps
-        steps = [h for h, _, _ in advice.evidence]
+        steps = [row.h for row in advice.evidence]
         assert steps == sorted(steps, reverse=True)
         assert steps[-1] <= advice.h <= steps[0]
         assert any(row.error == advice.expected_error and row.h == pytest.approx(advice.h) for row in advice.evidence)
-        assert all(row.seconds > 0.0 for row in advice.evidence if math.isfinite(row.error))
+        assert all(row.seconds > 0.0 < row.iterations for row in advice.evidence if math.isfinite(row.error))
         assert "symplectic" in advice.message
         assert "no digit is right" in advice.message
         assert "symplectic" not in advise(system, RadauIIA(3), q, p, 20.0, 1e-6).message
@@ -190,7 +211,7 @@ class TestHonesty:
         assert 0.02 * advice.expected_error < error < 20.0 * advice.expected_error
         assert 0.1 < advice.h < 1.0  # shorter steps would be for nothing
 
-    @pytest.mark.parametrize("method", [SVI(8), StoermerVerlet()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("method", [SVI(8), StoermerVerlet()], ids=name)
     @pytest.mark.parametrize("span", [50.0, 1000.0])
     def test_chaos_is_said_to_be_hopeless(self, method: Method, span: float):
         entry = problem("double-pendulum")
@@ -198,6 +219,14 @@ class TestHonesty:
         advice = advise(entry.system, method, entry.q, p, span, 1e-6)
         assert advice.expected_error > 1e-2
         assert any("chaos" in warning for warning in advice.warnings)
+
+    def test_chaos_in_a_run_longer_than_the_pilot_is_not_promised(self):
+        entry = problem("double-pendulum")
+        p = compile_stepper(entry.system, StoermerVerlet()).momentum(entry.q, entry.velocity)
+        advice = advise(entry.system, StoermerVerlet(), entry.q, p, 10.0, 1e-2)
+        assert advice.expected_error < 1e-2
+        assert len(advice.warnings) == 1
+        assert re.search(r"part by a factor of 10 every \S+ units of time \(chaos\).*not certain", advice.warnings[0])
 
     def test_chaos_over_a_short_span_is_none(self):
         entry = problem("double-pendulum")
@@ -270,7 +299,7 @@ class TestCommandLine:
         assert result.exit_code == 0, result.output
         steps, h = re.search(r"^(\d+) steps of (\S+) by svi-8", result.stdout).groups()  # type: ignore[union-attr]
         assert f"{steps} steps of {float(h):g} from t = 0 to t = 100" in result.stdout
-        assert len(re.findall(r"^  h = \S+ +error \S+ +\S+ \w+ a unit of time$", result.stdout, re.MULTILINE)) > 2
+        assert len(re.findall(r"^  h = \S+ +error \S+ +\S+ \w+ for the span$", result.stdout, re.MULTILINE)) > 2
 
     def test_backward_and_from_a_number_of_steps(self):
         result = self.invoke("kepler --time 50 --step -0.25 --span 50")
@@ -286,6 +315,7 @@ class TestCommandLine:
             ("kepler --tolerance 1e-6 --step 0.1", "--tolerance chooses the step: leave out --step"),
             ("kepler --tolerance 1e-6 --steps 10", "--tolerance chooses the step: leave out --steps"),
             ("kepler --tolerance 0", "the tolerance must be positive"),
+            ("kepler --tolerance 1e-6 --method explicit-euler", "steps are too many to begin without being told"),
             ("kepler --solver-tolerance 0", "the tolerance must be positive"),
         ):
             result = self.invoke(words)

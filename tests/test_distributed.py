@@ -6,9 +6,11 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +49,7 @@ def distributed() -> Any:
 def cluster(distributed: Any) -> Iterator[Any]:
     """Two worker processes of one thread."""
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
     ) as cluster:
         yield cluster
 
@@ -60,7 +62,6 @@ def test_parts_are_full_registers_and_cover_everything():
         assert all((part.stop - part.start) % 8 == 0 for part in parts[:-1])
 
 
-@pytest.mark.filterwarnings("ignore")  # what the cluster warns of is its own business
 class TestCluster:
     def test_in_this_process_by_default(self, distributed: Any, kepler: Stepper):
         q, p = states()
@@ -98,16 +99,38 @@ class TestCluster:
 
         def kill_one(done: int) -> None:
             if not killed:
-                killed.append(pids[0])
+                killed.append(done)
                 os.kill(pids[0], signal.SIGKILL)
 
         result = integrate_ensemble(
             kepler, q, p, **arguments, address=cluster.scheduler_address, blocks=9, progress=kill_one
         )
-        assert killed
+        assert 0 < killed[0] < COUNT
         assert result.ok.all()
         assert np.array_equal(result.q, here.q)
         assert np.array_equal(result.p, here.p)
+
+    def test_a_worker_compiles_the_source_into_its_own_cache(self, distributed: Any, kepler: Stepper, tmp_path: Path):
+        q, p = states()
+        with distributed.LocalCluster(
+            n_workers=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=50,
+            env={"SCVI_CODEGEN_CACHE": str(tmp_path)},
+        ) as cluster:
+            result = integrate_ensemble(kepler, q, p, h=0.05, steps=20, address=cluster.scheduler_address)
+        assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
+        assert any(tmp_path.iterdir())
+
+    def test_nothing_is_left_running(self, distributed: Any, kepler: Stepper):
+        q, p = states()
+        counts = []
+        for _ in range(3):
+            integrate_ensemble(kepler, q, p, h=0.05, steps=20)
+            files = list(Path("/proc/self/fd").iterdir()) if sys.platform == "linux" else []
+            counts.append((threading.active_count(), len(files)))
+        assert counts[2] == counts[1]
 
     def test_an_interruption_calls_the_rest_off(self, distributed: Any, cluster: Any, kepler: Stepper):
         def interrupt(done: int) -> None:

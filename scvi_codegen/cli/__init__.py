@@ -242,33 +242,27 @@ def methods(tableau: str | None) -> None:
 
 
 @main.command(short_help="Measure this project against other integrators.")
-@click.argument("problems", nargs=-1, metavar="[PROBLEM ...]")
+@click.argument("sections", nargs=-1, metavar="[SECTION ...]")
 @click.option("--peers", metavar="NAME,..", help="Only these of heyoka, rebound, cyrk, jitcode, scipy; none: ''.")
 @click.option("--json", "json_path", type=click.Path(), metavar="FILE", help="All measurements as JSON.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
 @click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
-@click.option("--drift", is_flag=True, help="The energy over many steps of Kepler's problem (alone, or as well).")
-@click.option("--drift-steps", type=int, default=10_000_000, show_default=True, help="How many.")
 def bench(
-    problems: tuple[str, ...],
-    peers: str | None,
-    json_path: str | None,
-    plot: str | None,
-    repeats: int,
-    quick: bool,
-    drift: bool,
-    drift_steps: int,
+    sections: tuple[str, ...], peers: str | None, json_path: str | None, plot: str | None, repeats: int, quick: bool
 ) -> None:
     """Time this project and the installed peers in turn, and compare them at equal error.
 
-    PROBLEM is planar-pendulum, duffing, kepler:0.2, kepler:0.5, outer-solar-system, double-pendulum,
-    relativistic-particle, or fput-chain:8, :64, :256; by default all. Install the peers with 'scvi-codegen[bench]'.
+    SECTION is a problem (planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system,
+    double-pendulum, relativistic-particle, fput-chain:8, :64, :256), 64 trajectories of one at once
+    (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), drift (the energy over ten million
+    steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C) or start-up; by default all.
+    Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
 
     \b
     Examples:
       scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
-      scvi-codegen bench --drift
+      scvi-codegen bench drift hand-written --json measured.json
     """  # noqa: D301  (click wants the character \b)
     for path, hint in ((json_path, "'--json'"), (plot, "'--plot'")):
         if path is not None:
@@ -276,9 +270,11 @@ def bench(
     from scvi_codegen.benchmark import PEERS, Plan, benchmark
 
     names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
-    plan, steps = Plan(peers=names, repeats=repeats, quick=quick), drift_steps if drift else 0
-    say = partial(click.echo, err=True)
-    click.echo(benchmark(problems, plan, json_path=json_path, plot_path=plot, drift_steps=steps, say=say))
+    plan, say = Plan(peers=names, repeats=repeats, quick=quick), partial(click.echo, err=True)
+    report = benchmark(sections, plan, json_path=json_path, plot_path=plot, say=say)
+    click.echo(report.text())
+    if report.interrupted:
+        raise _Failure(f"interrupted in '{report.interrupted}'; what was measured before is above", INTERRUPTED)
 
 
 @contextmanager

@@ -7,20 +7,24 @@ from dataclasses import replace
 
 import click
 
-from scvi_codegen.advice import Advice, advise
+from scvi_codegen.advice import Advice, Evidence, advise
 from scvi_codegen.binding import SolverOptions
 from scvi_codegen.cli.running import duration
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
 from scvi_codegen.model_file import Model
 
 __all__ = ["advised_model"]
+
+MOST_STEPS = 10**9
+"""More are not begun unasked: at a microsecond each these take a quarter of an hour."""
 
 
 def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions) -> Model:
     """The model with step and number of steps for an error at the end; prints why, and warnings to stderr.
 
     Raises:
-        StateError: if the tolerance is not positive, or every pilot run fails.
+        StateError: if the tolerance is not positive, every pilot run fails, or very many steps are needed.
     """
     span = model.span if model.span is not None else abs(model.h) * model.step_count
     stepper = compile_stepper(model.system, model.method, solver=solver)
@@ -38,15 +42,22 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
     click.echo(_text(advice))
     for warning in advice.warnings:
         click.echo(f"Warning: {warning}", err=True)
+    if advice.steps > MOST_STEPS:
+        raise StateError(
+            f"{advice.steps} steps are too many to begin without being told: take a method of higher order, "
+            f"a larger --tolerance or a shorter --span, or say --step {advice.h:.6g}"
+        )
     return replace(model, h=advice.h, steps=advice.steps, span=None)
 
 
 def _text(advice: Advice) -> str:
     """The message and a line a pilot run."""
-    lines = [
-        f"  h = {row.h:<12.6g} error {row.error:<9.2g} {duration(row.seconds)} a unit of time"
-        if math.isfinite(row.error)
-        else f"  h = {row.h:<12.6g} fails"
-        for row in advice.evidence
-    ]
+    lines = [f"  h = {row.h:<12.6g} {_outcome(row, abs(advice.h) * advice.steps)}" for row in advice.evidence]
     return "\n".join([advice.message, *lines, ""])
+
+
+def _outcome(row: Evidence, span: float) -> str:
+    if not math.isfinite(row.error):
+        return "fails"
+    error = f"error {row.error:.2g}" if row.error < 1.0 else "no digit right"
+    return f"{error:15} {duration(row.seconds * span)} for the span"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ from scvi_codegen.cli.running import counted, duration, interruptions, progress_
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory
 from scvi_codegen.ensemble_file import EnsembleStates
+from scvi_codegen.errors import StateError
 from scvi_codegen.model_file import Model
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
@@ -50,9 +53,10 @@ def integrate_states(
     Raises:
         BuildError: without a C compiler.
         MethodError: for a solver that the method does not have.
-        StateError: if a state is unfit.
+        StateError: if a state is unfit, or all of them need more memory than there is.
     """
     model, began = states.model, time.perf_counter()
+    _check_memory(len(states), model)
     stepper = compile_stepper(model.system, model.method, solver=solver)
     work = Ensemble(
         stepper,
@@ -85,6 +89,23 @@ def integrate_states(
         seconds=time.perf_counter() - started,
         interrupted=interrupted,
     )
+
+
+def _check_memory(count: int, model: Model) -> None:
+    kept = model.step_count // model.every + 1
+    needed = 16 * len(model.q) * count * kept
+    if needed > physical_memory():
+        raise StateError(
+            f"{kept} states of each of {count} trajectories need {needed / 1e9:.3g} GB of memory: keep fewer (--every)"
+        )
+
+
+def physical_memory() -> float:
+    """Bytes of this machine; infinitely many where it does not tell."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
 
 
 def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:

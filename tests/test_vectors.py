@@ -1,0 +1,49 @@
+"""The vector functions of the generated C, against libm in extended precision."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+CHECK = """
+#include "power.c"
+
+void check(const double *x, double *y)
+{
+  lane_view view;
+  memcpy(view.lane, x, sizeof view);
+  view.all = lanes_inverse_root_%d(view.all);
+  memcpy(y, view.lane, sizeof view);
+}
+"""
+
+
+@pytest.mark.parametrize("flags", ["-march=native -O2", "-O2"])
+@pytest.mark.parametrize("k", [1, 3, 5, 7])
+def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
+    compiler = shutil.which("cc") or pytest.skip("there is no C compiler")
+    system = sc.LagrangianSystem.from_text(
+        name="power", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**({2 - k}/2)" if k != 2 else "", parameters={}
+    )
+    source, _ = sc.generate_source(system, sc.SVI(8), prefix="power")
+    (tmp_path / "power.h").write_text(source.header)
+    (tmp_path / "power.c").write_text(source.code)
+    (tmp_path / "check.c").write_text(CHECK % k)
+    command = [compiler, *flags.split(), "-shared", "-fPIC", "check.c", "-o", "check.so", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    check = ctypes.CDLL(str(tmp_path / "check.so")).check
+    generator = np.random.default_rng(3)
+    worst = 0.0
+    for _ in range(2000):
+        x = generator.uniform(1.0, 4.0, 8) * 2.0 ** generator.integers(-80, 80, 8)
+        y = np.empty(8)
+        check(*(array.ctypes.data_as(ctypes.c_void_p) for array in (x, y)))
+        exact = np.longdouble(x) ** (np.longdouble(-k) / 2)
+        worst = max(worst, float(np.max(np.abs((y - exact) / exact))))
+    assert worst < 2 * 2.0**-52 + k * 2.0**-54
