@@ -396,6 +396,11 @@ class Splitting:
     force: Kernel
     mass: Kernel
 
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Both."""
+        return (self.force, self.mass)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Program:

@@ -126,11 +126,12 @@ def scratch_size(program: Program) -> int:
 
 
 def _context(program: Program) -> dict[str, object]:
+    scalar_kernels = (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
     return {
         "program": program,
         "prefix": program.prefix,
         "kernels": program.kernels,
-        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, program.kernels))),
+        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalar_kernels))),
         "purpose": _purposes(program),
         "legendre": program.legendre,
         "lagrangian": program.lagrangian,
