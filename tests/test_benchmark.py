@@ -11,15 +11,26 @@ from mpmath import mp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen import building
-from scvi_codegen.benchmark import cases, measuring, peers, report
+from scvi_codegen.benchmark import (
+    cases,
+    compositions,
+    hand_written,
+    measuring,
+    ours,
+    paper_tables,
+    peers,
+    report,
+    start_up,
+)
 from scvi_codegen.benchmark.contenders import Contender
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
-from scvi_codegen.benchmark.drift import drift_of, drift_table, fitted_slope
-from scvi_codegen.benchmark.ours import ladder, our_contenders
+from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
+from scvi_codegen.benchmark.ours import our_ensembles
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
+from scvi_codegen.benchmark.tables import Table
 from scvi_codegen.benchmark.tracing import rates_text
 from scvi_codegen.errors import StateError, SystemDefinitionError
-from scvi_codegen.methods import SVI
+from scvi_codegen.methods import SVI, Composition, StoermerVerlet
 
 EXTENDED = np.finfo(np.longdouble).eps < 1e-18
 needs_extended = pytest.mark.skipif(not EXTENDED, reason="long double is no wider than double here")
@@ -33,9 +44,14 @@ def short(name, span):
     return replace(cases.case(name), span=span)
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path / "cache"))
+def own_cache(folder, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(folder))
 
 
 class TestCases:
@@ -75,6 +91,8 @@ class TestCases:
     def test_unknown_names(self):
         with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
             cases.case("dufing")
+        with pytest.raises(StateError, match=r"nothing called 'drif' to measure; did you mean 'drift'\?"):
+            bench.benchmark(["drif"])
         with pytest.raises(StateError, match="no peer 'heyoca'"):
             bench.Plan(peers=("heyoca",))
 
@@ -87,6 +105,14 @@ class TestCases:
         out = np.empty(36)
         names["rates"](out, 0.0, x, 0)
         np.testing.assert_allclose(out, chosen.formulations[0].rates(x, chosen.parameters, math), rtol=1e-13)
+
+    def test_the_loops_of_a_chain_compute_the_same(self):
+        chosen = cases.case("fput-chain:8")
+        names = {}
+        exec(chosen.loops, names)
+        x, out = np.random.default_rng(5).standard_normal(16), np.empty(16)
+        names["rates"](out, 0.0, x, 0)
+        np.testing.assert_allclose(out, chosen.formulations[0].rates(list(x), chosen.parameters, math), rtol=1e-13)
 
 
 def kepler_position(q, v, t):
@@ -144,11 +170,12 @@ class TestReference:
         moved = reference(chosen, momenta)
         assert 0 < np.abs((moved.high - reference(chosen).high) + (moved.low - reference(chosen).low)).max() < 1e-14
 
-    def test_our_steppers_arrive_there(self):
+    def test_our_ensemble_arrives_there(self, monkeypatch):
+        monkeypatch.setattr(ours, "advised_counts", lambda *_, quick: {100: 1e-12})
         chosen = short("kepler:0.2", 50.0)
-        contender = our_contenders(chosen, rungs=1)[0]
-        final = np.array([contender.prepare(n)() for n in range(cases.STATES)])
-        assert rms_error(final, reference(chosen)) < 1e-12
+        (ensemble,) = our_ensembles(chosen)
+        assert ensemble.trajectories == len(chosen.q)
+        assert rms_error(ensemble.prepare(0)(), reference(chosen)) < 1e-12
 
 
 class TestCurves:
@@ -165,9 +192,10 @@ class TestCurves:
         assert time_at([], 1e-7) is None
 
     def test_errors_below_the_floor_are_equal(self):
-        curve = points((1.0, 1e-10), (2.0, 9e-14), (3.0, 1e-16))
-        assert [point.seconds for point in frontier(curve)] == [1.0, 2.0]
-        assert time_at(curve, 1e-15) == time_at(curve, FLOOR) == 2.0
+        curve = points((1.0, 1e-11), (4.0, 1e-15), (5.0, 1e-16))
+        assert [point.seconds for point in frontier(curve)] == [1.0, 4.0]
+        assert time_at(curve, 1e-15) == time_at(curve, FLOOR) == pytest.approx(2.0)
+        assert time_at(points((1.0, 1e-11), (4.0, 0.0)), FLOOR) < 4.0
 
     def test_a_slower_setting_that_is_less_accurate_does_not_matter(self):
         curve = points((1.0, 1e-6), (2.0, 1e-10))
@@ -192,30 +220,35 @@ def result_of(*found, **skipped):
 class TestReport:
     result = result_of(
         measurement("scvi-codegen svi", 1e-3, 1e-12),
+        measurement("heyoka", 5e-3, 1e-13, setting="tol=default"),
         measurement("heyoka", 4e-3, 1e-12),
         measurement("heyoka fast_math", 3e-3, 1e-12),
         measurement("broken", math.nan, math.nan, failure="ArithmeticError: no"),
         jitcode="not installed",
     )
 
-    def test_ratios_are_against_the_best_and_the_plain_heyoka(self):
-        ours, plain, fast = report.rows(self.result)
-        assert (ours.ratio, ours.plain_ratio) == (pytest.approx(3.0), pytest.approx(4.0))
-        assert (plain.ratio, fast.ratio) == (pytest.approx(0.75), 1.0)
+    def test_ratios_are_against_heyoka_by_default_and_at_best_and_against_the_best_peer(self):
+        other = measurement("CyRK DOP853", 2e-3, 1e-12)
+        ours, _, fast, _ = report.rows(replace(self.result, measurements=(*self.result.measurements, other)))
+        assert (ours.default, ours.best, ours.peer) == tuple(pytest.approx(x) for x in (5.0, 3.0, 2.0))
+        assert fast.best == 1.0
 
     def test_without_heyoka_there_are_no_ratios(self):
-        (row,) = report.rows(result_of(measurement("scvi-codegen svi", 1e-3, 1e-12)))
-        assert row.ratio is None
-        assert "-" in report.table([result_of(measurement("scvi-codegen svi", 1e-3, 1e-12))], bench.machine())
+        result = result_of(measurement("scvi-codegen svi", 1e-3, 1e-12))
+        (row,) = report.rows(result)
+        assert row.default is row.best is row.peer is None
+        assert "-" in result.text()
 
     def test_table_names_failures_and_skipped_peers(self):
-        text = report.table([self.result], bench.machine())
+        text = self.result.text()
         assert "skipped jitcode: not installed" in text
         assert "broken h=1: ArithmeticError: no" in text
 
     def test_json_schema(self):
-        data = json.loads(json.dumps(report.as_json([self.result], bench.machine()), allow_nan=False))
-        assert set(data) == {"schema", "machine", "cases"}
+        table = Table(name="t", title="", columns={"a": ".1f", "b": ""}, rows=({"a": math.nan}, {"a": 1.0, "b": "x"}))
+        whole = bench.Report(machine=bench.machine(), results=(self.result, table))
+        data = json.loads(json.dumps(whole.data(), allow_nan=False))
+        assert set(data) == {"schema", "machine", "cases", "tables", "interrupted"}
         assert {"processor", "compiler", "flags", "versions"} <= set(data["machine"])
         (found,) = data["cases"]
         assert set(found) == {"name", "span", "dimension", "reference_accuracy", "skipped", "measurements", "rows"}
@@ -231,7 +264,9 @@ class TestReport:
             "failure",
         }
         assert all(set(entry) == fields for entry in found["measurements"])
-        assert found["measurements"][3]["seconds"] is None
+        assert found["measurements"][4]["seconds"] is None
+        assert data["tables"][0]["rows"] == [{"a": None}, {"a": 1.0, "b": "x"}]
+        assert "  a    b\n  -    -\n  1.0  x" in table.text()
 
 
 class TestMeasuring:
@@ -259,10 +294,16 @@ class TestMeasuring:
         assert (good.error, good.repeats, last.repeats) == (0.0, 2, 2)
         assert bad.failure == "ArithmeticError: no"
 
-    def test_ladder_is_geometric_about_its_middle(self):
-        steps = ladder(0.5, 5)
-        assert steps[2] == 0.5
-        assert np.ptp(np.diff(np.log(steps))) < 1e-12
+    def test_an_ensemble_is_one_run_whose_time_is_shared(self):
+        high = np.arange(8.0)[:, None]
+        final = np.tile(high, (2, 1))
+        ensemble = Contender(
+            method="all", setting="", options="", compile_seconds=0.0, prepare=lambda n: lambda: final, trajectories=16
+        )
+        exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
+        (found,) = measuring.measure([ensemble], lambda _: exact, repeats=2)
+        assert found.error == 0.0
+        assert found.seconds < 1e-3
 
 
 @needs_extended
@@ -271,14 +312,29 @@ class TestCommand:
         monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
         path = tmp_path / "out.json"
         said = []
-        plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),), advice=lambda *_: 0.4)
-        text = bench.benchmark(["planar-pendulum"], plan, json_path=str(path), drift_steps=2000, say=said.append)
+        plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),))
+        names = ["planar-pendulum", "drift"]
+        text = bench.benchmark(names, plan, json_path=str(path), say=said.append).text()
         assert "skipped heyoka: heyoka is not installed (pip install 'scvi-codegen[bench]')" in text
         assert "skipped cyrk: CyRK is not installed" in text
         data = json.loads(path.read_text())
-        assert any("(advised)" in found["setting"] for found in data["cases"][0]["measurements"])
-        assert len(data["drift"]) == 6
+        assert [found["name"] for found in data["cases"]] == names[:1]
+        assert data["cases"][0]["rows"][0]["best"] is None
+        assert max(found["error"] for found in data["cases"][0]["measurements"]) < 1e-6
+        assert len(data["tables"][0]["rows"]) == 6
         assert "planar-pendulum: reference" in said
+
+    def test_ctrl_c_keeps_what_was_measured(self, tmp_path, monkeypatch):
+        def interrupt(plan, say):
+            raise KeyboardInterrupt
+
+        done = Table(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
+        monkeypatch.setattr(bench, "SECTIONS", {"one": lambda plan, say: done, "two": interrupt, "three": interrupt})
+        path = tmp_path / "out.json"
+        found = bench.benchmark(json_path=str(path))
+        assert (found.results, found.interrupted) == ((done,), "two")
+        assert json.loads(path.read_text())["interrupted"] == "two"
+        assert "done: kept" in found.text()
 
     def test_picture(self, tmp_path):
         pytest.importorskip("matplotlib")
@@ -303,6 +359,37 @@ class TestDrift:
         assert 0.85 < scores.std() < 1.2
 
     def test_a_short_run_keeps_its_energy(self):
-        row = drift_of("kepler:0.2", 0.2, 20_000)
-        assert row.largest < 1e-12
-        assert "kepler:0.2" in drift_table([row])
+        (row,) = drift_rows(cases.case("kepler:0.2"), 0.2, 20_000, with_heyoka=False)
+        assert row["largest"] < 1e-12
+
+
+class TestTables:
+    def test_the_method_written_by_hand_agrees_with_the_generated_one(self):
+        found = hand_written.run_hand_written(bench.Plan(quick=True, repeats=1), lambda text: None)
+        assert [row["case"] for row in found.rows] == list(hand_written.HAND_WRITTEN)
+        assert all(row["apart"] < 1e-12 for row in found.rows)
+
+    @needs_extended
+    def test_a_table_of_the_paper(self, monkeypatch):
+        monkeypatch.setattr(paper_tables, "TABLES", paper_tables.TABLES[:1])
+        found = paper_tables.run_paper_tables(bench.Plan(quick=True, repeats=1), lambda text: None)
+        errors = {(row["table"], row["scheme"]): row["position_error"] for row in found.rows}
+        assert len(errors) == 3
+        assert errors[6, "SVI"] < 0.01 * errors[6, "SRK"]
+        assert "more accurate by" in found.text()
+
+    @needs_extended
+    @pytest.mark.full
+    def test_compositions_on_one_case(self, monkeypatch):
+        monkeypatch.setattr(compositions, "COMPARED", ("henon-heiles",))
+        monkeypatch.setattr(compositions, "METHODS", (SVI(8), StoermerVerlet(), Composition(8)))
+        found = compositions.run_compositions(bench.Plan(quick=True), lambda text: None)
+        assert [row["error"] for row in found.rows] == [1e-4, 1e-8, 1e-12]
+        assert all("stoermer-verlet" in row for row in found.rows)
+        assert found.rows[-1]["fastest"] != "stoermer-verlet"
+
+    def test_start_up(self):
+        cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows
+        assert (cold["cache"], cached["cache"]) == ("cold", "cached")
+        assert cold["sympy_by_import"] == "False"
+        assert cached["first_step_ms"] < cold["first_step_ms"]
