@@ -328,11 +328,16 @@ class TestCommand:
         def interrupt(plan, say):
             raise KeyboardInterrupt
 
+        def fail(plan, say):
+            raise StateError("no")
+
         done = Table(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
-        monkeypatch.setattr(bench, "SECTIONS", {"one": lambda plan, say: done, "two": interrupt, "three": interrupt})
+        sections = {"one": lambda plan, say: done, "bad": fail, "two": interrupt, "three": interrupt}
+        monkeypatch.setattr(bench, "SECTIONS", sections)
         path = tmp_path / "out.json"
         found = bench.benchmark(json_path=str(path))
-        assert (found.results, found.interrupted) == ((done,), "two")
+        assert (found.results[0], found.interrupted) == (done, "two")
+        assert "bad: failed: no" in found.text()
         assert json.loads(path.read_text())["interrupted"] == "two"
         assert "done: kept" in found.text()
 

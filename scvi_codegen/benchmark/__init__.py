@@ -1,13 +1,18 @@
 """The benchmark: this project and other integrators side by side, at equal error.
 
-    cases       problems, eight initial states each, accelerations solved for by hand
-    references  where they end, in extended precision; independent of the project's steppers
-    ours        this project's steppers on a ladder of steps
-    peers       heyoka, REBOUND, CyRK, JiTCODE, SciPy at several tolerances
-    measuring   all of them timed in turn, in one process
-    curves      time at equal error, by interpolation
-    report      table, JSON;  picture: the work-precision plot
-    drift       the energy over ten million steps
+    cases         problems, eight initial states each, accelerations solved for by hand
+    references    where they end, in extended precision; independent of the project's steppers
+    ours          this project's steppers, at the steps it advises
+    peers         REBOUND, CyRK, JiTCODE, SciPy and (in taylor) heyoka at several tolerances
+    measuring     all of them timed in turn, in one process
+    racing        the above for one case, or for an ensemble of 64 trajectories
+    curves        time at equal error, by interpolation
+    report        table and JSON of these;  picture: the work-precision plot
+    drift         the energy over ten million steps
+    paper_tables  Tables 6 and 7 of the paper
+    compositions  SVI against explicit compositions
+    hand_written  generated C against hand-written C
+    start_up      from text to the first step
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation we know of, which are named; no step or tolerance chosen with the answer known, but whole curves.
@@ -16,100 +21,77 @@ the best formulation we know of, which are named; no step or tolerance chosen wi
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.benchmark.cases import CASES, Case, case
-from scvi_codegen.benchmark.contenders import Contender
-from scvi_codegen.benchmark.drift import drift_table, measure_drift
+from scvi_codegen.benchmark.cases import CASES
+from scvi_codegen.benchmark.compositions import run_compositions
+from scvi_codegen.benchmark.drift import run_drift
+from scvi_codegen.benchmark.hand_written import run_hand_written
 from scvi_codegen.benchmark.machine import machine
-from scvi_codegen.benchmark.measuring import measure
-from scvi_codegen.benchmark.ours import RUNGS, Advice, our_contenders
-from scvi_codegen.benchmark.peers import PEERS, missing_module, peer_contenders
-from scvi_codegen.benchmark.references import Reference, reference
-from scvi_codegen.benchmark.report import CaseResult, as_json, table
-from scvi_codegen.errors import StateError
-from scvi_codegen.methods.method import Method
+from scvi_codegen.benchmark.paper_tables import run_paper_tables
+from scvi_codegen.benchmark.peers import PEERS
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
+from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
+from scvi_codegen.benchmark.start_up import run_start_up
+from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.errors import ScviCodegenError, StateError
+from scvi_codegen.expression_text import closest
 
-__all__ = ["CASES", "PEERS", "Plan", "benchmark", "run_case"]
+__all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
-QUICK_SHARE = 0.05
-QUICK_RUNGS = 4
-QUICK_REPEATS = 2
-PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
-"""What a peer of an unknown version, or without its compiler, may raise; it is skipped by name."""
+SCHEMA = 2
+"""Version of the JSON."""
 
-Say = Callable[[str], None]
+SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | Table]] = {
+    **{name: partial(run_case, name) for name in CASES},
+    **{f"ensemble:{name}": partial(run_ensemble, name) for name in ENSEMBLES},
+    "drift": run_drift,
+    "tables": run_paper_tables,
+    "compositions": run_compositions,
+    "hand-written": run_hand_written,
+    "start-up": run_start_up,
+}
+"""All that can be measured: name on the command line -> function that does it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """How to measure.
+class Report:
+    """Everything measured.
 
     Attributes:
-        peers: names of the peers.
-        repeats: timed rounds.
-        quick: a twentieth of the span, few settings: to see that everything works.
-        methods: of this project; by default SVI(8).
-        advice: chooses a step without knowing the answer, for one more setting of this project.
+        machine: on what.
+        results: in the order measured.
+        interrupted: name of the section that Ctrl-C ended, or nothing.
     """
 
-    peers: tuple[str, ...] = tuple(PEERS)
-    repeats: int = 5
-    quick: bool = False
-    methods: tuple[Method, ...] = ()
-    advice: Advice | None = None
+    machine: Mapping[str, Any]
+    results: tuple[CaseResult | Table, ...]
+    interrupted: str = ""
 
-    def __post_init__(self) -> None:
-        for name in self.peers:
-            if name not in PEERS:
-                raise StateError(f"there is no peer '{name}'; known: {', '.join(PEERS)}")
-        if self.repeats < 1:
-            raise StateError(f"repeats must be at least 1, not {self.repeats}")
+    @property
+    def cases(self) -> list[CaseResult]:
+        """The results that are curves."""
+        return [result for result in self.results if isinstance(result, CaseResult)]
 
+    def text(self) -> str:
+        """All tables."""
+        legend = [LEGEND] if self.cases else []
+        return "\n\n".join([header_lines(self.machine), *(result.text() for result in self.results), *legend])
 
-def run_case(chosen: Case, plan: Plan, say: Say = lambda text: None) -> CaseResult:
-    """Compile everything for one case, then time it in turn."""
-    if plan.quick:
-        chosen = replace(chosen, span=chosen.span * QUICK_SHARE)
-    say(f"{chosen.name}: reference")
-    exact = reference(chosen)
-    skipped: dict[str, str] = {}
-    contenders = our_contenders(
-        chosen, methods=plan.methods or None, rungs=QUICK_RUNGS if plan.quick else RUNGS, advice=plan.advice
-    )
-    contenders += _peer_contenders(chosen, plan, skipped, say)
-    say(f"{chosen.name}: {len(contenders)} settings")
-
-    def reference_of(contender: Contender) -> Reference:
-        return exact if contender.momenta is None else reference(chosen, contender.momenta)
-
-    found = measure(contenders, reference_of, repeats=QUICK_REPEATS if plan.quick else plan.repeats)
-    return CaseResult(
-        name=chosen.name,
-        span=chosen.span,
-        dimension=chosen.dimension,
-        accuracy=exact.accuracy,
-        measurements=tuple(found),
-        skipped=skipped,
-    )
-
-
-def _peer_contenders(chosen: Case, plan: Plan, skipped: dict[str, str], say: Say) -> Iterator[Contender]:
-    for name in plan.peers:
-        missing = missing_module(PEERS[name])
-        if missing is not None:
-            skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
-        elif not PEERS[name].suits(chosen):
-            skipped[name] = "not for problems of this kind"
-        else:
-            say(f"{chosen.name}: compiling {name}")
-            try:
-                yield from peer_contenders(name, chosen, quick=plan.quick)
-            except PEER_ERRORS as error:
-                skipped[name] = f"{type(error).__name__}: {error}"
+    def data(self) -> dict[str, Any]:
+        """The same, and all measurements, as data that ``json.dump`` takes."""
+        return {
+            "schema": SCHEMA,
+            "machine": dict(self.machine),
+            "cases": [result.data() for result in self.cases],
+            "tables": [result.data() for result in self.results if isinstance(result, Table)],
+            "interrupted": self.interrupted,
+        }
 
 
 def benchmark(
@@ -118,35 +100,43 @@ def benchmark(
     *,
     json_path: str | None = None,
     plot_path: str | None = None,
-    drift_steps: int = 0,
     say: Say = lambda text: None,
-) -> str:
-    """Measure cases and write what was asked for.
+) -> Report:
+    """Measure sections one after the other; one that fails says so, Ctrl-C ends it with what was measured.
 
     Args:
-        names: of the cases, by default all; with ``drift_steps`` none.
+        names: of the sections, by default all.
         plan: how to measure.
         json_path, plot_path: files to write.
-        drift_steps: if positive, also run Kepler's problem for so many steps.
         say: told what is being done.
-
-    Returns:
-        The tables as text.
     """
+    for name in names:
+        if name not in SECTIONS:
+            raise StateError(
+                f"there is nothing called '{name}' to measure{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}"
+            )
     if plot_path is not None:
         from scvi_codegen.plotting import check_plot_path
 
         check_plot_path(plot_path)
-    chosen = [case(name) for name in names or (() if drift_steps else CASES)]
-    description = machine()
-    results = [run_case(one, plan or Plan(), say) for one in chosen]
-    drifts = measure_drift(drift_steps, say) if drift_steps else []
+    report = _measured(names or tuple(SECTIONS), plan or Plan(), say)
     if json_path is not None:
-        data: dict[str, Any] = as_json(results, description) | {"drift": [asdict(row) for row in drifts]}
-        Path(json_path).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    if plot_path is not None and results:
+        Path(json_path).write_text(json.dumps(report.data(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if plot_path is not None and report.cases:
         from scvi_codegen.benchmark.picture import plot_curves
 
-        plot_curves(results, plot_path)
-    text = [table(results, description)] if results else []
-    return "\n\n".join([*text, *([drift_table(drifts)] if drifts else [])])
+        plot_curves(report.cases, plot_path)
+    return report
+
+
+def _measured(names: Sequence[str], plan: Plan, say: Say) -> Report:
+    description = machine()
+    results: list[CaseResult | Table] = []
+    for name in names:
+        try:
+            results.append(SECTIONS[name](plan, say))
+        except KeyboardInterrupt:
+            return Report(machine=description, results=tuple(results), interrupted=name)
+        except ScviCodegenError as error:
+            results.append(Table(name=name, title=f"failed: {error}", columns={}, rows=()))
+    return Report(machine=description, results=tuple(results))

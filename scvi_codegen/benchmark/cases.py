@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -54,11 +55,12 @@ class Case:
         name: on the command line.
         system: the Lagrangian, with the parameters of this case.
         formulations: hand-solved first-order systems; the first one is in (q, v).
-        q, velocity: (8, m) initial states.
+        q, velocity: (8, m) initial states, or some of them again and again.
         span: length of time.
-        step: the middle of the ladder of step sizes, the catalogue's own where it has this problem.
+        step: one that gives about ten digits, the catalogue's own where it has this problem.
         fine: a step with which a Gauss method of 16 stages reaches 1e-18, for the reference.
         bodies: masses (and the constant of gravity) if coordinates are Cartesian positions of gravitating bodies.
+        loops: text of ``rates(out, t, x, unused)`` in Python with loops, for Numba, where it is faster than many lines.
         masses: (m,) constant masses of the coordinates where momenta differ from velocities by a rounding; ``None``
             where p = dL/dv is exact at the initial states (unit masses, or rest).
     """
@@ -72,6 +74,7 @@ class Case:
     step: float
     fine: float
     bodies: Bodies | None = None
+    loops: str | None = None
     masses: tuple[float, ...] | None = None
 
     @property
@@ -172,6 +175,24 @@ def chain(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[A
     return [right - left for left, right in pairwise(forces)]
 
 
+CHAIN_LOOPS = """
+def rates(out, t, x, unused):
+    before = x[0] + {beta} * (x[0] * x[0]) * x[0]
+    for i in range({n}):
+        stretch = x[i + 1] - x[i] if i < {n} - 1 else -x[i]
+        force = stretch + {beta} * (stretch * stretch) * stretch
+        out[i] = x[{n} + i]
+        out[{n} + i] = force - before
+        before = force
+"""
+
+
+def henon_heiles(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """X'' = -x - 2 coupling x y, y'' = -y - coupling (x^2 - y^2)."""
+    x, y = q
+    return [-x - 2.0 * of["coupling"] * (x * y), -y - of["coupling"] * (x * x - y * y)]
+
+
 def _scaled(state: Sequence[float], spread: float) -> Array:
     """(8, m) states proportional to one, within +- spread of it, at incommensurable places."""
     golden = (math.sqrt(5.0) - 1.0) / 2.0
@@ -187,9 +208,10 @@ def _rotated(vector: Sequence[float], axes: int) -> Array:
     return np.array([(parts @ matrix.T).ravel() for matrix in matrices])
 
 
-def _small_case(name: str, rates: tuple[Formulation, ...], *, span: float, fine: float, **changes: Any) -> Case:
-    """A problem of the catalogue with its own state (or another one at rest), spread by 5 %."""
+def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Case:
+    """A problem of the catalogue with its own state (or another one), spread by 5 %."""
     entry = problem(name)
+    own = {field: changes.pop(field) for field in ("span", "fine", "loops") if field in changes}
     q, velocity = changes.pop("q", entry.q), changes.pop("velocity", entry.velocity)
     step = changes.pop("step", entry.step)
     return Case(
@@ -198,9 +220,8 @@ def _small_case(name: str, rates: tuple[Formulation, ...], *, span: float, fine:
         formulations=rates,
         q=_scaled(q, 0.05),
         velocity=_scaled(velocity, 0.05),
-        span=span,
         step=step,
-        fine=fine,
+        **own,
     )
 
 
@@ -208,7 +229,39 @@ def _hand_solved(accelerations: Callable[..., list[Any]]) -> tuple[Formulation, 
     return (Formulation(name="hand-solved accelerations", rates=second_order(accelerations)),)
 
 
-def _kepler_case(eccentricity: float, step: float, fine: float) -> Case:
+def _pendulum_case() -> Case:
+    return _small_case("planar-pendulum", _hand_solved(pendulum), span=1000.0, fine=0.5, q=(0.5,), step=0.8)
+
+
+def _duffing_case() -> Case:
+    return _small_case("duffing", _hand_solved(duffing), span=2000.0, fine=0.25)
+
+
+def _henon_heiles_case() -> Case:
+    """At energy 0.055, where the motion is regular."""
+    return _small_case(
+        "henon-heiles",
+        _hand_solved(henon_heiles),
+        span=1000.0,
+        fine=0.375,
+        q=(0.0, 0.1),
+        velocity=(0.3, 0.1),
+    )
+
+
+def _double_pendulum_case() -> Case:
+    return _small_case(
+        "double-pendulum",
+        _hand_solved(double_pendulum),
+        span=1000.0,
+        fine=0.25,
+        q=(0.5, 0.5),
+        step=0.4,
+        g=1.0,
+    )
+
+
+def _kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
     entry = problem("kepler")
     speed = math.sqrt((1.0 + eccentricity) / (1.0 - eccentricity))
     return Case(
@@ -242,31 +295,28 @@ def _outer_solar_system() -> Case:
     )
 
 
-def _chain_case(n: int, step: float, fine: float) -> Case:
-    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=fine, step=step)
+def _chain_case(n: int, *, step: float, fine: float) -> Case:
+    loops = CHAIN_LOOPS.format(n=n, beta=1.0)
+    return _small_case(f"fput-chain:{n}", _hand_solved(chain), span=1000.0, fine=fine, step=step, loops=loops)
 
 
 def _relativistic_case() -> Case:
     momenta = Formulation(name="Hamilton's equations", rates=relativistic_in_momenta, momenta=True)
-    name, both = "relativistic-particle", (*_hand_solved(relativistic), momenta)
-    return _small_case(name, both, span=1000.0, fine=0.25)
+    return _small_case("relativistic-particle", (*_hand_solved(relativistic), momenta), span=1000.0, fine=0.25)
 
 
 CASES: Mapping[str, Callable[[], Case]] = {
-    "planar-pendulum": lambda: _small_case(
-        "planar-pendulum", _hand_solved(pendulum), span=1000.0, fine=0.5, q=(0.5,), step=0.8
-    ),
-    "duffing": lambda: _small_case("duffing", _hand_solved(duffing), span=2000.0, fine=0.25),
-    "kepler:0.2": lambda: _kepler_case(0.2, 0.5, 0.375),
-    "kepler:0.5": lambda: _kepler_case(0.5, 0.25, 0.1875),
+    "planar-pendulum": _pendulum_case,
+    "duffing": _duffing_case,
+    "kepler:0.2": partial(_kepler_case, 0.2, step=0.5, fine=0.375),
+    "kepler:0.5": partial(_kepler_case, 0.5, step=0.25, fine=0.1875),
+    "henon-heiles": _henon_heiles_case,
     "outer-solar-system": _outer_solar_system,
-    "double-pendulum": lambda: _small_case(
-        "double-pendulum", _hand_solved(double_pendulum), span=1000.0, fine=0.25, q=(0.5, 0.5), step=0.4, g=1.0
-    ),
+    "double-pendulum": _double_pendulum_case,
     "relativistic-particle": _relativistic_case,
-    "fput-chain:8": lambda: _chain_case(8, 1.0, 1.0),
-    "fput-chain:64": lambda: _chain_case(64, 2.0, 3.0),
-    "fput-chain:256": lambda: _chain_case(256, 2.0, 2.0),
+    "fput-chain:8": partial(_chain_case, 8, step=1.0, fine=1.0),
+    "fput-chain:64": partial(_chain_case, 64, step=2.0, fine=3.0),
+    "fput-chain:256": partial(_chain_case, 256, step=2.0, fine=2.0),
 }
 """The cases of the table: name on the command line -> function that builds one."""
 

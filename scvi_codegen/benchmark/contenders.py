@@ -21,8 +21,10 @@ class Contender:
         setting: what distinguishes it on that curve: a step or a tolerance.
         options: formulation and options chosen, for the reader.
         compile_seconds: from the equations to a function that can be called.
-        prepare: from the number of an initial state to a function that integrates from there and gives the final q.
-        momenta: (8, m) momenta that it starts from, where they are its state; ``None`` if it starts from velocities.
+        prepare: from the number of a run, which is that of its initial state, to a function that integrates from there
+            and gives the final q.
+        momenta: (k, m) momenta that it starts from, where they are its state; ``None`` if it starts from velocities.
+        trajectories: initial states that one run starts from; the final q of an ensemble is (trajectories, m).
     """
 
     method: str
@@ -31,3 +33,4 @@ class Contender:
     compile_seconds: float
     prepare: Callable[[int], Callable[[], Array]]
     momenta: Array | None = None
+    trajectories: int = 1

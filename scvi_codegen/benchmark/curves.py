@@ -11,6 +11,9 @@ __all__ = ["FLOOR", "Point", "common_error", "frontier", "time_at"]
 FLOOR = 1e-13
 """Errors below count as equal to it: there they are round-off and luck."""
 
+LEAST = 1e-18
+"""For an error that is 0."""
+
 MARGIN = 2.0
 """On the plateau of round-off one setting beats the next by luck; a method's reach is twice its smallest error."""
 
@@ -24,7 +27,7 @@ class Point:
 
 
 def frontier(points: Iterable[Point]) -> list[Point]:
-    """The points that no other beats in time and error (counted from the floor up), the fastest first.
+    """The points that no other beats in time and error, the fastest first, up to the first below the floor.
 
     >>> points = [Point(seconds=s, error=e) for s, e in [(1, 1e-3), (2, 1e-6), (3, 1e-5), (4, 1e-15), (5, 1e-16)]]
     >>> [point.seconds for point in frontier(points)]
@@ -32,9 +35,9 @@ def frontier(points: Iterable[Point]) -> list[Point]:
     """
     kept: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, point.error)):
-        error = max(point.error, FLOOR)
-        if math.isfinite(error) and (not kept or error < kept[-1].error):
-            kept.append(Point(seconds=point.seconds, error=error))
+        last = kept[-1].error if kept else math.inf
+        if last > FLOOR and point.error < last:
+            kept.append(point)
     return kept
 
 
@@ -54,7 +57,7 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
         return curve[0].seconds
     after = next(n for n, point in enumerate(curve) if point.error <= wanted)
     loose, tight = curve[after - 1], curve[after]
-    share = math.log(loose.error / wanted) / math.log(loose.error / tight.error)
+    share = math.log(loose.error / wanted) / math.log(loose.error / max(tight.error, LEAST))
     return loose.seconds * math.pow(tight.seconds / loose.seconds, share)
 
 

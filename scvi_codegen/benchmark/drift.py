@@ -1,47 +1,79 @@
-"""Ten million steps of Kepler's problem: does the energy drift?"""
+"""Ten million steps of Kepler's problem: does the energy drift? heyoka on the same spans, for comparison."""
 
 from __future__ import annotations
 
+import importlib.util
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import Array, case
+from scvi_codegen.benchmark.cases import Array, Case, case
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.taylor import heyoka_states
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.methods.method import Method
+from scvi_codegen.stepper import Stepper
 
-__all__ = ["CASES_OF_DRIFT", "DriftRow", "drift_of", "drift_table", "fitted_slope", "measure_drift"]
+__all__ = ["DRIFTS", "fitted_slope", "run_drift"]
 
-CASES_OF_DRIFT = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
+DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
 """Three step sizes each, from the largest without a visible truncation error down."""
 
+STEPS, QUICK_STEPS = 10_000_000, 20_000
 SAMPLES = 2000
 BLOCKS = 20
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DriftRow:
-    """One long run; energies are relative to the first.
+def run_drift(plan: Plan, say: Say) -> Table:
+    """All cases at all step sizes, SVI(8) and heyoka at its default tolerance."""
+    steps = QUICK_STEPS if plan.quick else STEPS
+    with_heyoka = "heyoka" in plan.peers and importlib.util.find_spec("heyoka") is not None
+    rows = []
+    for name, sizes in DRIFTS.items():
+        for h in sizes:
+            say(f"drift: {name}, h = {h:g}, {steps} steps")
+            rows += drift_rows(case(name), h, steps, with_heyoka=with_heyoka)
+    formats = {"case": "", "method": "", "h": "g", "span": ".0f", "seconds": ".2f", "at_the_end": ".1e"}
+    return Table(
+        name="drift",
+        title=f"relative energy error over {steps} steps",
+        columns=formats | {"largest": ".1e", "drift": ".1e", "uncertainty": ".1e"},
+        rows=tuple(rows),
+        remarks=(
+            "drift: slope of the fitted line times the length of the run. uncertainty: its standard error, from the",
+            f"scatter of the gains over {BLOCKS} blocks, since round-off makes the energy walk at random.",
+        ),
+    )
 
-    Attributes:
-        case, h, steps, seconds: what was run.
-        final: error at the end.
-        largest: largest error on the way.
-        slope: of the line fitted to the error over the whole run, times its length: the drift.
-        slope_error: its standard error.
-    """
 
-    case: str
-    h: float
-    steps: int
-    seconds: float
-    final: float
-    largest: float
-    slope: float
-    slope_error: float
+def drift_rows(chosen: Case, h: float, steps: int, *, with_heyoka: bool) -> list[dict[str, Any]]:
+    """One row a method, from the first state of a case."""
+    stepper = compile_stepper(chosen.system, SVI(8))
+    q, p = chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0])
+    every = max(1, steps // SAMPLES)
+    began = time.process_time()
+    run = stepper.integrate(q, p, h=h, steps=steps, every=every)
+    found = [("scvi-codegen", h, time.process_time() - began, run.q, run.p)]
+    if with_heyoka:
+        began = time.process_time()
+        states = heyoka_states(chosen, np.linspace(0.0, h * steps, steps // every + 1))
+        half = chosen.dimension
+        found.append(("heyoka", float("nan"), time.process_time() - began, states[:, :half], states[:, half:]))
+    return [
+        {"case": chosen.name, "method": method, "h": size, "span": h * steps, "seconds": seconds}
+        | _energy_entries(stepper, q, p)
+        for method, size, seconds, q, p in found
+    ]
+
+
+def _energy_entries(stepper: Stepper, q: Array, p: Array) -> dict[str, float]:
+    energy = stepper.energy(q, p)
+    error = (energy - energy[0]) / abs(energy[0])
+    drift, uncertainty = fitted_slope(error)
+    largest = float(np.abs(error).max())
+    return {"at_the_end": float(error[-1]), "largest": largest, "drift": drift, "uncertainty": uncertainty}
 
 
 def fitted_slope(error: Array) -> tuple[float, float]:
@@ -55,48 +87,3 @@ def fitted_slope(error: Array) -> tuple[float, float]:
     slope = float(t @ error / (t @ t))
     gains = np.diff(error[np.linspace(0, len(error) - 1, BLOCKS + 1).astype(int)])
     return slope, float(np.sqrt(1.2 * BLOCKS * np.var(gains, ddof=1)))
-
-
-def drift_of(name: str, h: float, steps: int, method: Method | None = None) -> DriftRow:
-    """Run one case for many steps and fit its energy."""
-    chosen = case(name)
-    stepper = compile_stepper(chosen.system, method or SVI(8))
-    q, p = chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0])
-    began = time.perf_counter()
-    run = stepper.integrate(q, p, h=h, steps=steps, every=max(1, steps // SAMPLES))
-    seconds = time.perf_counter() - began
-    energy = run.energy()
-    error = (energy - energy[0]) / abs(energy[0])
-    slope, slope_error = fitted_slope(error)
-    return DriftRow(
-        case=name,
-        h=h,
-        steps=steps,
-        seconds=seconds,
-        final=float(error[-1]),
-        largest=float(np.abs(error).max()),
-        slope=slope,
-        slope_error=slope_error,
-    )
-
-
-def measure_drift(steps: int, progress: Callable[[str], None] = lambda text: None) -> list[DriftRow]:
-    """All cases at all step sizes."""
-    result = []
-    for name, sizes in CASES_OF_DRIFT.items():
-        for h in sizes:
-            progress(f"{name}, h = {h:g}, {steps} steps")
-            result.append(drift_of(name, h, steps))
-    return result
-
-
-def drift_table(found: Sequence[DriftRow]) -> str:
-    """The rows as text."""
-    names = f"{'at the end':>12}{'largest':>10}{'drift':>11}{'+-':>10}{'ns/step':>9}"
-    header = f"{'relative energy error':24}{'steps':>10}{names}"
-    lines = [
-        f"{row.case:14}h={row.h:<8g}{row.steps:>10}{row.final:>12.1e}{row.largest:>10.1e}"
-        f"{row.slope:>11.1e}{row.slope_error:>10.1e}{1e9 * row.seconds / row.steps:>9.0f}"
-        for row in found
-    ]
-    return "\n".join([header, *lines, "drift: slope of the fitted line times the length of the run"])

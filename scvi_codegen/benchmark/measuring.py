@@ -1,8 +1,8 @@
 """Contenders timed in turn, in one process: all of them once, then all of them again.
 
-Times are processor times of the stepping thread. Every contender steps in one thread and does nothing but compute, so
-this is the wall clock of an idle machine; on a busy one it leaves out the shares of other programs, which would weigh
-on long runs and spare short ones.
+Times are processor times of the process. Every contender steps in one thread and does nothing but compute, so this is
+the wall clock of an idle machine; on a busy one it leaves out the shares of other programs, which would weigh on long
+runs and spare short ones.
 """
 
 from __future__ import annotations
@@ -70,17 +70,18 @@ class _Record:
     def round(self) -> None:
         """Integrate from every state once."""
         taken, final = [], []
-        for index in range(STATES):
+        size = self.contender.trajectories
+        for index in range(STATES if size == 1 else 1):
             integrate = self.contender.prepare(index)
-            began = time.thread_time()
+            began = time.process_time()
             q = integrate()
-            taken.append(time.thread_time() - began)
+            taken.append((time.process_time() - began) / size)
             final.append(q)
         self.seconds.append(taken)
         self.final = final
 
     def wants_more(self) -> bool:
-        return not self.failure and (not self.seconds or sum(self.seconds[0]) < PATIENCE)
+        return not self.failure and (not self.seconds or sum(self.seconds[0]) * self.contender.trajectories < PATIENCE)
 
 
 def measure(
@@ -119,7 +120,7 @@ def _attempt(record: _Record) -> None:
 def _summary(record: _Record, reference: Reference) -> Measurement:
     contender, failed = record.contender, bool(record.failure)
     columns = [] if failed else list(zip(*record.seconds, strict=True))
-    error = float("nan") if failed else rms_error(np.array(record.final), reference)
+    error = float("nan") if failed else _error(record.final, reference)
     return Measurement(
         method=contender.method,
         setting=contender.setting,
@@ -131,3 +132,9 @@ def _summary(record: _Record, reference: Reference) -> Measurement:
         repeats=len(record.seconds),
         failure=record.failure,
     )
+
+
+def _error(final: list[Array], reference: Reference) -> float:
+    """Of one array for each state, or of one for an ensemble that holds all states some times over."""
+    copies = np.concatenate([np.atleast_2d(q) for q in final]).reshape(-1, *reference.high.shape)
+    return float(np.sqrt(np.mean([rms_error(q, reference) ** 2 for q in copies])))

@@ -1,7 +1,8 @@
-"""This project's own steppers on a ladder of step sizes."""
+"""This project's own steppers, at the step sizes that :func:`scvi_codegen.advise` gives for a ladder of tolerances."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 import time
@@ -11,54 +12,45 @@ from contextlib import contextmanager
 import numpy as np
 
 from scvi_codegen import building
+from scvi_codegen.advice import advise
 from scvi_codegen.benchmark.cases import Array, Case
 from scvi_codegen.benchmark.contenders import OURS, Contender
-from scvi_codegen.compiler import generate_source
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.stepper import Stepper
 
-__all__ = ["Advice", "ladder", "our_contenders"]
+__all__ = ["advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
 
-Advice = Callable[[Case, Method], float]
-"""A step size for a case and a method, chosen without knowing the answer."""
+TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
+"""For which advice is asked; what is reached is measured."""
 
-RUNGS = 11
-RATIO = 2.0 ** (1.0 / 3.0)
-PILOT_STEPS = 2
-SLOWEST = 10.0
-"""Seconds for a trajectory beyond which a step is not measured: the stages of a large system then go to Newton."""
+QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
+LARGEST_NEWTON = 18
+"""Degrees of freedom beyond which the steps advised are those of the iteration by fixed point: Newton's method allows
+longer ones, each of which takes seconds."""
 
-
-def ladder(middle: float, rungs: int = RUNGS) -> list[float]:
-    """Step sizes in geometric progression, the largest first."""
-    return [middle * RATIO ** (rungs // 2 - rung) for rung in range(rungs)]
+_builds = itertools.count()
 
 
-def our_contenders(
-    case: Case, *, methods: Iterable[Method] | None = None, rungs: int = RUNGS, advice: Advice | None = None
-) -> list[Contender]:
-    """Every method at every step of the ladder (rounded so that steps fill the span), and at the step advised.
+def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = False) -> list[Contender]:
+    """Every method at every step advised.
 
     Args:
         case: what to integrate.
         methods: by default the default method, SVI(8).
-        rungs: length of the ladder.
-        advice: chooses one more step.
+        quick: few tolerances.
     """
     result = []
     for method in methods or (SVI(8),):
-        stepper, seconds = _compiled(case, method)
-        momenta = np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
-        steps = [(h, "") for h in ladder(case.step, rungs)]
-        steps += [(advice(case, method), " (advised)")] if advice is not None else []
-        for h, note in steps:
-            count = max(1, round(case.span / h))
+        stepper, seconds = compiled(case, method)
+        momenta = momenta_of(stepper, case)
+        for count, tolerance in advised_counts(case, method, momenta[0], quick=quick).items():
             result.append(
                 Contender(
                     method=f"{OURS} {method.name}",
-                    setting=f"h={case.span / count:.4g}{note}",
+                    setting=_setting(case, count, tolerance),
                     options=f"{stepper.title}, solver auto, {' '.join(stepper.flags)}",
                     compile_seconds=seconds,
                     prepare=_preparation(stepper, case, momenta, count),
@@ -68,13 +60,51 @@ def our_contenders(
     return result
 
 
-def _compiled(case: Case, method: Method) -> tuple[Stepper, float]:
-    """The stepper, and the seconds from the Lagrangian to it with an empty cache."""
+def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
+    """SVI(8) with all states of the case as one ensemble, in one thread."""
+    stepper, seconds = compiled(case, SVI(8))
+    momenta = momenta_of(stepper, case)
+    began = time.perf_counter()
+    stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled at its first use
+    seconds += time.perf_counter() - began
+    return [
+        Contender(
+            method=f"{OURS} ensemble",
+            setting=_setting(case, count, tolerance),
+            options=f"{stepper.title}, one thread",
+            compile_seconds=seconds,
+            prepare=_ensemble_preparation(stepper, case, momenta, count),
+            momenta=momenta,
+            trajectories=len(case.q),
+        )
+        for count, tolerance in advised_counts(case, SVI(8), momenta[0], quick=quick).items()
+    ]
+
+
+def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
+    """Numbers of steps that fill the span -> the tolerance for which each was advised, at the first initial state."""
+    counts: dict[int, float] = {}
+    solver = "auto" if case.dimension <= LARGEST_NEWTON else "fixed-point"
+    for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
+        try:
+            advice = advise(case.system, method, case.q[0], momentum, case.span, tolerance, solver=solver)
+        except StateError:  # no step is known to be good enough
+            continue
+        counts.setdefault(advice.steps, tolerance)
+    return counts
+
+
+def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
+    """The stepper, and the seconds from the Lagrangian to it with an empty cache and a name that is new."""
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder, _cache_in(folder):
         began = time.perf_counter()
-        source, interface = generate_source(case.system, method)
-        stepper = Stepper(source, interface)
+        stepper = compile_stepper(case.system, method, prefix=f"bench_{next(_builds)}")
         return stepper, time.perf_counter() - began
+
+
+def momenta_of(stepper: Stepper, case: Case) -> Array:
+    """(k, m) initial momenta."""
+    return np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
 
 
 @contextmanager
@@ -90,23 +120,12 @@ def _cache_in(folder: str) -> Iterator[None]:
             os.environ[building.CACHE_VARIABLE] = before
 
 
-def _expected_seconds(stepper: Stepper, case: Case, momenta: Array, count: int) -> float:
-    """For a trajectory, from its first steps; 0 if they fail, since then it costs nothing to see them fail again."""
-    run = stepper.start(case.q[0], momenta[0], h=case.span / count)
-    began = time.thread_time()
-    try:
-        run.record(min(PILOT_STEPS, count))
-    except StepFailedError:
-        return 0.0
-    return (time.thread_time() - began) * max(1.0, count / PILOT_STEPS)
+def _setting(case: Case, count: int, tolerance: float) -> str:
+    return f"h={case.span / count:.4g} for {tolerance:.0e}"
 
 
 def _preparation(stepper: Stepper, case: Case, momenta: Array, count: int) -> Callable[[int], Callable[[], Array]]:
-    expected = _expected_seconds(stepper, case, momenta, count)
-
     def prepare(index: int) -> Callable[[], Array]:
-        if expected > SLOWEST:
-            raise StateError(f"not measured, since it would take about {expected:.0f} s")
         run = stepper.start(case.q[index], momenta[index], h=case.span / count)
 
         def integrate() -> Array:
@@ -116,3 +135,14 @@ def _preparation(stepper: Stepper, case: Case, momenta: Array, count: int) -> Ca
         return integrate
 
     return prepare
+
+
+def _ensemble_preparation(
+    stepper: Stepper, case: Case, momenta: Array, count: int
+) -> Callable[[int], Callable[[], Array]]:
+    def integrate() -> Array:
+        result = stepper.integrate_ensemble(case.q, momenta, h=case.span / count, steps=count, every=count, threads=1)
+        final: Array = result.q[-1]
+        return final
+
+    return lambda index: integrate

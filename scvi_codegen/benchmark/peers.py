@@ -1,9 +1,6 @@
 """Other people's integrators, each with the best options and the best formulation we know of.
 
-heyoka      adaptive Taylor series, compiled by LLVM; every formulation (accelerations solved for by hand,
-            ``heyoka.lagrangian``, Hamilton's equations where they are shorter, ``heyoka.model.nbody``) and, for small
-            systems, unrolled as well as compact code; the fastest at the default tolerance makes the curve. A second
-            curve is made with ``fast_math``, which allows what the C compiler calls ``-ffast-math``.
+heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
 rebound     IAS15, for gravitating bodies, with its default step control.
 cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
 jitcode     SciPy's Fortran DOP853, right-hand side compiled by C with JiTCODE's default flags (-Ofast -march=native).
@@ -24,20 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import Array, Case, Formulation
+from scvi_codegen.benchmark.cases import Array, Case
 from scvi_codegen.benchmark.contenders import Contender
+from scvi_codegen.benchmark.taylor import heyoka_contenders
 from scvi_codegen.benchmark.tracing import rates_text
 
 __all__ = ["PEERS", "Peer", "missing_module", "peer_contenders"]
 
-TAYLOR_TOLERANCES = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
-"""0 is heyoka's default, 2^-52."""
-
-TOLERANCES = (1e-13, 1e-11, 1e-9, 1e-7)
+TOLERANCES = (3e-14, 1e-13, 1e-12, 1e-11, 1e-9, 1e-7)
 IAS15_EPSILONS = (1e-9, 1e-6, 1e-4)
-LARGEST_UNROLLED = 64
-"""Degrees of freedom up to which heyoka's unrolled code compiles within a minute."""
-LARGEST_LAGRANGIAN = 18
 MOST_STEPS = 10**9
 
 
@@ -64,139 +56,6 @@ def missing_module(peer: Peer) -> str | None:
 def peer_contenders(name: str, case: Case, *, quick: bool = False) -> Iterator[Contender]:
     """The contenders of a peer for a case."""
     return PEERS[name].contenders(case, quick)
-
-
-def _start(case: Case, formulation: Formulation, index: int) -> Array:
-    """First-order state; momenta only for cases that start from rest."""
-    second = np.zeros(case.dimension) if formulation.momenta else case.velocity[index]
-    return np.concatenate([case.q[index], second])
-
-
-# ---- heyoka
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Taylor:
-    """A heyoka system with its options."""
-
-    name: str
-    equations: list[Any]
-    formulation: Formulation
-    compact: bool
-    fast: bool
-
-    def integrator(self, tolerance: float) -> tuple[Any, float]:
-        import heyoka
-
-        heyoka.llvm_state.clear_memcache()
-        began = time.perf_counter()
-        states = [0.125 * (n + 1) for n in range(len(self.equations))]  # replaced before each run
-        made = heyoka.taylor_adaptive(
-            self.equations, states, tol=tolerance, compact_mode=self.compact, fast_math=self.fast
-        )
-        return made, time.perf_counter() - began
-
-    def contender(self, case: Case, tolerance: float) -> Contender:
-        integrator, seconds = self.integrator(tolerance)
-        mode = "compact" if self.compact else "unrolled"
-        return Contender(
-            method="heyoka fast_math" if self.fast else "heyoka",
-            setting=f"tol={tolerance:.0e}" if tolerance else "tol=default",
-            options=f"{self.name}, {mode}, order {integrator.order}",
-            compile_seconds=seconds,
-            prepare=self._preparation(integrator, case),
-        )
-
-    def _preparation(self, integrator: Any, case: Case) -> Callable[[int], Callable[[], Array]]:
-        def prepare(index: int) -> Callable[[], Array]:
-            integrator.time = 0.0
-            integrator.state[:] = _start(case, self.formulation, index)
-
-            def integrate() -> Array:
-                outcome = integrator.propagate_until(case.span)
-                if "time_limit" not in str(outcome[0]):
-                    raise ArithmeticError(f"heyoka stopped with {outcome[0]}")
-                return np.array(integrator.state[: case.dimension])
-
-            return integrate
-
-        return prepare
-
-
-def _heyoka(case: Case, quick: bool) -> Iterator[Contender]:
-    for fast in (False, True):
-        variants = [
-            _Taylor(name=name, equations=equations, formulation=formulation, compact=compact, fast=fast)
-            for name, equations, formulation in _heyoka_formulations(case)
-            for compact in _compact_modes(case)
-        ]
-        trials = [(variant, variant.contender(case, 0.0)) for variant in variants]
-        seconds = [_quickest(contender) for _, contender in trials]
-        best, contender = trials[int(np.argmin(seconds))]  # one that fails takes for ever
-        yield contender
-        for tolerance in TAYLOR_TOLERANCES[1 : 3 if quick else None]:
-            yield best.contender(case, tolerance)
-
-
-def _compact_modes(case: Case) -> tuple[bool, ...]:
-    if case.dimension > LARGEST_UNROLLED:
-        return (True,)
-    return (False, True) if case.dimension > 2 else (False,)
-
-
-def _heyoka_formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:
-    import heyoka
-
-    m = case.dimension
-    q, v = (heyoka.make_vars(*[f"{letter}{n}" for n in range(m)]) for letter in "qv")
-    x = [*q, *v] if m > 1 else [q, v]
-    for formulation in case.formulations:
-        yield formulation.name, list(zip(x, formulation.rates(x, case.parameters, heyoka), strict=True)), formulation
-    plain = case.formulations[0]
-    if m <= LARGEST_LAGRANGIAN:
-        yield "heyoka.lagrangian", _heyoka_lagrangian(case), plain
-    if case.bodies is not None and not case.bodies.fixed_centre:
-        yield "heyoka.model.nbody", _heyoka_bodies(case), plain
-
-
-def _heyoka_lagrangian(case: Case) -> list[Any]:
-    """Equations in the order q, v, from the Lagrangian of the system with numbers for its parameters."""
-    import heyoka
-    import sympy
-
-    system = case.system
-    values = dict(zip(system.parameters, map(sympy.Float, system.defaults), strict=True))
-    q, v = ([heyoka.expression(symbol.name) for symbol in part] for part in (system.coordinates, system.velocities))
-    lagrangian = heyoka.from_sympy(system.lagrangian.xreplace(values))
-    rates = {str(left): right for left, right in heyoka.lagrangian(lagrangian, q, v)}
-    return [(symbol, rates[str(symbol)]) for symbol in (*q, *v)]
-
-
-def _heyoka_bodies(case: Case) -> list[Any]:
-    """Heyoka's own N-body equations, in the order of the case: all positions, then all velocities."""
-    import heyoka
-
-    bodies = case.bodies
-    assert bodies is not None
-    rates = heyoka.model.nbody(len(bodies.masses), masses=bodies.masses, Gconst=bodies.gravity)
-    by_name = {str(left): (left, right) for left, right in rates}
-    axes = "xyz"[: bodies.axes]
-    names = [f"{kind}{axis}_{n}" for kind in ("", "v") for n in range(len(bodies.masses)) for axis in axes]
-    return [by_name[name] for name in names]
-
-
-def _quickest(contender: Contender) -> float:
-    """Seconds of the fastest of five runs; infinite if they fail, as powers of a distance that is 0 make heyoka do."""
-    seconds = []
-    for _ in range(5):
-        integrate = contender.prepare(0)
-        began = time.thread_time()
-        try:
-            integrate()
-        except ArithmeticError:
-            return math.inf
-        seconds.append(time.thread_time() - began)
-    return min(seconds)
 
 
 # ---- REBOUND
@@ -246,10 +105,14 @@ def _rebound_preparation(case: Case, epsilon: float) -> Callable[[int], Callable
 # ---- Dormand and Prince's method of order 8, three times
 
 
+def _start(case: Case, index: int) -> Array:
+    return np.concatenate([case.q[index], case.velocity[index]])
+
+
 def _right_hand_side(case: Case) -> Callable[..., None]:
-    """Plain Python ``rates(out, t, x, unused)`` of the first formulation."""
+    """Plain Python ``rates(out, t, x, unused)``: the loops of the case if it has some, else lines without any."""
     names: dict[str, Any] = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
-    text = rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension)
+    text = case.loops or rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension)
     exec(compile(text, f"<rates of {case.name}>", "exec"), names)
     function: Callable[..., None] = names["rates"]
     return function
@@ -262,7 +125,7 @@ def _dop853(
 
     def preparation(tolerance: float) -> Callable[[int], Callable[[], Array]]:
         def prepare(index: int) -> Callable[[], Array]:
-            start = _start(case, case.formulations[0], index)
+            start = _start(case, index)
             return lambda: solve(start, tolerance)[: case.dimension]
 
         return prepare
@@ -307,7 +170,7 @@ def _cyrk(case: Case, quick: bool) -> Iterator[Contender]:
         result: Array = final
         return result
 
-    compiled(address, _start(case, case.formulations[0], 0), 1e-3, 1e-3, 1e-3 * span)
+    compiled(address, _start(case, 0), 1e-3, 1e-3, 1e-3 * span)
     seconds = time.perf_counter() - began
     yield from _dop853("CyRK DOP853", "right-hand side by Numba", seconds, case, quick, solve)
 
@@ -375,13 +238,13 @@ def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
         final: Array = outcome.y[:, -1]
         return final
 
-    rates(0.0, _start(case, case.formulations[0], 0))
+    rates(0.0, _start(case, 0))
     seconds = time.perf_counter() - began
     yield from _dop853("SciPy DOP853", options, seconds, case, quick, solve)
 
 
 PEERS = {
-    "heyoka": Peer(modules=("heyoka",), contenders=_heyoka),
+    "heyoka": Peer(modules=("heyoka",), contenders=heyoka_contenders),
     "rebound": Peer(modules=("rebound",), contenders=_rebound, suits=lambda case: case.bodies is not None),
     "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk),
     "jitcode": Peer(modules=("jitcode",), contenders=_jitcode),

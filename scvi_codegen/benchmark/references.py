@@ -1,6 +1,6 @@
 """Where a case ends, to 18 digits: Gauss's method of 16 stages in extended precision, fixed step, compensated sums.
 
-It works in NumPy's ``longdouble`` (80 bits on x86, 128 on 64-bit Arm under Linux), for the eight states at once, and
+It works in NumPy's ``longdouble`` (80 bits on x86, 128 on 64-bit Arm under Linux), for all states at once, and
 knows nothing of the project's steppers: its right-hand sides are the hand-solved ones of :mod:`.cases`, its tables come
 from mpmath here. Tables are kept as sums of two numbers and steps are short binary fractions, so that neither brings in
 a systematic error. Each reference is computed with two different steps, and their difference is kept as its accuracy.
@@ -43,7 +43,7 @@ class Reference:
     """Positions at the end.
 
     Attributes:
-        high, low: (8, m) positions as sums of two doubles.
+        high, low: (k, m) positions as sums of two doubles.
         accuracy: difference of two computations with different steps, measured like every error here.
     """
 
@@ -53,7 +53,7 @@ class Reference:
 
 
 def rms_error(q: Array, reference: Reference) -> float:
-    """Root mean square over the states of |q - reference|, relative to that of |reference|; (8, m) positions."""
+    """Root mean square over the states of |q - reference|, relative to that of |reference|; (k, m) positions."""
     return _rms((q - reference.high) - reference.low) / _rms(reference.high)
 
 
@@ -66,7 +66,7 @@ def reference(case: Case, momenta: Array | None = None) -> Reference:
 
     Args:
         case: what to compute.
-        momenta: (8, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p); it
+        momenta: (k, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p); it
             matters only where the masses of the case are given.
     """
     velocity = case.velocity.astype(np.longdouble)

@@ -1,4 +1,4 @@
-"""Measurements as a table for the terminal and as JSON."""
+"""Curves of a case as a table for the terminal and as JSON."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from typing import Any
 from scvi_codegen.benchmark.contenders import OURS
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, time_at
 from scvi_codegen.benchmark.measuring import Measurement
+from scvi_codegen.benchmark.tables import finite, lines_of
 
-__all__ = ["SCHEMA", "CaseResult", "Row", "as_json", "rows", "table"]
+__all__ = ["LEGEND", "CaseResult", "Row", "header_lines", "rows"]
 
-SCHEMA = 1
-"""Version of the JSON."""
-
-BASELINE = "heyoka"
+BASELINE, FAST, DEFAULT = "heyoka", "fast_math", "tol=default"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,27 +39,45 @@ class CaseResult:
         """Names of the curves, in the order measured."""
         return list(dict.fromkeys(measurement.method for measurement in self.measurements))
 
+    def text(self) -> str:
+        """A block of the report for the terminal."""
+        return _block(self)
+
+    def data(self) -> dict[str, Any]:
+        """Everything, as data that ``json.dump`` takes; numbers that do not exist are null."""
+        return {
+            "name": self.name,
+            "span": self.span,
+            "dimension": self.dimension,
+            "reference_accuracy": self.accuracy,
+            "skipped": dict(self.skipped),
+            "measurements": [finite(asdict(found)) for found in self.measurements],
+            "rows": [_row_data(row) for row in rows(self)],
+        }
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One line of the table.
+    """One line of the table. Ratios are times of others at equal error over the time of this method: above 1 it wins.
 
     Attributes:
         measurement: the fastest setting that reaches the common error, else the most accurate one.
         at_error: the error at which times are compared: the smallest that this method and heyoka both reach.
         seconds: of this method there, interpolated on its curve.
-        ratio: time of heyoka (all its curves taken together) there, over this method's; above 1 is faster.
-        minima_ratio: the same from the shortest times instead of the medians.
-        plain_ratio: the ratio against heyoka without ``fast_math``.
+        default: against heyoka at its default tolerance, without ``fast_math``.
+        best: against heyoka, all its curves and tolerances taken together.
+        peer: against all peers taken together.
+        best_by_minima: like best, from the shortest times instead of the medians.
     """
 
     method: str
     measurement: Measurement
     at_error: float
     seconds: float
-    ratio: float | None
-    minima_ratio: float | None
-    plain_ratio: float | None
+    default: float | None
+    best: float | None
+    peer: float | None
+    best_by_minima: float | None
 
 
 def rows(result: CaseResult) -> list[Row]:
@@ -71,11 +87,13 @@ def rows(result: CaseResult) -> list[Row]:
 
 
 def _row(result: CaseResult, method: str) -> Row | None:
-    own = [found for found in result.measurements if found.method == method and not found.failure]
+    good = [found for found in result.measurements if not found.failure]
+    own = [found for found in good if found.method == method]
     if not own:
         return None
-    best = [found for found in result.measurements if found.method.startswith(BASELINE) and not found.failure]
-    plain = [found for found in best if found.method == BASELINE]
+    peers = [found for found in good if not found.method.startswith(OURS)]
+    best = [found for found in peers if found.method.startswith(BASELINE)]
+    default = [found for found in best if FAST not in found.method and found.setting == DEFAULT]
     points = [found.point for found in own]
     error = common_error(points, [found.point for found in best or own]) or math.inf
     reaching = [found for found in own if max(found.error, FLOOR) <= error]
@@ -85,10 +103,15 @@ def _row(result: CaseResult, method: str) -> Row | None:
         measurement=shown,
         at_error=error,
         seconds=time_at(points, error) or math.nan,
-        ratio=_ratio([found.point for found in best], points),
-        minima_ratio=_ratio([found.fastest_point for found in best], [found.fastest_point for found in own]),
-        plain_ratio=_ratio([found.point for found in plain], points),
+        default=_ratio(_points(default), points),
+        best=_ratio(_points(best), points),
+        peer=_ratio(_points(peers), points),
+        best_by_minima=_ratio([found.fastest_point for found in best], [found.fastest_point for found in own]),
     )
+
+
+def _points(found: Sequence[Measurement]) -> list[Point]:
+    return [one.point for one in found]
 
 
 def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:
@@ -99,22 +122,17 @@ def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:
     return None if theirs is None or own is None else theirs / own
 
 
-HEADER = ("", "setting", "time", "error", "compile", "ratio", "minima", "plain", "at error", "options")
-LEGEND = """Times are processor times of stepping one trajectory to the end, medians. Errors are those of q at the end,
-relative, in root mean square over eight initial states. The setting shown is the fastest that reaches the error named.
-ratio: time of heyoka's best, with fast_math or without, over the method's, at the error named, interpolated on the
-measured curves (errors below 1e-13 count as equal); above 1 is faster than heyoka. minima: the same from the shortest
-times instead of the medians, which a busy machine disturbs less. plain: the ratio against heyoka without fast_math."""
+HEADER = ["", "setting", "time", "error", "compile", "default", "best", "peer", "at error", "options"]
+LEGEND = """Times are processor times of stepping one trajectory to the end, medians; of an ensemble, the whole over the
+number of trajectories. Errors are those of q at the end, relative, in root mean square over the initial states. The
+setting shown is the fastest that reaches the error named. Ratios are times of others over that of the method, at equal
+error (errors below 1e-13 count as equal), interpolated on the measured curves: above 1 the method is faster.
+default: against heyoka with its default options; best: against heyoka with fast_math or without, at any tolerance,
+whichever is fastest; peer: against the fastest of all peers."""
 
 
-def table(results: Sequence[CaseResult], description: Mapping[str, Any]) -> str:
-    """The whole report as text."""
-    blocks = [_machine_lines(description)]
-    blocks += [_block(result) for result in results]
-    return "\n\n".join([*blocks, LEGEND])
-
-
-def _machine_lines(description: Mapping[str, Any]) -> str:
+def header_lines(description: Mapping[str, Any]) -> str:
+    """Machine, compiler and versions."""
     versions = ", ".join(f"{name} {version}" for name, version in description["versions"].items())
     first = f"{description['processor']}, {description['cores']} cores, load {description['load']}"
     return f"{first}\n{description['compiler']}, {description['flags']}\n{versions}"
@@ -122,72 +140,27 @@ def _machine_lines(description: Mapping[str, Any]) -> str:
 
 def _block(result: CaseResult) -> str:
     title = f"{result.name}, T = {result.span:g}, m = {result.dimension} (reference accurate to {result.accuracy:.0e})"
-    lines = [HEADER, *(_cells(row) for row in rows(result))]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+    text = lines_of([HEADER, *(_cells(row) for row in rows(result))])
     failures = [f"{found.method} {found.setting}: {found.failure}" for found in result.measurements if found.failure]
     notes = [f"skipped {name}: {why}" for name, why in result.skipped.items()]
     return "\n  ".join([title, *text, *failures, *notes])
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: Row) -> list[str]:
     found = row.measurement
-    return (
+    return [
         row.method,
         found.setting,
-        _seconds(found.seconds),
+        f"{1e3 * found.seconds:.3g} ms",
         f"{found.error:.1e}",
         f"{found.compile_seconds:.2f} s",
-        _number(row.ratio),
-        _number(row.minima_ratio),
-        _number(row.plain_ratio),
+        *("-" if ratio is None else f"{ratio:.2f}" for ratio in (row.default, row.best, row.peer)),
         f"{row.at_error:.1e}",
         "" if row.method.startswith(OURS) else found.options,
-    )
+    ]
 
 
-def _seconds(value: float) -> str:
-    return f"{1e3 * value:.3g} ms"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def as_json(results: Sequence[CaseResult], description: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything, as data that ``json.dump`` takes; numbers that do not exist are null."""
-    return {
-        "schema": SCHEMA,
-        "machine": dict(description),
-        "cases": [
-            {
-                "name": result.name,
-                "span": result.span,
-                "dimension": result.dimension,
-                "reference_accuracy": result.accuracy,
-                "skipped": dict(result.skipped),
-                "measurements": [_finite(asdict(found)) for found in result.measurements],
-                "rows": [
-                    _finite(
-                        {
-                            "method": row.method,
-                            "setting": row.measurement.setting,
-                            "at_error": row.at_error,
-                            "seconds": row.seconds,
-                            "ratio": row.ratio,
-                            "minima_ratio": row.minima_ratio,
-                            "plain_ratio": row.plain_ratio,
-                        }
-                    )
-                    for row in rows(result)
-                ],
-            }
-            for result in results
-        ],
-    }
-
-
-def _finite(entries: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()
-    }
+def _row_data(row: Row) -> dict[str, Any]:
+    numbers = asdict(row) | {"setting": row.measurement.setting}
+    del numbers["measurement"]
+    return finite(numbers)

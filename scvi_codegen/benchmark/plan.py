@@ -1,0 +1,52 @@
+"""How to measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from scvi_codegen.benchmark.peers import PEERS
+from scvi_codegen.errors import StateError
+from scvi_codegen.methods.method import Method
+
+__all__ = ["Plan", "Say"]
+
+QUICK_SHARE = 0.05
+QUICK_REPEATS = 2
+
+Say = Callable[[str], None]
+"""Told what is being done."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """How to measure.
+
+    Attributes:
+        peers: names of the peers.
+        repeats: timed rounds.
+        quick: a twentieth of the span, few settings: to see that everything works.
+        methods: of this project; by default SVI(8).
+    """
+
+    peers: tuple[str, ...] = tuple(PEERS)
+    repeats: int = 5
+    quick: bool = False
+    methods: tuple[Method, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.peers:
+            if name not in PEERS:
+                raise StateError(f"there is no peer '{name}'; known: {', '.join(PEERS)}")
+        if self.repeats < 1:
+            raise StateError(f"repeats must be at least 1, not {self.repeats}")
+
+    @property
+    def rounds(self) -> int:
+        """Timed rounds."""
+        return min(self.repeats, QUICK_REPEATS) if self.quick else self.repeats
+
+    @property
+    def share(self) -> float:
+        """Part of each span that is run."""
+        return QUICK_SHARE if self.quick else 1.0

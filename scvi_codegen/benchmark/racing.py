@@ -1,0 +1,89 @@
+"""One case of the benchmark: everybody compiled, then timed in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import STATES, Case, case
+from scvi_codegen.benchmark.contenders import Contender
+from scvi_codegen.benchmark.measuring import measure
+from scvi_codegen.benchmark.ours import our_contenders, our_ensembles
+from scvi_codegen.benchmark.peers import PEERS, missing_module, peer_contenders
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.references import Reference, reference
+from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.benchmark.taylor import heyoka_ensembles
+
+__all__ = ["ENSEMBLES", "run_case", "run_ensemble"]
+
+ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
+"""Names of the cases that are run as ensembles."""
+
+TRAJECTORIES = 64
+PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
+"""What a peer of an unknown version, or without its compiler, may raise; it is skipped by name."""
+
+Makers = dict[str, Callable[[], Iterable[Contender]]]
+"""By the name of the peer."""
+
+
+def run_case(name: str, plan: Plan, say: Say) -> CaseResult:
+    """One trajectory after the other, by this project and all peers."""
+    chosen = case(name)
+    chosen = replace(chosen, span=chosen.span * plan.share)
+    makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=plan.quick) for peer in plan.peers}
+    return _race(chosen, partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick), makers, plan, say)
+
+
+def run_ensemble(name: str, plan: Plan, say: Say) -> CaseResult:
+    """64 trajectories in one thread, from the array of their states to that of the ends; heyoka in its batch mode.
+
+    They start from the eight states of the case again and again, which saves computing more references.
+    """
+    few = case(name)
+    few = replace(few, name=f"ensemble:{name}", span=few.span * plan.share)
+    copies = 2 if plan.quick else TRAJECTORIES // STATES
+    many = replace(few, q=np.tile(few.q, (copies, 1)), velocity=np.tile(few.velocity, (copies, 1)))
+    makers: Makers = {"heyoka": partial(heyoka_ensembles, many, plan.quick)} if "heyoka" in plan.peers else {}
+    return _race(few, partial(our_ensembles, many, quick=plan.quick), makers, plan, say)
+
+
+def _race(chosen: Case, ours: Callable[[], list[Contender]], makers: Makers, plan: Plan, say: Say) -> CaseResult:
+    say(f"{chosen.name}: reference")
+    exact = reference(chosen)
+    say(f"{chosen.name}: step sizes")
+    skipped: dict[str, str] = {}
+    contenders = [*ours(), *_peer_contenders(chosen, makers, skipped, say)]
+    say(f"{chosen.name}: {len(contenders)} settings")
+
+    def reference_of(contender: Contender) -> Reference:
+        return exact if contender.momenta is None else reference(chosen, contender.momenta[:STATES])
+
+    found = measure(contenders, reference_of, repeats=plan.rounds)
+    return CaseResult(
+        name=chosen.name,
+        span=chosen.span,
+        dimension=chosen.dimension,
+        accuracy=exact.accuracy,
+        measurements=tuple(found),
+        skipped=skipped,
+    )
+
+
+def _peer_contenders(chosen: Case, makers: Makers, skipped: dict[str, str], say: Say) -> Iterator[Contender]:
+    for name, make in makers.items():
+        missing = missing_module(PEERS[name])
+        if missing is not None:
+            skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
+        elif not PEERS[name].suits(chosen):
+            skipped[name] = "not for problems of this kind"
+        else:
+            say(f"{chosen.name}: compiling {name}")
+            try:
+                yield from make()
+            except PEER_ERRORS as error:
+                skipped[name] = f"{type(error).__name__}: {error}"
