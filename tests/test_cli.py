@@ -259,9 +259,9 @@ class TestRun:
         assert np.isfinite(written["q"]).all()
 
     def test_a_first_step_that_fails_is_told_in_short(self):
-        result = invoke("run", "kepler", "--step", "50")
+        result = invoke("run", "double-pendulum", "--step", "5")
         assert result.exit_code == 1
-        assert "Error: step 0 at t = 0 with h = 50 failed" in result.stderr
+        assert "Error: step 0 at t = 0 with h = 5 failed" in result.stderr
         assert "the initial state was not written to a file (-o, --plot)" in result.stderr
         assert "energy" not in result.stdout
 
