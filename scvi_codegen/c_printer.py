@@ -10,9 +10,9 @@ from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, 
 __all__ = [
     "lane_functions",
     "print_expression",
-    "print_lane_results",
-    "print_lane_temporaries",
+    "print_lane_statements",
     "print_number",
+    "print_statements",
     "scalar_functions",
 ]
 
@@ -81,25 +81,33 @@ def _functions(kernel: Kernel, wanted: Callable[[Expression], bool]) -> set[str]
     return found
 
 
-def print_lane_temporaries(kernel: Kernel, sources: Sources) -> list[tuple[str, str, str]]:
-    """(type, name, text) of the temporaries as vectors; what is the same in every lane stays a number."""
-    vectors = _Vectors(kernel, sources)
+def print_statements(kernel: Kernel) -> list[str]:
+    """The statements of a kernel of numbers."""
     return [
-        ("lanes" if k in vectors.temporaries else "double", f"w{k}", _print_lanes(expression, vectors))
-        for k, expression in enumerate(kernel.temporaries)
+        f"const double w{k} = {print_expression(expression)};"
+        if kind == "w"
+        else f"{kind}[{k}] = {print_expression(expression)};"
+        for kind, k, expression in kernel.statements()
     ]
 
 
-def print_lane_results(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
-    """Statements that store the results as vectors; slopes go to their places in the (lower) mass matrix."""
+def print_lane_statements(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
+    """The same for vectors; what is the same in every lane stays a number, slopes go to their places in the mass."""
     vectors = _Vectors(kernel, sources)
-    targets = [f"value[{k}]" for k in range(kernel.values)]
-    targets += [f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]" for i, j in sweep.mass_entries]
     statements = []
-    for target, expression in zip(targets, kernel.results, strict=False):
-        text = _print_lanes(expression, vectors)
-        statements.append(f"{target} = {text};" if vectors.has(expression) else f"{target} = lanes_of({text});")
+    for kind, k, expression in kernel.statements():
+        text, vector = _print_lanes(expression, vectors), vectors.has(expression)
+        if kind == "w":
+            statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
+        else:
+            target = f"value[{k}]" if kind == "value" else _place_in_mass(sweep, k)
+            statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")
     return statements
+
+
+def _place_in_mass(sweep: Sweep, k: int) -> str:
+    i, j = sweep.mass_entries[k]
+    return f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]"
 
 
 class _Vectors:

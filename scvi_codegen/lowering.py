@@ -14,6 +14,7 @@ Nothing here changes a value but by rounding; ``tests/test_lowering.py`` reads k
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import sympy
@@ -82,6 +83,11 @@ class _Graph:
             self._ids[content] = len(self.nodes)
             self.nodes.append(content)
         return self._ids[content]
+
+    def operands(self, k: int) -> tuple[int, ...]:
+        """Ids of the operands of a node, all smaller than its own."""
+        content = self.nodes[k]
+        return content[1] if isinstance(content, tuple) else ()
 
     def read(self, expression: sympy.Expr) -> int:
         """The id of a SymPy expression."""
@@ -219,20 +225,18 @@ def lower_kernel(
 
 
 def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, ...], tuple[Expression, ...]]:
-    """Nodes used more than once become temporaries, in order of definition; others stand where they are used."""
+    """Nodes used more than once become temporaries, each defined shortly before its use; others stand in place."""
+    order = _order(graph, roots)
     uses = [0] * len(graph.nodes)
-    reachable = _reachable(graph, roots)
-    for k in reachable:
-        content = graph.nodes[k]
-        if isinstance(content, tuple):
-            for operand in content[1]:
-                uses[operand] += 1
+    for k in order:
+        for operand in graph.operands(k):
+            uses[operand] += 1
     for root in roots:
         uses[root] += 1
     texts: dict[int, Expression] = {}
     depths: dict[int, int] = {}
     temporaries: list[Expression] = []
-    for k in sorted(reachable):
+    for k in order:
         content = graph.nodes[k]
         if not isinstance(content, tuple):
             texts[k], depths[k] = content, 0
@@ -245,18 +249,37 @@ def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, .
     return tuple(temporaries), tuple(texts[root] for root in roots)
 
 
-def _reachable(graph: _Graph, roots: Sequence[int]) -> set[int]:
+def _order(graph: _Graph, roots: Sequence[int]) -> list[int]:
+    """Reachable nodes, operands first: those of the results that use the first arguments before those of others.
+
+    In a chain a result shares parts with its neighbours only; numbers then are needed soon after they are computed,
+    which compilers and processors reward.
+    """
+    first = _first_arguments(graph)
+    order: list[int] = []
     seen: set[int] = set()
-    stack = list(roots)
-    while stack:
-        k = stack.pop()
-        if k in seen:
-            continue
-        seen.add(k)
-        content = graph.nodes[k]
-        if isinstance(content, tuple):
-            stack.extend(content[1])
-    return seen
+    for root in sorted(roots, key=lambda root: first[root]):
+        stack = [(root, False)]
+        while stack:
+            k, finished = stack.pop()
+            if finished:
+                order.append(k)
+            elif k not in seen:
+                seen.add(k)
+                stack.append((k, True))
+                stack.extend((operand, False) for operand in reversed(graph.operands(k)))
+    return order
+
+
+def _first_arguments(graph: _Graph) -> list[float]:
+    """Of each node, the smallest index of an argument that it depends on."""
+    first: list[float] = []
+    for k, content in enumerate(graph.nodes):  # operands have smaller numbers
+        if isinstance(content, Load) and content.source == "u":
+            first.append(content.index)
+        else:
+            first.append(min((first[operand] for operand in graph.operands(k)), default=math.inf))
+    return first
 
 
 def lower(

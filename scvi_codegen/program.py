@@ -8,6 +8,7 @@ Newton, sweeps, the run) is a loop over tables, the same for every method and sy
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
@@ -66,7 +67,7 @@ Expression: TypeAlias = Constant | Load | Operation
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kernel:
-    """Straight-line code: ``temporaries[k]`` defines ``w[k]``, ``results`` are stored in order.
+    """Straight-line code: ``temporaries[k]`` defines ``w[k]``; ``results`` are stored as soon as they can be.
 
     Attributes:
         name: C identifier.
@@ -106,12 +107,24 @@ class Kernel:
             _count(expression, counts)
         return dict(sorted(counts.items()))
 
+    def statements(self) -> Iterator[tuple[str, int, Expression]]:
+        """("w", "value" or "slope", index, expression): each result right after the last temporary that it needs."""
+        due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
+        for k, expression in enumerate(self.results):
+            due[1 + _last_temporary(expression)].append(k)
+        for k, ready in enumerate(due):
+            if k > 0:
+                yield "w", k - 1, self.temporaries[k - 1]
+            for number in ready:
+                slope = number >= self.values
+                yield "slope" if slope else "value", number - slope * self.values, self.results[number]
+
     def __str__(self) -> str:
         """The kernel as readable text, one assignment a line."""
         lines = [f"kernel {self.name}(u[{self.arguments}], t, parameters)"]
-        lines += [f"  w{k} = {_text(e)}" for k, e in enumerate(self.temporaries)]
-        lines += [f"  value[{k}] = {_text(e)}" for k, e in enumerate(self.results[: self.values])]
-        lines += [f"  slope[{k}] = {_text(e)}" for k, e in enumerate(self.results[self.values :])]
+        for kind, k, expression in self.statements():
+            target = f"w{k}" if kind == "w" else f"{kind}[{k}]"
+            lines.append(f"  {target} = {_text(expression)}")
         return "\n".join(lines)
 
 
@@ -503,6 +516,15 @@ class Program:
             ]
             head += [f"    scatter {loop.name}: w[n] h^{loop.power} {loop.name}[n][r]" for loop in family.scatters]
         return "\n".join([*head, *(str(kernel) for kernel in self.kernels)])
+
+
+def _last_temporary(expression: Expression) -> int:
+    """The largest index of a temporary in an expression, -1 without one."""
+    if isinstance(expression, Load):
+        return expression.index if expression.source == "w" else -1
+    if isinstance(expression, Operation):
+        return max((_last_temporary(operand) for operand in expression.operands), default=-1)
+    return -1
 
 
 def _occurs(source: str, expression: Expression) -> bool:

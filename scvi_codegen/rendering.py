@@ -15,10 +15,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from scvi_codegen.c_printer import (
     lane_functions,
-    print_expression,
-    print_lane_results,
-    print_lane_temporaries,
+    print_lane_statements,
     print_number,
+    print_statements,
     scalar_functions,
 )
 from scvi_codegen.program import CoupledSweep, Family, Kernel, Program, SeparableSweep, Sweep
@@ -264,14 +263,13 @@ def _environment() -> Environment:
     environment.globals["power_of_h"] = _power_of_h
     environment.filters |= {
         "number": print_number,
-        "expression": print_expression,
         "signature": _signature,
         "call_arguments": _call_arguments,
         "counts": _counts,
         "pairs": lambda entries: ", ".join(f"{{{i}, {j}}}" for i, j in entries),
         "transposed": lambda rows: tuple(zip(*rows, strict=True)),
         "lane_signature": _lane_signature,
-        "lane_temporaries": print_lane_temporaries,
-        "lane_results": print_lane_results,
+        "statements": print_statements,
+        "lane_statements": print_lane_statements,
     }
     return environment
