@@ -200,103 +200,103 @@ static inline double inverse_root_7(double x)
 /* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
+  value[2] = u[2];
+  value[3] = u[3];
   const double w0 = parameters[0]*inverse_root_3(u[0]*u[0] + u[1]*u[1]);
   value[0] = -(w0*u[0]);
   value[1] = -(w0*u[1]);
-  value[2] = u[2];
-  value[3] = u[3];
 }
 
 /* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1 inverse_root_5, 4 neg. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
+  value[2] = u[2];
+  value[3] = u[3];
+  slope[4] = 1.0;
+  slope[5] = 1.0;
   const double w0 = u[0]*u[0];
   const double w1 = u[1]*u[1];
   const double w2 = w0 + w1;
   const double w3 = parameters[0]*inverse_root_3(w2);
-  const double w4 = inverse_root_5(w2);
-  const double w5 = 3.0*parameters[0];
-  const double w6 = w5*w4*u[0]*u[1];
   value[0] = -(w3*u[0]);
   value[1] = -(w3*u[1]);
-  value[2] = u[2];
-  value[3] = u[3];
-  slope[0] = -(w3 - w5*w0*w4);
+  const double w4 = 3.0*parameters[0];
+  const double w5 = inverse_root_5(w2);
+  slope[0] = -(w3 - w4*w0*w5);
+  slope[3] = -(w3 - w4*w1*w5);
+  const double w6 = w4*w5*u[0]*u[1];
   slope[1] = w6;
   slope[2] = w6;
-  slope[3] = -(w3 - w5*w1*w4);
-  slope[4] = 1.0;
-  slope[5] = 1.0;
 }
 
 /* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
 static void node_value(const double *u, const double *parameters, double *value)
 {
-  const double w0 = u[0]*u[0];
-  const double w1 = u[1]*u[1];
-  const double w2 = w0 + w1;
-  const double w3 = parameters[0]*inverse_root_3(w2);
-  const double w4 = inverse_root_5(w2);
-  const double w5 = 3.0*parameters[0];
-  const double w6 = w5*w4;
-  value[0] = w3*u[6] - w5*w0*w4*u[6] - w6*u[0]*u[1]*u[7];
-  value[1] = w3*u[7] - w5*w1*w4*u[7] - w6*u[6]*u[0]*u[1];
   value[2] = 0.0;
   value[3] = 0.0;
   value[4] = u[6];
   value[5] = u[7];
+  const double w0 = u[0]*u[0];
+  const double w1 = u[1]*u[1];
+  const double w2 = w0 + w1;
+  const double w3 = parameters[0]*inverse_root_3(w2);
   value[6] = w3*u[0] + u[4];
   value[7] = w3*u[1] + u[5];
+  const double w4 = 3.0*parameters[0];
+  const double w5 = inverse_root_5(w2);
+  const double w6 = w4*w5;
+  value[0] = w3*u[6] - w4*w0*w5*u[6] - w6*u[0]*u[1]*u[7];
+  value[1] = w3*u[7] - w4*w1*w5*u[7] - w6*u[6]*u[0]*u[1];
 }
 
 /* The same, and the non-zero derivatives with respect to u = (q, v, a, lambda). Operations: 55 *, 6 +, 12 -, 1 inverse_root_3, 1 inverse_root_5, 1 inverse_root_7, 1 neg. */
 static void node_slope(const double *u, const double *parameters, double *value, double *slope)
 {
-  const double w0 = u[0]*u[0];
-  const double w1 = u[1]*u[1];
-  const double w2 = w0 + w1;
-  const double w3 = parameters[0]*inverse_root_3(w2);
-  const double w4 = inverse_root_5(w2);
-  const double w5 = parameters[0]*w4;
-  const double w6 = 3.0*parameters[0];
-  const double w7 = w6*w0*w4;
-  const double w8 = w6*w4;
-  const double w9 = w8*u[0]*u[1];
-  const double w10 = w5*u[6];
-  const double w11 = w6*w1*w4;
-  const double w12 = w8*u[6]*u[0];
-  const double w13 = inverse_root_7(w2);
-  const double w14 = 5.0*parameters[0];
-  const double w15 = w14*w0*w13;
-  const double w16 = w14*w1*w13;
-  const double w17 = (-3.0)*(w5*u[0]*u[7] + w10*u[1] - w16*u[0]*u[7] - w15*u[6]*u[1]);
-  const double w18 = w3 - w7;
-  const double w19 = -w9;
-  const double w20 = w3 - w11;
-  value[0] = w3*u[6] - w7*u[6] - w9*u[7];
-  value[1] = w3*u[7] - w11*u[7] - w12*u[1];
   value[2] = 0.0;
   value[3] = 0.0;
   value[4] = u[6];
   value[5] = u[7];
-  value[6] = w3*u[0] + u[4];
-  value[7] = w3*u[1] + u[5];
-  slope[0] = (-3.0)*(w12 + w5*u[1]*u[7] - w14*(w0*u[0])*w13*u[6] - w15*u[1]*u[7]);
-  slope[1] = w17;
-  slope[2] = w17;
-  slope[3] = (-3.0)*(w10*u[0] + w8*u[1]*u[7] - w14*w13*(w1*u[1])*u[7] - w16*u[6]*u[0]);
-  slope[4] = w18;
-  slope[5] = w19;
-  slope[6] = w19;
-  slope[7] = w20;
   slope[8] = 1.0;
   slope[9] = 1.0;
-  slope[10] = w18;
-  slope[11] = w19;
-  slope[12] = w19;
-  slope[13] = w20;
   slope[14] = 1.0;
   slope[15] = 1.0;
+  const double w0 = u[0]*u[0];
+  const double w1 = u[1]*u[1];
+  const double w2 = w0 + w1;
+  const double w3 = parameters[0]*inverse_root_3(w2);
+  value[6] = w3*u[0] + u[4];
+  value[7] = w3*u[1] + u[5];
+  const double w4 = 3.0*parameters[0];
+  const double w5 = inverse_root_5(w2);
+  const double w6 = w4*w0*w5;
+  const double w7 = w4*w5;
+  const double w8 = w7*u[0]*u[1];
+  value[0] = w3*u[6] - w6*u[6] - w8*u[7];
+  const double w9 = w4*w1*w5;
+  const double w10 = w7*u[6]*u[0];
+  value[1] = w3*u[7] - w9*u[7] - w10*u[1];
+  const double w11 = parameters[0]*w5;
+  const double w12 = 5.0*parameters[0];
+  const double w13 = inverse_root_7(w2);
+  const double w14 = w12*w0*w13;
+  slope[0] = (-3.0)*(w10 + w11*u[1]*u[7] - w12*(w0*u[0])*w13*u[6] - w14*u[1]*u[7]);
+  const double w15 = w11*u[6];
+  const double w16 = w12*w1*w13;
+  slope[3] = (-3.0)*(w15*u[0] + w7*u[1]*u[7] - w12*w13*(w1*u[1])*u[7] - w16*u[6]*u[0]);
+  const double w17 = (-3.0)*(w11*u[0]*u[7] + w15*u[1] - w16*u[0]*u[7] - w14*u[6]*u[1]);
+  slope[1] = w17;
+  slope[2] = w17;
+  const double w18 = w3 - w6;
+  slope[4] = w18;
+  slope[10] = w18;
+  const double w19 = -w8;
+  slope[5] = w19;
+  slope[6] = w19;
+  slope[11] = w19;
+  slope[12] = w19;
+  const double w20 = w3 - w9;
+  slope[7] = w20;
+  slope[13] = w20;
 }
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
@@ -933,14 +933,19 @@ static const lanes NODE_END = {1.0, 0.0};
 static const lanes NODE_CONSISTENCY = {1.0, 0.0};
 static const lanes NODE_MASK = {1.0, 1.0};
 
-/* sum_j table[j] x_j, in four sums that do not wait for each other. */
+/* sum_j table[j] x_j of a vector in memory, one after the other. */
+static inline lanes lanes_apply_at(const lanes *table, const lanes *vector)
+{
+  const lane_view *x = (const lane_view *)vector;
+  lanes a = table[0] * x->lane[0];
+  for (int j = 1; j < LANES; j++)
+    a += table[j] * x->lane[j];
+  return a;
+}
+
 static inline lanes lanes_apply(const lanes *table, lanes x)
 {
-  const lane_view view = {x};
-  lanes a = table[0] * view.lane[0];
-  for (int j = 1; j < LANES; j++)
-    a += table[j] * view.lane[j];
-  return a;
+  return lanes_apply_at(table, &x);
 }
 
 static inline double lanes_total(lanes x)
@@ -962,6 +967,17 @@ static inline void lanes_store(const lanes *x, double *memory)
   memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
+/* 1 / (size + a little of the largest), so that a coordinate that rests at 0 has a size too; or what makes changes of x
+ * changes of q. */
+static inline void invert_sizes(const kepler_scvi_2_options *options, double absolute, double *size)
+{
+  double largest = 0.0;
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, size[i]);
+  for (int i = 0; i < M; i++)
+    size[i] = options->absolute ? absolute : 1.0 / (size[i] + DBL_EPSILON * largest + DBL_MIN);
+}
+
 /* What is kept at the points, continued into this step from the last one or from the last two. */
 static inline void continue_curve(const double *memory, long long steps, lanes *x)
 {
@@ -969,7 +985,7 @@ static inline void continue_curve(const double *memory, long long steps, lanes *
   lanes_load(memory, x);
   lanes_load(memory + M * LANES, before);
   for (int i = 0; i < M; i++)
-    x[i] = steps == 1 ? lanes_apply(LAST_ALONE, x[i]) : lanes_apply(LAST, x[i]) + lanes_apply(BEFORE, before[i]);
+    x[i] = steps == 1 ? lanes_apply_at(LAST_ALONE, &x[i]) : lanes_apply_at(LAST, &x[i]) + lanes_apply_at(BEFORE, &before[i]);
 }
 
 static inline void remember_curve(const lanes *x, double *memory)
@@ -988,31 +1004,31 @@ static inline long long steps_to_continue(long long steps, double first_change)
 /* E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m). Operations: 19 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
 static inline void node_lanes(const lanes *u, const double *parameters, lanes *value, lanes *slope)
 {
-  const lanes w0 = u[0]*u[0];
-  const lanes w1 = u[1]*u[1];
-  const lanes w2 = w0 + w1;
-  const lanes w3 = parameters[0]*lanes_inverse_root_3(w2);
-  const lanes w4 = lanes_inverse_root_5(w2);
-  const double w5 = 3.0*parameters[0];
-  const lanes w6 = w5*w4*u[0]*u[1];
-  value[0] = w3*u[0] + u[4];
-  value[1] = w3*u[1] + u[5];
-  value[2] = w3*u[6] - w5*w0*w4*u[6] - w6*u[7];
-  value[3] = w3*u[7] - w5*w1*w4*u[7] - w6*u[6];
   value[4] = lanes_of(0.0);
   value[5] = lanes_of(0.0);
   slope[0] = lanes_of(1.0);
   slope[1] = lanes_of(1.0);
+  const lanes w0 = u[0]*u[0];
+  const lanes w1 = u[1]*u[1];
+  const lanes w2 = w0 + w1;
+  const lanes w3 = parameters[0]*lanes_inverse_root_3(w2);
+  value[0] = w3*u[0] + u[4];
+  value[1] = w3*u[1] + u[5];
+  const double w4 = 3.0*parameters[0];
+  const lanes w5 = lanes_inverse_root_5(w2);
+  const lanes w6 = w4*w5*u[0]*u[1];
+  value[2] = w3*u[6] - w4*w0*w5*u[6] - w6*u[7];
+  value[3] = w3*u[7] - w4*w1*w5*u[7] - w6*u[6];
 }
 
 /* L_q and L_v at all points, u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static inline void action_lanes(const lanes *u, const double *parameters, lanes *value)
 {
+  value[2] = u[2];
+  value[3] = u[3];
   const lanes w0 = parameters[0]*lanes_inverse_root_3(u[0]*u[0] + u[1]*u[1]);
   value[0] = -(w0*u[0]);
   value[1] = -(w0*u[1]);
-  value[2] = u[2];
-  value[3] = u[3];
 }
 
 /* The masses are diagonal: nothing to factorise. */
@@ -1115,7 +1131,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   shot curve;
   lanes V[M], u[4 * M], node[3 * M], action[2 * M], mass[M];
   const double h = step->h;
-  double inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
+  double inverse_size[M], first = 0.0, last = INFINITY;
   int status = 0, settled = 0;
   if (*steps > 0) {
     continue_shot(memory, *steps, &curve);
@@ -1126,12 +1142,6 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
     for (int i = 0; i < M; i++)
       curve.z[i] = curve.m[i] = lanes_of(0.0);
   }
-  for (int i = 0; i < M; i++) {
-    inverse_size[i] = fabs(curve.v0[i]) + fabs(curve.v0[i] + lanes_total(NODE_MASK * NODE_END * curve.z[i]));
-    largest = larger(largest, inverse_size[i]);
-  }
-  for (int i = 0; i < M; i++)
-    inverse_size[i] = options->absolute ? fabs(h) : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
   for (int k = 0; status == 0; k++) {
     lanes change = lanes_of(0.0), r[M], gamma[M];
     double total = 0.0, misfit[M];
@@ -1141,6 +1151,11 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
     for (int i = 0; i < M; i++)
       r[i] = h * node[i];
     solve_mass(mass, r);
+    if (k == 0) {
+      for (int i = 0; i < M; i++)
+        inverse_size[i] = fabs(curve.v0[i]) + fabs(curve.v0[i] + lanes_total(NODE_MASK * NODE_END * (curve.z[i] - r[i])));
+      invert_sizes(options, fabs(h), inverse_size);
+    }
     for (int i = 0; i < M; i++) {
       const lanes moved = r[i] * inverse_size[i];
       change += moved * moved;

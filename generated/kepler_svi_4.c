@@ -116,33 +116,33 @@ static inline double inverse_root_5(double x)
 /* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, const double *parameters, double *value)
 {
+  value[2] = u[2];
+  value[3] = u[3];
   const double w0 = parameters[0]*inverse_root_3(u[0]*u[0] + u[1]*u[1]);
   value[0] = -(w0*u[0]);
   value[1] = -(w0*u[1]);
-  value[2] = u[2];
-  value[3] = u[3];
 }
 
 /* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1 inverse_root_5, 4 neg. */
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
+  value[2] = u[2];
+  value[3] = u[3];
+  slope[4] = 1.0;
+  slope[5] = 1.0;
   const double w0 = u[0]*u[0];
   const double w1 = u[1]*u[1];
   const double w2 = w0 + w1;
   const double w3 = parameters[0]*inverse_root_3(w2);
-  const double w4 = inverse_root_5(w2);
-  const double w5 = 3.0*parameters[0];
-  const double w6 = w5*w4*u[0]*u[1];
   value[0] = -(w3*u[0]);
   value[1] = -(w3*u[1]);
-  value[2] = u[2];
-  value[3] = u[3];
-  slope[0] = -(w3 - w5*w0*w4);
+  const double w4 = 3.0*parameters[0];
+  const double w5 = inverse_root_5(w2);
+  slope[0] = -(w3 - w4*w0*w5);
+  slope[3] = -(w3 - w4*w1*w5);
+  const double w6 = w4*w5*u[0]*u[1];
   slope[1] = w6;
   slope[2] = w6;
-  slope[3] = -(w3 - w5*w1*w4);
-  slope[4] = 1.0;
-  slope[5] = 1.0;
 }
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
@@ -729,13 +729,13 @@ static const lanes BEFORE[4] = {
   {0.09189683115258643, -0.44746251218562305, -4.806839337041577, -21.533808302186017}
 };
 
-/* sum_j table[j] x_j, in four sums that do not wait for each other. */
-static inline lanes lanes_apply(const lanes *table, lanes x)
+/* sum_j table[j] x_j of a vector in memory, one after the other. */
+static inline lanes lanes_apply_at(const lanes *table, const lanes *vector)
 {
-  const lane_view view = {x};
-  lanes a = table[0] * view.lane[0];
+  const lane_view *x = (const lane_view *)vector;
+  lanes a = table[0] * x->lane[0];
   for (int j = 1; j < LANES; j++)
-    a += table[j] * view.lane[j];
+    a += table[j] * x->lane[j];
   return a;
 }
 
@@ -758,6 +758,17 @@ static inline void lanes_store(const lanes *x, double *memory)
   memcpy(memory, x, sizeof(double) * M * LANES);
 }
 
+/* 1 / (size + a little of the largest), so that a coordinate that rests at 0 has a size too; or what makes changes of x
+ * changes of q. */
+static inline void invert_sizes(const kepler_svi_4_options *options, double absolute, double *size)
+{
+  double largest = 0.0;
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, size[i]);
+  for (int i = 0; i < M; i++)
+    size[i] = options->absolute ? absolute : 1.0 / (size[i] + DBL_EPSILON * largest + DBL_MIN);
+}
+
 /* What is kept at the points, continued into this step from the last one or from the last two. */
 static inline void continue_curve(const double *memory, long long steps, lanes *x)
 {
@@ -765,7 +776,7 @@ static inline void continue_curve(const double *memory, long long steps, lanes *
   lanes_load(memory, x);
   lanes_load(memory + M * LANES, before);
   for (int i = 0; i < M; i++)
-    x[i] = steps == 1 ? lanes_apply(LAST_ALONE, x[i]) : lanes_apply(LAST, x[i]) + lanes_apply(BEFORE, before[i]);
+    x[i] = steps == 1 ? lanes_apply_at(LAST_ALONE, &x[i]) : lanes_apply_at(LAST, &x[i]) + lanes_apply_at(BEFORE, &before[i]);
 }
 
 static inline void remember_curve(const lanes *x, double *memory)
@@ -844,30 +855,31 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
     const kepler_svi_4_options *options, kepler_svi_4_report *report)
 {
   lanes X[M], base[M], F[M];
-  double drift[M], drift_low[M], inverse_size[M], first = 0.0, last = INFINITY, largest = 0.0;
+  double drift[M], drift_low[M], inverse_size[M], first = 0.0, last = INFINITY;
   int status = 0;
   for (int i = 0; i < M; i++) {
     const double v = data->inverse_mass[i] * step->p0[i], v_low = fma(data->inverse_mass[i], step->p0[i], -v);
     drift[i] = step->h * v;
     drift_low[i] = fma(step->h, v, -drift[i]) + step->h * (v_low + data->inverse_mass[i] * step->carry_p[i]);
     base[i] = step->q0[i] + POINT_DRIFT * drift[i];
-    inverse_size[i] = fabs(step->q0[i]) + fabs(drift[i]);
-    largest = larger(largest, inverse_size[i]);
     X[i] = base[i];
   }
-  for (int i = 0; i < M; i++)
-    inverse_size[i] = options->absolute ? 1.0 : 1.0 / (inverse_size[i] + DBL_EPSILON * largest + DBL_MIN);
   if (*steps > 0) {
     continue_curve(memory, *steps, F);
     for (int i = 0; i < M; i++)
       X[i] += (data->square * data->inverse_mass[i]) * F[i];
   }
   force_lanes(X, step->parameters, F);
+  for (int i = 0; i < M; i++) {
+    const lane_view force = {F[i]};
+    inverse_size[i] = fabs(step->q0[i]) + fabs(drift[i]) + fabs(data->square * data->inverse_mass[i] * force.lane[0]);
+  }
+  invert_sizes(options, 1.0, inverse_size);
   for (int k = 0; status == 0; k++) {
     lanes change = lanes_of(0.0);
     double total;
     for (int i = 0; i < M; i++) {
-      const lanes x = base[i] + (data->square * data->inverse_mass[i]) * lanes_apply(POINT_PRODUCT, F[i]);
+      const lanes x = base[i] + (data->square * data->inverse_mass[i]) * lanes_apply_at(POINT_PRODUCT, &F[i]);
       const lanes moved = (x - X[i]) * inverse_size[i];
       change += moved * moved;
       X[i] = x;
@@ -883,7 +895,7 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   if (status < 0)
     return last < INFINITY ? KEPLER_SVI_4_NOT_CONVERGED : KEPLER_SVI_4_NOT_FINITE;
   for (int i = 0; i < M; i++) {
-    const lanes sum = lanes_apply(POINT_PRODUCT, F[i]), low = lanes_apply(POINT_PRODUCT_LOW, F[i]);
+    const lanes sum = lanes_apply_at(POINT_PRODUCT, &F[i]), low = lanes_apply_at(POINT_PRODUCT_LOW, &F[i]);
     const lanes small = step->carry_q[i] + POINT_DRIFT * drift_low[i] + POINT_DRIFT_LOW * drift[i];
     const lanes rest = data->inverse_mass[i] * (data->square * low + data->square_low * sum);
     X[i] = step->q0[i] + ((POINT_DRIFT * drift[i] + (small + rest)) + data->inverse_mass[i] * (data->square * sum));

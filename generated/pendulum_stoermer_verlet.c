@@ -90,10 +90,10 @@ static void quadrature_value(const double *u, const double *parameters, double *
 static void quadrature_slope(const double *u, const double *parameters, double *value, double *slope)
 {
   const double w0 = parameters[2]*parameters[1]*parameters[0];
-  const double w1 = parameters[0]*(parameters[1]*parameters[1]);
   value[0] = -(w0*sin(u[0]));
-  value[1] = w1*u[1];
   slope[0] = -(w0*cos(u[0]));
+  const double w1 = parameters[0]*(parameters[1]*parameters[1]);
+  value[1] = w1*u[1];
   slope[1] = w1;
 }
 

@@ -10,6 +10,7 @@ import oracle
 import pytest
 
 from scvi_codegen.binding import SolverOptions
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.problems import problem
@@ -503,3 +504,16 @@ def test_a_stepper_shows_system_and_method(kepler):
     assert "Kepler" in repr(kepler)
     assert "degree 3" in repr(kepler)
     assert kepler.dimension == 2
+
+
+@pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
+@pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
+def test_the_fixed_point_starts_from_rest(name, method):
+    """The first sweep from rest has no velocity to measure changes by."""
+    chosen = problem(name)
+    rest = np.zeros(chosen.system.dimension)
+    ends = [
+        compile_stepper(chosen.system, method, solver=solver).step(chosen.q, rest, 0.05)
+        for solver in ("fixed-point", "newton")
+    ]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-14, atol=1e-16)
