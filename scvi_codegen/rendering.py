@@ -39,6 +39,8 @@ POINT_SOURCES = ("u", "t")
 TRAJECTORY_SOURCES = ("u", "parameters")
 ENSEMBLE_LANES = 8
 INVERSE_ROOT = "inverse_root_"
+LARGEST_INLINED = 150
+"""Operations of the kernels of a sweep that is made part of the loop over steps; larger ones gain nothing."""
 VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
@@ -174,7 +176,13 @@ def _lane_context(sweep: Sweep | None) -> dict[str, object]:
     """What the templates of the fixed-point solver need; nothing without one."""
     if sweep is None:
         return {}
-    return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points"}
+    hot = "static inline __attribute__((always_inline)) " if _size(sweep) <= LARGEST_INLINED else "static "
+    return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points", "hot": hot}
+
+
+def _size(sweep: Sweep) -> int:
+    """Operations of all kernels with lanes."""
+    return sum(sum(kernel.operation_counts().values()) for kernel in sweep.kernels)
 
 
 def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]:
