@@ -208,15 +208,17 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
   momentum_and_mass(t, u, parameters, value, mass);
   misfit = largest_misfit(value, p);
   for (int k = 0; k < 50; k++) {
-    double scale = 1.0, nearer, start[M], largest = 0.0;
+    double scale = 1.0, nearer, start[M], roundoff = 0.0;
     if (!all_finite(value, M) || !all_finite(mass, M * M))
       return PENDULUM_STOERMER_VERLET_NOT_FINITE;
     if (misfit == 0.0)
       return PENDULUM_STOERMER_VERLET_OK;
     if (!factorise(mass, M, pivot))
       return PENDULUM_STOERMER_VERLET_SINGULAR;
-    for (int i = 0; i < M; i++)
+    for (int i = 0; i < M; i++) {
       update[i] = p[i] - value[i];
+      roundoff = larger(roundoff, 64.0 * DBL_EPSILON * fabs(p[i]));
+    }
     back_substitute(mass, M, pivot, update);
     memcpy(start, u + M, sizeof(double) * M);
     do {
@@ -225,12 +227,10 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       momentum_and_mass(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
       scale *= 0.5;
-    } while (!(nearer < misfit) && scale > DBL_EPSILON);
-    for (int i = 0; i < M; i++)
-      largest = larger(largest, fabs(p[i]));
+    } while (!(nearer < misfit) && misfit > roundoff && scale > DBL_EPSILON);
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
-      return misfit <= 64.0 * DBL_EPSILON * largest ? PENDULUM_STOERMER_VERLET_OK : PENDULUM_STOERMER_VERLET_NOT_CONVERGED;
+      return misfit <= roundoff ? PENDULUM_STOERMER_VERLET_OK : PENDULUM_STOERMER_VERLET_NOT_CONVERGED;
     }
     misfit = nearer;
   }
