@@ -1,9 +1,9 @@
 """The fixed-point solver of collocation in position form: accelerations at the nodes, as lanes.
 
 It serves what collocates the Euler-Lagrange equations and is not variational: spectral collocation and Runge-Kutta
-methods in position form, which have the velocity at both ends in common with the momenta, and the shooting-based method
-as printed, which has quadratures there. The equations, those of ``methods/collocation.py`` and ``methods/shooting.py``
-solved for the accelerations, stand at :class:`scvi_codegen.program.CollocationSweep`.
+methods in position form, whose momenta at both ends are those of the velocities there, and the shooting-based method as
+printed, whose momenta at both ends are quadratures. The equations, those of ``methods/collocation.py`` and
+``methods/shooting.py`` solved for the accelerations, stand at :class:`scvi_codegen.program.CollocationSweep`.
 """
 
 from __future__ import annotations
