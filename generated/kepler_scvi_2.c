@@ -465,15 +465,17 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
   momentum_and_mass(t, u, parameters, value, mass);
   misfit = largest_misfit(value, p);
   for (int k = 0; k < 50; k++) {
-    double scale = 1.0, nearer, start[M], largest = 0.0;
+    double scale = 1.0, nearer, start[M], roundoff = 0.0;
     if (!all_finite(value, M) || !all_finite(mass, (int)band_size(&shape)))
       return KEPLER_SCVI_2_NOT_FINITE;
     if (misfit == 0.0)
       return KEPLER_SCVI_2_OK;
     if (!factorise(mass, &shape, pivot))
       return KEPLER_SCVI_2_SINGULAR;
-    for (int i = 0; i < M; i++)
+    for (int i = 0; i < M; i++) {
       update[PLACE[i]] = p[i] - value[i];
+      roundoff = larger(roundoff, 64.0 * DBL_EPSILON * fabs(p[i]));
+    }
     back_substitute(mass, &shape, pivot, update);
     memcpy(start, u + M, sizeof(double) * M);
     do {
@@ -482,12 +484,10 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       momentum_and_mass(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
       scale *= 0.5;
-    } while (!(nearer < misfit) && scale > DBL_EPSILON);
-    for (int i = 0; i < M; i++)
-      largest = larger(largest, fabs(p[i]));
+    } while (!(nearer < misfit) && misfit > roundoff && scale > DBL_EPSILON);
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
-      return misfit <= 64.0 * DBL_EPSILON * largest ? KEPLER_SCVI_2_OK : KEPLER_SCVI_2_NOT_CONVERGED;
+      return misfit <= roundoff ? KEPLER_SCVI_2_OK : KEPLER_SCVI_2_NOT_CONVERGED;
     }
     misfit = nearer;
   }
@@ -891,31 +891,23 @@ static inline lanes lanes_inverse_root_5(lanes x)
 #endif
 }
 
-/* Column j of a table multiplies node j, or point j of a transposed one. Lanes beyond repeat the last. */
+/* Column j of a table multiplies node j. Lanes beyond node 2 or the last point repeat it. */
 static const lanes COLLOCATION[2] = {
   {0.75, 1.0},
   {-0.25, 0.0}
 };
-static const lanes COLLOCATION_T[2] = {
-  {0.75, -0.25},
-  {1.0, 0.0}
-};
+static const lanes NODE_END = {1.0, 0.0};
+static const lanes NODE_MASK = {1.0, 1.0};
 static const lanes POINT_POSITION[2] = {
   {0.37799153207185376, 0.9553418012614795},
   {-0.16666666666666666, -0.16666666666666666}
-};
-static const lanes POINT_POSITION_T[2] = {
-  {0.37799153207185376, -0.16666666666666666},
-  {0.9553418012614795, -0.16666666666666666}
 };
 static const lanes POINT_VELOCITY[2] = {
   {1.5773502691896257, 0.4226497308103742},
   {-0.5773502691896257, 0.5773502691896257}
 };
-static const lanes POINT_VELOCITY_T[2] = {
-  {1.5773502691896257, -0.5773502691896257},
-  {0.4226497308103742, 0.5773502691896257}
-};
+
+/* From the accelerations of the last step and of the one before to a guess of those of the next. */
 static const lanes LAST_ALONE[2] = {
   {-1.0, -2.0},
   {2.0, 3.0}
@@ -928,10 +920,6 @@ static const lanes BEFORE[2] = {
   {0.75, 1.95},
   {-1.25, -2.85}
 };
-static const lanes POINT_WEIGHT = {0.5, 0.5};
-static const lanes NODE_END = {1.0, 0.0};
-static const lanes NODE_CONSISTENCY = {1.0, 0.0};
-static const lanes NODE_MASK = {1.0, 1.0};
 
 /* sum_j table[j] x_j of a vector in memory, one after the other. */
 static inline lanes lanes_apply_at(const lanes *table, const lanes *vector)
@@ -1063,6 +1051,114 @@ static inline int sweep_status(double change, double last, double tolerance, int
   return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
+/* v0, z = h a and m of the curve of a step. */
+typedef struct {
+  double v0[M];
+  lanes z[M], m[M];
+} curve_data;
+
+/* In memory: z of the last step and of the one before, v0, m. */
+static void save_curve(const curve_data *curve, double *memory)
+{
+  remember_curve(curve->z, memory);
+  memcpy(memory + 2 * M * LANES, curve->v0, sizeof curve->v0);
+  lanes_store(curve->m, memory + 2 * M * LANES + M);
+}
+
+/* v1 = v0 + sum b z. */
+static inline double end_velocity(const curve_data *curve, int i)
+{
+  return curve->v0[i] + lanes_total(NODE_MASK * NODE_END * curve->z[i]);
+}
+
+/* The curve of the last steps continued, or a straight line. */
+static int first_curve(const step_data *step, const double *memory, long long steps, curve_data *curve)
+{
+  int status = KEPLER_SCVI_2_OK;
+  if (steps > 0) {
+    lanes_load(memory, curve->z);
+    memcpy(curve->v0, memory + 2 * M * LANES, sizeof curve->v0);
+    for (int i = 0; i < M; i++)
+      curve->v0[i] = end_velocity(curve, i);
+    continue_curve(memory, steps, curve->z);
+    lanes_load(memory + 2 * M * LANES + M, curve->m);
+  } else {
+    for (int i = 0; i < M; i++)
+      curve->z[i] = curve->m[i] = lanes_of(0.0);
+    status = kepler_scvi_2_velocity(step->t, step->q0, step->p0, step->parameters, curve->v0, step->scratch);
+  }
+  return status;
+}
+
+/* 1 / (|v0| + |v1|), which makes changes of velocities relative. */
+static inline void measure_curve(const step_data *step, const curve_data *curve, const kepler_scvi_2_options *options,
+    double *inverse_size)
+{
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = fabs(curve->v0[i]) + fabs(end_velocity(curve, i));
+  invert_sizes(options, fabs(step->h), inverse_size);
+}
+
+/* Positions, velocities, accelerations and multipliers at the nodes. */
+static inline void place_nodes(const step_data *step, const curve_data *curve, lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    u[M + i] = curve->v0[i] + lanes_apply(COLLOCATION, curve->z[i]);
+    u[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(COLLOCATION, step->h * u[M + i]));
+    u[2 * M + i] = curve->z[i] / step->h;
+    u[3 * M + i] = curve->m[i];
+  }
+}
+
+/* Positions and velocities at the quadrature points. */
+static inline void place_points(const step_data *step, const curve_data *curve, lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    const lanes V = curve->v0[i] + lanes_apply(COLLOCATION, curve->z[i]);
+    u[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, step->h * V));
+    u[M + i] = lanes_apply(POINT_VELOCITY, V);
+  }
+}
+
+/* v0 -= mass^-1 misfit, the mean over the nodes; how much it moved, relative and squared. */
+static inline double correct_velocity(const lanes *mass, const double *misfit, const double *inverse_size, double *v0)
+{
+  lanes r[M];
+  double total = 0.0;
+  for (int i = 0; i < M; i++)
+    r[i] = lanes_of(misfit[i]);
+  solve_mass(mass, r);
+  for (int i = 0; i < M; i++) {
+    const double correction = lanes_total(NODE_MASK * r[i]) / 2.0, moved = correction * inverse_size[i];
+    total += moved * moved;
+    v0[i] -= correction;
+  }
+  return total;
+}
+
+/* q1 - q0. */
+static inline void end_increment(const step_data *step, const curve_data *curve, double *dq)
+{
+  for (int i = 0; i < M; i++)
+    dq[i] = lanes_total(NODE_MASK * NODE_END * (step->h * (curve->v0[i] + lanes_apply(COLLOCATION, curve->z[i]))));
+}
+
+/* What the points and nodes give back, and weights. */
+static const lanes COLLOCATION_T[2] = {
+  {0.75, -0.25},
+  {1.0, 0.0}
+};
+static const lanes POINT_POSITION_T[2] = {
+  {0.37799153207185376, -0.16666666666666666},
+  {0.9553418012614795, -0.16666666666666666}
+};
+static const lanes POINT_VELOCITY_T[2] = {
+  {1.5773502691896257, -0.5773502691896257},
+  {0.4226497308103742, 0.5773502691896257}
+};
+static const lanes POINT_WEIGHT = {0.5, 0.5};
+static const lanes NODE_CONSISTENCY = {1.0, 0.0};
+
 typedef struct {
   lanes weight; /* h w */
 } sweep_data;
@@ -1072,112 +1168,51 @@ static void prepare_sweep(const step_data *step, sweep_data *data)
   data->weight = step->h * POINT_WEIGHT;
 }
 
-/* v0, z = h a and m of the curve of a step. */
-typedef struct {
-  double v0[M];
-  lanes z[M], m[M];
-} shot;
-
-/* In memory: z of the last step and of the one before, m, v0. */
-static void save_shot(const shot *curve, double *memory)
-{
-  remember_curve(curve->z, memory);
-  lanes_store(curve->m, memory + 2 * M * LANES);
-  memcpy(memory + 3 * M * LANES, curve->v0, sizeof curve->v0);
-}
-
-/* The curve of the last two steps, continued. */
-static void continue_shot(const double *memory, long long steps, shot *curve)
-{
-  lanes_load(memory + 2 * M * LANES, curve->m);
-  memcpy(curve->v0, memory + 3 * M * LANES, sizeof curve->v0);
-  lanes_load(memory, curve->z);
-  for (int i = 0; i < M; i++)
-    curve->v0[i] += lanes_total(NODE_MASK * NODE_END * curve->z[i]);
-  continue_curve(memory, steps, curve->z);
-}
-
-/* Positions, velocities, accelerations and multipliers at the nodes. */
-static inline void place_nodes(const step_data *step, const shot *curve, lanes *V, lanes *u)
-{
-  for (int i = 0; i < M; i++) {
-    V[i] = curve->v0[i] + lanes_apply(COLLOCATION, curve->z[i]);
-    u[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(COLLOCATION, step->h * V[i]));
-    u[M + i] = V[i];
-    u[2 * M + i] = curve->z[i] / step->h;
-    u[3 * M + i] = curve->m[i];
-  }
-}
-
-/* Positions and velocities at the quadrature points. */
-static inline void place_points(const step_data *step, const lanes *V, lanes *u)
-{
-  for (int i = 0; i < M; i++) {
-    u[i] = step->q0[i] + (step->carry_q[i] + lanes_apply(POINT_POSITION, step->h * V[i]));
-    u[M + i] = lanes_apply(POINT_VELOCITY, V[i]);
-  }
-}
-
 /* p1 - p0 from the forces at the points and the gradient of m . E at the nodes. */
-static inline double end_increment(const step_data *step, const sweep_data *data, lanes force, lanes slope)
+static inline double momentum_increment(const step_data *step, const sweep_data *data, lanes force, lanes slope)
 {
   return lanes_total(data->weight * force) + step->h * (step->h * lanes_total(NODE_MASK * slope));
 }
 
 /* One step. Accelerations, momentum, initial velocity and multipliers are corrected in turn until all rest. */
-static int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
+static inline __attribute__((always_inline)) int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const kepler_scvi_2_options *options, kepler_scvi_2_report *report)
 {
-  shot curve;
-  lanes V[M], u[4 * M], node[3 * M], action[2 * M], mass[M];
+  curve_data curve;
+  lanes u[4 * M], node[3 * M], action[2 * M], mass[M];
   const double h = step->h;
   double inverse_size[M], first = 0.0, last = INFINITY;
-  int status = 0, settled = 0;
-  if (*steps > 0) {
-    continue_shot(memory, *steps, &curve);
-  } else {
-    status = kepler_scvi_2_velocity(step->t, step->q0, step->p0, step->parameters, curve.v0, step->scratch);
-    if (status != KEPLER_SCVI_2_OK)
-      return status;
-    for (int i = 0; i < M; i++)
-      curve.z[i] = curve.m[i] = lanes_of(0.0);
-  }
+  int status, settled = 0;
+  status = first_curve(step, memory, *steps, &curve);
+  if (status != KEPLER_SCVI_2_OK)
+    return status;
   for (int k = 0; status == 0; k++) {
     lanes change = lanes_of(0.0), r[M], gamma[M];
-    double total = 0.0, misfit[M];
-    place_nodes(step, &curve, V, u);
+    double total, misfit[M];
+    place_nodes(step, &curve, u);
     node_lanes(u, step->parameters, node, mass);
     factor_mass(mass);
     for (int i = 0; i < M; i++)
       r[i] = h * node[i];
     solve_mass(mass, r);
-    if (k == 0) {
-      for (int i = 0; i < M; i++)
-        inverse_size[i] = fabs(curve.v0[i]) + fabs(curve.v0[i] + lanes_total(NODE_MASK * NODE_END * (curve.z[i] - r[i])));
-      invert_sizes(options, fabs(h), inverse_size);
-    }
+    for (int i = 0; i < M; i++)
+      curve.z[i] -= r[i];
+    if (k == 0)
+      measure_curve(step, &curve, options, inverse_size);
     for (int i = 0; i < M; i++) {
       const lanes moved = r[i] * inverse_size[i];
       change += moved * moved;
-      curve.z[i] -= r[i];
-      V[i] = curve.v0[i] + lanes_apply(COLLOCATION, curve.z[i]);
     }
-    place_points(step, V, u);
+    place_points(step, &curve, u);
     action_lanes(u, step->parameters, action);
     for (int i = 0; i < M; i++) {
-      const double p1 = step->p0[i] + (step->carry_p[i] + end_increment(step, data, action[i], node[M + i]));
+      const double p1 = step->p0[i] + (step->carry_p[i] + momentum_increment(step, data, action[i], node[M + i]));
       gamma[i] = lanes_apply(POINT_POSITION_T, data->weight * action[i]) + lanes_apply(POINT_VELOCITY_T, POINT_WEIGHT * action[M + i])
           + h * (node[2 * M + i] + h * lanes_apply(COLLOCATION_T, node[M + i])) - NODE_END * p1;
       misfit[i] = lanes_total(NODE_MASK * gamma[i]);
-      r[i] = lanes_of(misfit[i]);
-    }
-    solve_mass(mass, r);
-    for (int i = 0; i < M; i++) {
-      const double correction = lanes_total(NODE_MASK * r[i]) / 2.0;
-      total += (correction * inverse_size[i]) * (correction * inverse_size[i]);
-      curve.v0[i] -= correction;
       r[i] = lanes_apply(COLLOCATION_T, gamma[i] - NODE_CONSISTENCY * misfit[i]);
     }
+    total = correct_velocity(mass, misfit, inverse_size, curve.v0);
     solve_mass(mass, r);
     for (int i = 0; i < M; i++) {
       const lanes moved = (r[i] + curve.m[i]) * inverse_size[i];
@@ -1197,17 +1232,16 @@ static int sweep(const step_data *step, const sweep_data *data, double *memory, 
   report->change = sqrt(last);
   if (status < 0)
     return last < INFINITY ? KEPLER_SCVI_2_NOT_CONVERGED : KEPLER_SCVI_2_NOT_FINITE;
-  place_nodes(step, &curve, V, u);
+  place_nodes(step, &curve, u);
   node_lanes(u, step->parameters, node, mass);
-  place_points(step, V, u);
+  place_points(step, &curve, u);
   action_lanes(u, step->parameters, action);
-  for (int i = 0; i < M; i++) {
-    dq[i] = lanes_total(NODE_MASK * NODE_END * (h * V[i]));
-    dp[i] = end_increment(step, data, action[i], node[M + i]);
-  }
+  end_increment(step, &curve, dq);
+  for (int i = 0; i < M; i++)
+    dp[i] = momentum_increment(step, data, action[i], node[M + i]);
   if (!all_finite(dq, M) || !all_finite(dp, M))
     return KEPLER_SCVI_2_NOT_FINITE;
-  save_shot(&curve, memory);
+  save_curve(&curve, memory);
   *steps = steps_to_continue(*steps, first);
   return KEPLER_SCVI_2_OK;
 }
@@ -1241,17 +1275,15 @@ static void prepare(const step_data *step, solver_data *data)
   prepare_sweep(step, data);
 }
 
-/* The increments by sweeps, from the curve of the last two steps continued and then from the straight line, else by
- * Newton's iteration. On success guess says from how many steps the next is continued. */
-static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+/* The increments where the curve continued from former steps leads nowhere: by sweeps from the straight line, else by
+ * Newton's iteration. */
+static int solve_again(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const kepler_scvi_2_options *options, kepler_scvi_2_report *report, double *workspace)
 {
-  long long steps = *guess;
-  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
-  if (status != KEPLER_SCVI_2_OK && steps > 0) {
-    steps = 0;
+  long long steps = 0;
+  int status = KEPLER_SCVI_2_NOT_CONVERGED;
+  if (*guess > 0)
     status = sweep(step, data, memory, &steps, dq, dp, options, report);
-  }
   if (status != KEPLER_SCVI_2_OK) {
     const newton_data newtons = newton_in(workspace);
     int keep;
@@ -1261,6 +1293,18 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
   }
   if (status == KEPLER_SCVI_2_OK)
     *guess = steps;
+  return status;
+}
+
+/* The increments by sweeps. On success guess says from how many steps the next is continued. */
+static inline __attribute__((always_inline)) int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const kepler_scvi_2_options *options, kepler_scvi_2_report *report, double *workspace)
+{
+  long long steps = *guess;
+  const int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != KEPLER_SCVI_2_OK)
+    return solve_again(step, data, memory, guess, dq, dp, options, report, workspace);
+  *guess = steps;
   return status;
 }
 #else
@@ -1342,6 +1386,27 @@ void kepler_scvi_2_start(kepler_scvi_2_run *run, double t, double h, const doubl
   memcpy(run->p, p, sizeof(double) * M);
 }
 
+/* What a step changes, at hand while a call lasts. */
+typedef struct {
+  double q[M], p[M], carry_q[M], carry_p[M];
+} state;
+
+static void load_state(const kepler_scvi_2_run *run, state *now)
+{
+  memcpy(now->q, run->q, sizeof now->q);
+  memcpy(now->p, run->p, sizeof now->p);
+  memcpy(now->carry_q, run->carry_q, sizeof now->carry_q);
+  memcpy(now->carry_p, run->carry_p, sizeof now->carry_p);
+}
+
+static void save_state(const state *now, kepler_scvi_2_run *run)
+{
+  memcpy(run->q, now->q, sizeof now->q);
+  memcpy(run->p, now->p, sizeof now->p);
+  memcpy(run->carry_q, now->carry_q, sizeof now->carry_q);
+  memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
+}
+
 /* x += increment, with what rounding cuts off in carry (Kahan). */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
@@ -1357,13 +1422,15 @@ int kepler_scvi_2_advance(kepler_scvi_2_run *run, long long steps, long long eve
     kepler_scvi_2_report *report, double *workspace)
 {
   const kepler_scvi_2_options standard = kepler_scvi_2_default_options();
-  step_data step = {run->t0, run->h, run->q, run->p, run->carry_q, run->carry_p, parameters, workspace, 1};
+  state now;
+  step_data step = {run->t0, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1};
   kepler_scvi_2_report unread;
   solver_data data;
   long long stored = 0;
   double dq[M], dp[M];
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
+  load_state(run, &now);
   prepare(&step, &data);
   for (long long k = 0; k < steps; k++) {
     const long long before = report->iterations;
@@ -1372,22 +1439,25 @@ int kepler_scvi_2_advance(kepler_scvi_2_run *run, long long steps, long long eve
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
-    if (status != KEPLER_SCVI_2_OK)
+    if (status != KEPLER_SCVI_2_OK) {
+      save_state(&now, run);
       return status;
-    add_compensated(run->q, run->carry_q, dq);
-    add_compensated(run->p, run->carry_p, dp);
+    }
+    add_compensated(now.q, now.carry_q, dq);
+    add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;
     run->step++;
     report->steps++;
     if (run->step % every == 0) {
       t[stored] = run->t0 + (double)run->step * run->h;
-      memcpy(q + stored * M, run->q, sizeof(double) * M);
-      memcpy(p + stored * M, run->p, sizeof(double) * M);
+      memcpy(q + stored * M, now.q, sizeof(double) * M);
+      memcpy(p + stored * M, now.p, sizeof(double) * M);
       iterations[stored] = (int)run->iterations;
       run->iterations = 0;
       stored++;
     }
   }
+  save_state(&now, run);
   return KEPLER_SCVI_2_OK;
 }
 

@@ -261,15 +261,17 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
   momentum_and_mass(t, u, parameters, value, mass);
   misfit = largest_misfit(value, p);
   for (int k = 0; k < 50; k++) {
-    double scale = 1.0, nearer, start[M], largest = 0.0;
+    double scale = 1.0, nearer, start[M], roundoff = 0.0;
     if (!all_finite(value, M) || !all_finite(mass, (int)band_size(&shape)))
       return PENDULUM_STOERMER_VERLET_NOT_FINITE;
     if (misfit == 0.0)
       return PENDULUM_STOERMER_VERLET_OK;
     if (!factorise(mass, &shape, pivot))
       return PENDULUM_STOERMER_VERLET_SINGULAR;
-    for (int i = 0; i < M; i++)
+    for (int i = 0; i < M; i++) {
       update[PLACE[i]] = p[i] - value[i];
+      roundoff = larger(roundoff, 64.0 * DBL_EPSILON * fabs(p[i]));
+    }
     back_substitute(mass, &shape, pivot, update);
     memcpy(start, u + M, sizeof(double) * M);
     do {
@@ -278,12 +280,10 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       momentum_and_mass(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
       scale *= 0.5;
-    } while (!(nearer < misfit) && scale > DBL_EPSILON);
-    for (int i = 0; i < M; i++)
-      largest = larger(largest, fabs(p[i]));
+    } while (!(nearer < misfit) && misfit > roundoff && scale > DBL_EPSILON);
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
-      return misfit <= 64.0 * DBL_EPSILON * largest ? PENDULUM_STOERMER_VERLET_OK : PENDULUM_STOERMER_VERLET_NOT_CONVERGED;
+      return misfit <= roundoff ? PENDULUM_STOERMER_VERLET_OK : PENDULUM_STOERMER_VERLET_NOT_CONVERGED;
     }
     misfit = nearer;
   }
@@ -688,6 +688,27 @@ void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t,
   memcpy(run->p, p, sizeof(double) * M);
 }
 
+/* What a step changes, at hand while a call lasts. */
+typedef struct {
+  double q[M], p[M], carry_q[M], carry_p[M];
+} state;
+
+static void load_state(const pendulum_stoermer_verlet_run *run, state *now)
+{
+  memcpy(now->q, run->q, sizeof now->q);
+  memcpy(now->p, run->p, sizeof now->p);
+  memcpy(now->carry_q, run->carry_q, sizeof now->carry_q);
+  memcpy(now->carry_p, run->carry_p, sizeof now->carry_p);
+}
+
+static void save_state(const state *now, pendulum_stoermer_verlet_run *run)
+{
+  memcpy(run->q, now->q, sizeof now->q);
+  memcpy(run->p, now->p, sizeof now->p);
+  memcpy(run->carry_q, now->carry_q, sizeof now->carry_q);
+  memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
+}
+
 /* x += increment, with what rounding cuts off in carry (Kahan). */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
@@ -703,13 +724,15 @@ int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long lon
     pendulum_stoermer_verlet_report *report, double *workspace)
 {
   const pendulum_stoermer_verlet_options standard = pendulum_stoermer_verlet_default_options();
-  step_data step = {run->t0, run->h, run->q, run->p, run->carry_q, run->carry_p, parameters, workspace, 1};
+  state now;
+  step_data step = {run->t0, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1};
   pendulum_stoermer_verlet_report unread;
   solver_data data;
   long long stored = 0;
   double dq[M], dp[M];
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
+  load_state(run, &now);
   prepare(&step, &data);
   for (long long k = 0; k < steps; k++) {
     const long long before = report->iterations;
@@ -718,22 +741,25 @@ int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long lon
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
-    if (status != PENDULUM_STOERMER_VERLET_OK)
+    if (status != PENDULUM_STOERMER_VERLET_OK) {
+      save_state(&now, run);
       return status;
-    add_compensated(run->q, run->carry_q, dq);
-    add_compensated(run->p, run->carry_p, dp);
+    }
+    add_compensated(now.q, now.carry_q, dq);
+    add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;
     run->step++;
     report->steps++;
     if (run->step % every == 0) {
       t[stored] = run->t0 + (double)run->step * run->h;
-      memcpy(q + stored * M, run->q, sizeof(double) * M);
-      memcpy(p + stored * M, run->p, sizeof(double) * M);
+      memcpy(q + stored * M, now.q, sizeof(double) * M);
+      memcpy(p + stored * M, now.p, sizeof(double) * M);
       iterations[stored] = (int)run->iterations;
       run->iterations = 0;
       stored++;
     }
   }
+  save_state(&now, run);
   return PENDULUM_STOERMER_VERLET_OK;
 }
 

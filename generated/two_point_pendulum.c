@@ -264,15 +264,17 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
   momentum_and_mass(t, u, parameters, value, mass);
   misfit = largest_misfit(value, p);
   for (int k = 0; k < 50; k++) {
-    double scale = 1.0, nearer, start[M], largest = 0.0;
+    double scale = 1.0, nearer, start[M], roundoff = 0.0;
     if (!all_finite(value, M) || !all_finite(mass, (int)band_size(&shape)))
       return TWO_POINT_PENDULUM_NOT_FINITE;
     if (misfit == 0.0)
       return TWO_POINT_PENDULUM_OK;
     if (!factorise(mass, &shape, pivot))
       return TWO_POINT_PENDULUM_SINGULAR;
-    for (int i = 0; i < M; i++)
+    for (int i = 0; i < M; i++) {
       update[PLACE[i]] = p[i] - value[i];
+      roundoff = larger(roundoff, 64.0 * DBL_EPSILON * fabs(p[i]));
+    }
     back_substitute(mass, &shape, pivot, update);
     memcpy(start, u + M, sizeof(double) * M);
     do {
@@ -281,12 +283,10 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
       momentum_and_mass(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
       scale *= 0.5;
-    } while (!(nearer < misfit) && scale > DBL_EPSILON);
-    for (int i = 0; i < M; i++)
-      largest = larger(largest, fabs(p[i]));
+    } while (!(nearer < misfit) && misfit > roundoff && scale > DBL_EPSILON);
     if (!(nearer < misfit)) { /* round-off: keep the better velocity */
       memcpy(u + M, start, sizeof(double) * M);
-      return misfit <= 64.0 * DBL_EPSILON * largest ? TWO_POINT_PENDULUM_OK : TWO_POINT_PENDULUM_NOT_CONVERGED;
+      return misfit <= roundoff ? TWO_POINT_PENDULUM_OK : TWO_POINT_PENDULUM_NOT_CONVERGED;
     }
     misfit = nearer;
   }
@@ -791,7 +791,7 @@ static inline int sweep_status(double change, double last, double tolerance, int
 /* One step. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; then once more, and the increments, with
  * all digits of the coefficients. Small terms are summed first: added to a rounded sum, they would be rounded away. The
  * forces stay in memory. */
-static int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
+static inline __attribute__((always_inline)) int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report)
 {
   lanes X[M], base[M], F[M];
@@ -882,17 +882,15 @@ static void prepare(const step_data *step, solver_data *data)
   prepare_sweep(step, data);
 }
 
-/* The increments by sweeps, from the curve of the last two steps continued and then from the straight line, else by
- * Newton's iteration. On success guess says from how many steps the next is continued. */
-static int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+/* The increments where the curve continued from former steps leads nowhere: by sweeps from the straight line, else by
+ * Newton's iteration. */
+static int solve_again(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report, double *workspace)
 {
-  long long steps = *guess;
-  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
-  if (status != TWO_POINT_PENDULUM_OK && steps > 0) {
-    steps = 0;
+  long long steps = 0;
+  int status = TWO_POINT_PENDULUM_NOT_CONVERGED;
+  if (*guess > 0)
     status = sweep(step, data, memory, &steps, dq, dp, options, report);
-  }
   if (status != TWO_POINT_PENDULUM_OK) {
     const newton_data newtons = newton_in(workspace);
     int keep;
@@ -902,6 +900,18 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
   }
   if (status == TWO_POINT_PENDULUM_OK)
     *guess = steps;
+  return status;
+}
+
+/* The increments by sweeps. On success guess says from how many steps the next is continued. */
+static inline __attribute__((always_inline)) int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const two_point_pendulum_options *options, two_point_pendulum_report *report, double *workspace)
+{
+  long long steps = *guess;
+  const int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != TWO_POINT_PENDULUM_OK)
+    return solve_again(step, data, memory, guess, dq, dp, options, report, workspace);
+  *guess = steps;
   return status;
 }
 #else
@@ -979,6 +989,27 @@ void two_point_pendulum_start(two_point_pendulum_run *run, double t, double h, c
   memcpy(run->p, p, sizeof(double) * M);
 }
 
+/* What a step changes, at hand while a call lasts. */
+typedef struct {
+  double q[M], p[M], carry_q[M], carry_p[M];
+} state;
+
+static void load_state(const two_point_pendulum_run *run, state *now)
+{
+  memcpy(now->q, run->q, sizeof now->q);
+  memcpy(now->p, run->p, sizeof now->p);
+  memcpy(now->carry_q, run->carry_q, sizeof now->carry_q);
+  memcpy(now->carry_p, run->carry_p, sizeof now->carry_p);
+}
+
+static void save_state(const state *now, two_point_pendulum_run *run)
+{
+  memcpy(run->q, now->q, sizeof now->q);
+  memcpy(run->p, now->p, sizeof now->p);
+  memcpy(run->carry_q, now->carry_q, sizeof now->carry_q);
+  memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
+}
+
 /* x += increment, with what rounding cuts off in carry (Kahan). */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
@@ -994,13 +1025,15 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     two_point_pendulum_report *report, double *workspace)
 {
   const two_point_pendulum_options standard = two_point_pendulum_default_options();
-  step_data step = {run->t0, run->h, run->q, run->p, run->carry_q, run->carry_p, parameters, workspace, 1};
+  state now;
+  step_data step = {run->t0, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1};
   two_point_pendulum_report unread;
   solver_data data;
   long long stored = 0;
   double dq[M], dp[M];
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
+  load_state(run, &now);
   prepare(&step, &data);
   for (long long k = 0; k < steps; k++) {
     const long long before = report->iterations;
@@ -1009,22 +1042,25 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
-    if (status != TWO_POINT_PENDULUM_OK)
+    if (status != TWO_POINT_PENDULUM_OK) {
+      save_state(&now, run);
       return status;
-    add_compensated(run->q, run->carry_q, dq);
-    add_compensated(run->p, run->carry_p, dp);
+    }
+    add_compensated(now.q, now.carry_q, dq);
+    add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;
     run->step++;
     report->steps++;
     if (run->step % every == 0) {
       t[stored] = run->t0 + (double)run->step * run->h;
-      memcpy(q + stored * M, run->q, sizeof(double) * M);
-      memcpy(p + stored * M, run->p, sizeof(double) * M);
+      memcpy(q + stored * M, now.q, sizeof(double) * M);
+      memcpy(p + stored * M, now.p, sizeof(double) * M);
       iterations[stored] = (int)run->iterations;
       run->iterations = 0;
       stored++;
     }
   }
+  save_state(&now, run);
   return TWO_POINT_PENDULUM_OK;
 }
 

@@ -53,10 +53,11 @@ def compile_stepper(
     Args:
         system: what moves.
         method: how its motion is discretised.
-        solver: of the stage equations: ``"fixed-point"`` (fast, points as vector lanes; for SVI with as many points as
-            the degree, Runge-Kutta methods, and every SVI and SC of a separable system), ``"newton"`` (always, also for
-            stiff systems and large steps), ``"explicit"`` (Stoermer-Verlet and compositions on separable systems) or
-            ``"auto"``: explicit or fixed point where there is one, Newton where it fails.
+        solver: of the stage equations: ``"fixed-point"`` (fast, points as vector lanes; for every method of at most 32
+            points on every system, but variational SCVI with more than 8 coordinates, and SVI with fewer points than
+            the degree), ``"newton"`` (always, also for stiff systems and large steps), ``"explicit"`` (Stoermer-Verlet
+            and compositions on separable systems) or ``"auto"``: explicit or fixed point where there is one, Newton
+            where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 

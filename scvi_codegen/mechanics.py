@@ -13,6 +13,7 @@ from scvi_codegen.system import LagrangianSystem
 
 __all__ = [
     "accelerations",
+    "applied_force",
     "energy",
     "euler_lagrange",
     "force",
@@ -68,6 +69,12 @@ def euler_lagrange(system: LagrangianSystem) -> tuple[sympy.Expr, ...]:
     for (i, j), slope in jacobian(p, variables).items():
         terms[i].append(slope * rates[j])
     return tuple(sympy.Add(*row) for row in terms)
+
+
+def applied_force(system: LagrangianSystem) -> tuple[sympy.Expr, ...]:
+    """F = L_q - L_vq v - L_vt, m expressions in (q, v, t), equal to L_vv a on trajectories."""
+    at_rest = dict.fromkeys(accelerations(system), sympy.S.Zero)
+    return tuple(-residual.xreplace(at_rest) for residual in euler_lagrange(system))
 
 
 def multiplied_residual(system: LagrangianSystem) -> sympy.Expr:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
 __all__ = [
+    "CollocationSweep",
     "Constant",
     "CoupledSweep",
     "Expression",
@@ -22,7 +23,10 @@ __all__ = [
     "Kernel",
     "LaneTable",
     "Load",
+    "NodeTables",
     "Operation",
+    "PointTables",
+    "PrintedEnds",
     "Program",
     "ScatterLoop",
     "SeparableSweep",
@@ -329,7 +333,76 @@ class CoupledSweep:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShootingSweep:
+class NodeTables:
+    """Curves given by v0 and z = h a: V = v0 + A z and q = q0 + h A V at the nodes; all padded to whole vectors.
+
+    Attributes:
+        count: of the nodes; lanes beyond repeat the last and have weight 0.
+        abscissae: c_n, where time stands.
+        collocation: A.
+        end: b, q1 = q0 + h sum b V and v1 = v0 + sum b z.
+        mask: 1 for nodes.
+        guess: from z of former steps to z.
+    """
+
+    count: int
+    abscissae: tuple[float, ...]
+    collocation: LaneTable
+    end: tuple[float, ...]
+    mask: tuple[float, ...]
+    guess: GuessTables
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointTables:
+    """Quadrature points on such a curve: q = q0 + h a V and v = l V, V the velocities at the nodes.
+
+    Attributes:
+        abscissae: c_n, where time stands.
+        position, velocity: a, l.
+        action: L_q and L_v at (q, v, t).
+    """
+
+    abscissae: tuple[float, ...]
+    position: LaneTable
+    velocity: LaneTable
+    action: Kernel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurveSweep:
+    """What the two iterations on accelerations have in common.
+
+    Attributes:
+        nodes, points: of the curve, and of a quadrature along it where there is one.
+        kernel: at the nodes.
+        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+    """
+
+    lanes: int
+    nodes: NodeTables
+    points: PointTables | None
+    kernel: Kernel
+    mass_entries: tuple[tuple[int, int], ...]
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes."""
+        return (self.kernel, self.points.action) if self.points else (self.kernel,)
+
+    @property
+    def guess(self) -> GuessTables:
+        """That of the accelerations."""
+        return self.nodes.guess
+
+    @property
+    def diagonal(self) -> bool:
+        """Whether the mass matrix is diagonal."""
+        return all(i == j for i, j in self.mass_entries)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShootingSweep(CurveSweep):
     """The fixed-point iteration of a shooting-based variational method; tables padded to ``lanes`` rows.
 
     Unknowns: v0, the scaled accelerations z_i = h a_i at the nodes and the scaled multipliers m_i. With
@@ -339,55 +412,67 @@ class ShootingSweep:
         gamma = h a^T w L_q + l^T w L_v + h (m . E)_v + h^2 A^T (m . E)_q - b p1,
         v0 -= M^-1 sum gamma,                m = -M^-1 A^T (gamma - l^T w sum gamma).
 
+    The kernel: E, (m . E)_q, (m . E)_v and the mass at (q, V, a, m, t).
+
     Attributes:
-        points, nodes: how many of each; lanes beyond repeat the last and have weight 0.
-        node_abscissae, abscissae: (lanes,) times.
-        collocation: A; position, velocity: a, l; their transposes act on what is gathered back.
-        weights: (lanes,) w; end: (lanes,) b; consistency: (lanes,) l^T w; mask: (lanes,) 1 for nodes.
-        guess: from z of former steps to z.
-        kernel: E, (m . E)_q, (m . E)_v and the mass at (q, V, a, m, t).
-        action: L_q and L_v at (q, v, t).
-        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+        collocation_transposed, position_transposed, velocity_transposed: A^T, a^T, l^T.
+        weights: (lanes,) w; consistency: (lanes,) l^T w.
     """
 
-    points: int
-    nodes: int
-    lanes: int
-    node_abscissae: tuple[float, ...]
-    abscissae: tuple[float, ...]
-    collocation: LaneTable
     collocation_transposed: LaneTable
-    position: LaneTable
     position_transposed: LaneTable
-    velocity: LaneTable
     velocity_transposed: LaneTable
     weights: tuple[float, ...]
-    end: tuple[float, ...]
     consistency: tuple[float, ...]
-    mask: tuple[float, ...]
-    guess: GuessTables
-    kernel: Kernel
-    action: Kernel
-    mass_entries: tuple[tuple[int, int], ...]
 
     kind: ClassVar[str] = "shooting"
 
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Those with lanes."""
-        return (self.kernel, self.action)
-
-    @property
-    def diagonal(self) -> bool:
-        """Whether the mass matrix is diagonal."""
-        return all(i == j for i, j in self.mass_entries)
-
     def memory(self, dimension: int) -> int:
-        """Z of the last two steps, m and v0."""
+        """Z of the last two steps, v0 and m."""
         return dimension * (3 * self.lanes + 1)
 
 
-Sweep: TypeAlias = SeparableSweep | CoupledSweep | ShootingSweep
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrintedEnds:
+    """Momenta at both ends of a curve by quadrature, as the paper prints them; all (lanes,).
+
+        p0 = -sum (h start_force L_q + start_momentum L_v),     p1 = p0 + sum (h end_force L_q + end_momentum L_v).
+
+    Attributes:
+        start_force, start_momentum: w l_0 and w l_0', l_0 of the first node.
+        end_force, end_momentum: w (l_0 + l_s) and w (l_0' + l_s').
+    """
+
+    start_force: tuple[float, ...]
+    start_momentum: tuple[float, ...]
+    end_force: tuple[float, ...]
+    end_momentum: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollocationSweep(CurveSweep):
+    """A fixed-point iteration on accelerations: the Euler-Lagrange equations at the nodes of a curve from q0.
+
+    With V = v0 + A z and q = q0 + h A V at the nodes, z = h M^-1 (L_q - L_vq V - L_vt) until nothing moves. Without
+    ``ends``, p0 and p1 are L_v at the ends of the curve, and v0 is known; with them they are sums over the points, and
+    v0 is corrected after z by M^-1 times the misfit of p0.
+
+    The kernel: L_q - L_vq V - L_vt and the mass at (q, V, t).
+
+    Attributes:
+        ends: of the printed form, ``None`` for spectral collocation and Runge-Kutta methods.
+    """
+
+    ends: PrintedEnds | None
+
+    kind: ClassVar[str] = "collocation"
+
+    def memory(self, dimension: int) -> int:
+        """Z of the last two steps and v0."""
+        return dimension * (2 * self.lanes + 1)
+
+
+Sweep: TypeAlias = SeparableSweep | CoupledSweep | ShootingSweep | CollocationSweep
 """A fixed-point iteration; ``kind`` says which."""
 
 

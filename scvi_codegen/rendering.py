@@ -155,6 +155,7 @@ def _purposes(program: Program) -> dict[str, str]:
         "force_lanes": "L_q at all points.",
         "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
         "action_lanes": "L_q and L_v at all points, u = (q, v).",
+        "applied_force_lanes": "L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
         "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
     }
     for family in program.families:

@@ -10,20 +10,18 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
+from scvi_codegen.curves import node_tables, point_tables
 from scvi_codegen.derivatives import gradient
 from scvi_codegen.lowering import lower_kernel
 from scvi_codegen.mechanics import (
     accelerations,
     euler_lagrange,
-    force,
     mass_entries,
-    momentum,
     multiplied_residual,
     multipliers,
 )
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
-from scvi_codegen.precision import mp
+from scvi_codegen.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
 from scvi_codegen.program import Kernel, ShootingSweep
 from scvi_codegen.system import LagrangianSystem
 
@@ -36,33 +34,22 @@ LARGEST_DIMENSION = 8
 def shooting_sweep(system: LagrangianSystem, method: SCVI) -> ShootingSweep | None:
     """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
     tableau, rule = method.tableau, method.rule
-    nodes, points = len(tableau.b), len(rule)
-    lanes = lane_count(max(nodes, points))
+    lanes = lane_count(max(len(tableau.b), len(rule)))
     if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
         return None
     position = cardinal_integrals(tableau.c, rule.abscissae, 0)
     velocity = cardinal_values(tableau.c, rule.abscissae)
     kernel, entries = _node_kernel(system)
-    guess = guess_tables(tableau.c, lanes)
     return ShootingSweep(
-        points=points,
-        nodes=nodes,
         lanes=lanes,
-        node_abscissae=pad_vector(tableau.c, lanes, repeat=True),
-        abscissae=pad_vector(rule.abscissae, lanes, repeat=True),
-        collocation=pad_matrix(tableau.A, lanes),
+        nodes=node_tables(tableau, lanes),
+        points=point_tables(system, tableau, rule, lanes),
         collocation_transposed=pad_matrix(transpose(tableau.A), lanes),
-        position=pad_matrix(position, lanes),
         position_transposed=pad_matrix(transpose(position), lanes),
-        velocity=pad_matrix(velocity, lanes),
         velocity_transposed=pad_matrix(transpose(velocity), lanes),
         weights=pad_vector(rule.unit_weights, lanes),
-        end=pad_vector(tableau.b, lanes, repeat=True),
         consistency=pad_vector(matrix_product((rule.unit_weights,), velocity)[0], lanes, repeat=True),
-        mask=pad_vector((mp.one,) * nodes, lanes),
-        guess=guess,
         kernel=kernel,
-        action=_action_kernel(system),
         mass_entries=entries,
     )
 
@@ -81,13 +68,3 @@ def _node_kernel(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, int
         slopes=tuple(mass.values()),
     )
     return kernel, tuple(mass)
-
-
-def _action_kernel(system: LagrangianSystem) -> Kernel:
-    return lower_kernel(
-        "action_lanes",
-        arguments=(*system.coordinates, *system.velocities),
-        time=system.time,
-        parameters=system.parameters,
-        values=(*force(system), *momentum(system)),
-    )

@@ -2,16 +2,19 @@
 
 All of them iterate on kernels at points that are the lanes of one vector, without a Newton matrix:
 :mod:`~scvi_codegen.separable_sweep` on positions, :mod:`~scvi_codegen.coupled_sweep` on velocities,
-:mod:`~scvi_codegen.shooting_sweep` on accelerations and multipliers.
+:mod:`~scvi_codegen.collocation_sweep` on accelerations, :mod:`~scvi_codegen.shooting_sweep` on accelerations and
+multipliers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from scvi_codegen.collocation_sweep import position_sweep, printed_sweep
 from scvi_codegen.coupled_sweep import coupled_sweep
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics import is_separable
+from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.program import Splitting, Sweep
@@ -25,12 +28,15 @@ __all__ = ["check_solver", "sweep_of"]
 
 def sweep_of(system: LagrangianSystem, method: Method) -> Sweep | None:
     """The fixed-point iteration of a method for a system, or ``None`` where there is none."""
-    if isinstance(method, SCVI) and method.variational and method.degree > 1:
-        return shooting_sweep(system, method)
+    if isinstance(method, SCVI) and method.degree > 1:
+        return shooting_sweep(system, method) if method.variational else printed_sweep(system, method)
+    separable = is_separable(system)
+    if isinstance(method, RungeKutta | SpectralCollocation) and method.form == "position" and not separable:
+        return position_sweep(system, method.tableau)
     tables = velocity_tables(system, method)
     if tables is None:
         return None
-    return separable_sweep(system, tables) if is_separable(system) else coupled_sweep(system, tables)
+    return separable_sweep(system, tables) if separable else coupled_sweep(system, tables)
 
 
 def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:
@@ -42,5 +48,5 @@ def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sw
     if solver == "fixed-point" and found is None:
         raise MethodError(
             f"{method.name} has no fixed-point iteration for this system; use solver='auto' or 'newton', "
-            "or an SVI with as many quadrature points as its degree"
+            "or at most 32 points, for an SVI at least as many as its degree, for a variational SCVI 8 coordinates"
         )

@@ -102,6 +102,11 @@ SOLVED_BOTH_WAYS = (
     ("relativistic-particle", Gauss(2)),
     ("driven-duffing", RadauIA(3)),
     ("charged-particle", StoermerVerlet()),
+    ("double-pendulum", SpectralCollocation(3)),
+    ("pumped-cart-pole", SCVI(3, "gauss-legendre:4", variational=False)),
+    ("kepler", SCVI(2, variational=False)),
+    ("charged-particle", RadauIA(2, form="position")),
+    ("relativistic-particle", LobattoIIIA(3, form="position")),
 )
 
 

@@ -58,6 +58,9 @@ METHODS = {
 }
 
 
+TUNED = (SVI(3), Gauss(5), SpectralCollocation(4), SCVI(5, variational=False))
+
+
 def bare_oscillator() -> LagrangianSystem:
     return LagrangianSystem.from_text(
         name="bare oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", parameters={}
@@ -153,8 +156,8 @@ def test_headers_serve_c_plus_plus(tmp_path):
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_path):
-    methods = (SVI(2), Gauss(3), StoermerVerlet())
-    names = ("kepler", "driven-duffing")
+    methods = (SVI(2), Gauss(3), StoermerVerlet(), SpectralCollocation(2), SCVI(3, variational=False))
+    names = ("kepler", "driven-duffing", "pumped-cart-pole")
     sources = [generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
     files = write(sources, tmp_path)
     run([tool(compiler), *C99, "-c", *files], tmp_path)
@@ -164,7 +167,7 @@ def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_pa
 def test_tuned_builds_compile_without_a_warning(compiler, tmp_path):
     """With the vector instructions of this processor, and with glibc's vector functions where those are."""
     names = ("double-pendulum", "driven-duffing")
-    sources = [generate_source(systems()[name], method)[0] for method in (SVI(3), Gauss(5)) for name in names]
+    sources = [generate_source(systems()[name], method)[0] for method in TUNED for name in names]
     files = write(sources, tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
         run([tool(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
@@ -175,7 +178,8 @@ def test_tuned_builds_compile_without_a_warning(compiler, tmp_path):
 FINGERPRINT = """
 import hashlib
 from test_c_text import METHODS, generated
-for method in ("svi-1-gauss-legendre-1", "scvi-2-chebyshev-lobatto-gauss-legendre-2", "gauss-2"):
+names = "svi-1-gauss-legendre-1", "scvi-2-chebyshev-lobatto-gauss-legendre-2", "gauss-2", "sc-3-chebyshev-lobatto"
+for method in names:
     for name, (source, interface) in generated(method).items():
         text = source.header + source.code + source.declarations + interface.to_json()
         print(method, name, hashlib.sha256(text.encode()).hexdigest())
@@ -195,7 +199,7 @@ def test_text_is_the_same_in_every_process(tmp_path):
         for seed in (0, 1, 4242)
     ]
     first, *others = [process.communicate()[0] for process in processes]
-    assert first.count("\n") == 3 * len(systems())
+    assert first.count("\n") == 4 * len(systems())
     assert others == [first] * len(others)
 
 

@@ -29,7 +29,8 @@ FLOORS = """
     methods
     equations lowering c_printer
     velocity_tables padding splitting rendering building
-    separable_sweep coupled_sweep shooting_sweep
+    curves
+    separable_sweep coupled_sweep collocation_sweep shooting_sweep
     sweeps
     trajectory
     binding text_cache

@@ -15,7 +15,15 @@ from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.problems import problem
 
-METHODS = (SVI(3), SCVI(3), SpectralCollocation(2), RadauIIA(2), StoermerVerlet(), ExplicitEuler())
+METHODS = (
+    SVI(3),
+    SCVI(3),
+    SCVI(2, variational=False),
+    SpectralCollocation(2),
+    RadauIIA(2),
+    StoermerVerlet(),
+    ExplicitEuler(),
+)
 SYMMETRIC = (SVI(3), SVI(2, "gauss-lobatto:3"), StoermerVerlet(), Gauss(2))
 WITH_ACTION = (SVI(2, "gauss-legendre:3"), SCVI(3), Gauss(2), StoermerVerlet())
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
