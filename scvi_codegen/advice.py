@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
@@ -22,6 +23,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.pilot import STEEP, Pilot, launch
+from scvi_codegen.stepper import Stepper
 from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["Advice", "Evidence", "advise"]
@@ -35,6 +37,8 @@ ORDER_MARGIN = 0.3
 LANES = 8
 OVERHEAD = 3.0
 """Cost of a step beside its iterations, in iterations."""
+MUCH_LESS = 0.9
+"""Part of the work by which a shorter step is preferred to the longest."""
 NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
 """Positions at points of steps in one pilot run, as far as that makes neither fewer nor more steps than these."""
 
@@ -129,22 +133,32 @@ def advise(
     found: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
     for candidate in _candidates(method) if degree else [method]:
-        stepper = compile_stepper(system, candidate, solver=solver)
-        start = stepper.start(q, p, h=1.0, t=t, parameters=parameters).q  # checks them
-        integrate = partial(stepper.integrate, p=p, t=t, parameters=parameters, options=options)
         points = _points(candidate)
-        most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
-        try:
-            pilot = launch(integrate, candidate, start, length, goal=target / SAFETY, most=most)
-        except StateError as failure:
-            failures.append(failure)
-        else:
+        most = min(max(FEWEST, NUMBERS // (points * system.dimension)), MOST)
+        for stepper in _steppers(system, candidate, solver):
+            start = stepper.start(q, p, h=1.0, t=t, parameters=parameters).q  # checks them
+            integrate = partial(stepper.integrate, p=p, t=t, parameters=parameters, options=options)
+            try:
+                pilot = launch(integrate, candidate, start, length, goal=target / SAFETY, most=most)
+            except StateError as failure:
+                failures.append(failure)
+                continue
             choice = _choose(pilot, target)
             found.append((_cost(pilot, choice.n, points), _advice(pilot, choice, candidate)))
+            if choice.error <= target:
+                break
     if not found:
         raise failures[-1]
     met = [pair for pair in found if pair[1].expected_error <= target]
     return min(met, key=lambda pair: pair[0])[1] if met else min(found, key=lambda pair: pair[1].expected_error)[1]
+
+
+def _steppers(system: LagrangianSystem, method: Method, solver: str) -> Iterator[Stepper]:
+    """That asked for; but for ``"auto"`` first the fixed point alone, whose limit of h a good step should keep to."""
+    if solver == "auto":
+        with suppress(MethodError):
+            yield compile_stepper(system, method, solver="fixed-point")
+    yield compile_stepper(system, method, solver=solver)
 
 
 def _candidates(method: Method) -> list[Method]:
@@ -183,7 +197,7 @@ def _choose(pilot: Pilot, tolerance: float) -> _Choice:
     """The longest step that meets the tolerance, or that rounding makes as good as any shorter one."""
     floor, (coarse, fine) = pilot.floor_at_end, pilot.judged[-2:]
     goal = max(tolerance / SAFETY, 2.0 * floor)
-    n = _bisected(pilot, goal)
+    n = _cheapest(pilot, _bisected(pilot, goal))
     if n is not None or (pilot.rate and floor > tolerance):
         n = n or fine
         return _Choice(n, min(1.0, pilot.error(n)), tuple(_doubts(pilot, tolerance, n)))
@@ -230,6 +244,15 @@ def _bisected(pilot: Pilot, goal: float) -> int | None:
         pilot.run(middle)
         worse, best = (worse, middle) if pilot.error(middle) <= goal else (middle, best)
     return best
+
+
+def _cheapest(pilot: Pilot, n: int | None) -> int | None:
+    """n, or more steps that need much less work: near the limit of the fixed point a step needs many sweeps."""
+    if n is None:
+        return None
+    work = {k: k * (pilot.legs[k].iterations + OVERHEAD) for k in pilot.judged if k >= n}
+    best = min(work, key=work.__getitem__)
+    return best if work[best] < MUCH_LESS * work[n] else n
 
 
 def _sampled(n: float) -> int:

@@ -1,8 +1,8 @@
 /* Gauss's method of eight stages for q'' = f(q), written by hand for one problem, to compare generated code with.
  *
  * The stages are the lanes of a vector. Sweeps X <- q + h c v + h^2 (A A) f(X) start from the forces of the last step or
- * two, continued as a polynomial; the last evaluation and the update have all digits of coefficients and of h^2, so that
- * the rounded method is symplectic too. Sums are compensated.
+ * two, continued as a polynomial; the last evaluation and the update have all digits of coefficients and of powers of h,
+ * small terms first, so that the rounded method is symplectic too. Sums are compensated.
  *
  * The header holds the constants C, AA, B and BB = b A with their low parts, ALONE, LAST and BEFORE (forces of past steps to
  * AA times those of the next; tables by columns) and, for the pendulum, the macro PENDULUM; else the problem is Kepler's. */
@@ -85,18 +85,22 @@ static inline void add(double *x, double *carry, double increment)
 long hand_written(double *q, double *v, double strength, double h, long steps, long every, double *out)
 {
   const double h2 = h * h, h2_low = fma(h, h, -h2);
-  lanes aa[S], x[M], f[M], before[M], base[M];
-  double cut_q[M] = {0}, cut_v[M] = {0}, first = 1.0;
+  const lanes hb = h * B;
+  lanes aa[S], hb_low, x[M], f[M], before[M], base[M];
+  double drift[M], drift_low[M], cut_q[M] = {0}, cut_v[M] = {0}, first = 1.0;
   long sweeps = 0;
-  for (int n = 0; n < S; n++)
+  for (int n = 0; n < S; n++) {
     aa[n] = h2 * AA[n];
+    hb_low[n] = fma(h, B[n], -hb[n]) + h * B_LOW[n];
+  }
   for (long step = 1; step <= steps; step++) {
     double last = INFINITY, size = 0.0;
     int count = 0, done = 0;
     for (int i = 0; i < M; i++) {
-      const double drift = h * v[i];
-      base[i] = x[i] = q[i] + (C * drift + (C_LOW * drift + cut_q[i]));
-      size += q[i] * q[i] + drift * drift;
+      drift[i] = h * v[i];
+      drift_low[i] = fma(h, v[i], -drift[i]) + h * cut_v[i];
+      base[i] = x[i] = q[i] + C * drift[i];
+      size += q[i] * q[i] + drift[i] * drift[i];
       if (step > 1) {
         const lanes guess = step > 2 && first < 1e-6 ? apply(LAST, f[i]) + apply(BEFORE, before[i]) : apply(ALONE, f[i]);
         before[i] = f[i];
@@ -115,21 +119,22 @@ long hand_written(double *q, double *v, double strength, double h, long steps, l
       force(strength, x, f);
       change = total(squares) / size;
       ratio = count ? fmin(fmax(change / last, 1e-6), 0.25) : 1.0;
-      done = 4.0 * ratio * ratio * change <= 0x1p-104 || (count && change >= 0.0625 * last && change < 1e-25);
+      done = 16.0 * ratio * ratio * change <= 0x1p-104 || (count && change >= 0.0625 * last && change < 1e-25);
       first = count ? first : change;
       last = change;
       if (++count == MOST_SWEEPS || !(change < INFINITY))
         return -1;
     }
     for (int i = 0; i < M; i++) {
-      const lanes sum = apply(AA, f[i]) + apply(AA_LOW, f[i]);
-      x[i] = base[i] + (h2 * sum + h2_low * sum);
+      const lanes sum = apply(AA, f[i]), low = apply(AA_LOW, f[i]);
+      const lanes small = cut_q[i] + C * drift_low[i] + C_LOW * drift[i] + (h2 * low + h2_low * sum);
+      x[i] = q[i] + ((C * drift[i] + small) + h2 * sum);
     }
     force(strength, x, f);
     for (int i = 0; i < M; i++) {
       const double sum = total(BB * f[i] + BB_LOW * f[i]);
-      add(q + i, cut_q + i, h * v[i] + (h2 * sum + (h2_low * sum + h * cut_v[i])));
-      add(v + i, cut_v + i, h * total(B * f[i] + B_LOW * f[i]));
+      add(q + i, cut_q + i, drift[i] + (drift_low[i] + (h2 * sum + h2_low * sum)));
+      add(v + i, cut_v + i, total(hb * f[i] + hb_low * f[i]));
     }
     sweeps += count;
     if (step % every == 0)
