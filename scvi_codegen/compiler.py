@@ -21,10 +21,10 @@ from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
 from scvi_codegen.rendering import render, render_ensemble, workspace_size
+from scvi_codegen.solvers.choice import check_solver, sweep_of
+from scvi_codegen.solvers.splitting import splitting_of
 from scvi_codegen.source import Interface, Source
-from scvi_codegen.splitting import splitting_of
 from scvi_codegen.stepper import Stepper
-from scvi_codegen.sweeps import check_solver, sweep_of
 from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.text_cache import Texts, remembered_texts
 

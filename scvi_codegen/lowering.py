@@ -296,8 +296,8 @@ def lower(
     Args:
         system, method: what is lowered.
         prefix: a C identifier.
-        sweep: the fixed-point iteration to try first (:func:`scvi_codegen.sweeps.sweep_of`).
-        splitting: the explicit solver that replaces both (:func:`scvi_codegen.splitting.splitting_of`).
+        sweep: the fixed-point iteration to try first (:func:`scvi_codegen.solvers.choice.sweep_of`).
+        splitting: the explicit solver that replaces both (:func:`scvi_codegen.solvers.splitting.splitting_of`).
         newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
     """
     stages = method.stage_system(system)

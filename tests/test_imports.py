@@ -28,10 +28,11 @@ FLOORS = """
     methods.shooting
     methods
     equations lowering c_printer
-    velocity_tables padding splitting rendering building
-    curves
-    separable_sweep coupled_sweep collocation_sweep shooting_sweep
-    sweeps
+    solvers.velocity_tables solvers.padding solvers.splitting rendering building
+    solvers.curve_tables
+    solvers.separable solvers.coupled solvers.collocation solvers.shooting
+    solvers.choice
+    solvers
     trajectory
     binding text_cache
     run ensemble

@@ -5,10 +5,10 @@ from __future__ import annotations
 from scvi_codegen.basis import cardinal_integrals, cardinal_values
 from scvi_codegen.lowering import lower_kernel
 from scvi_codegen.mechanics import force, momentum
-from scvi_codegen.padding import guess_tables, pad_matrix, pad_vector
 from scvi_codegen.precision import mp
 from scvi_codegen.program import NodeTables, PointTables
 from scvi_codegen.quadrature import Quadrature
+from scvi_codegen.solvers.padding import guess_tables, pad_matrix, pad_vector
 from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import Tableau
 

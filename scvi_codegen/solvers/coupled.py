@@ -15,11 +15,11 @@ from scvi_codegen.basis import transpose
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.lowering import lower_kernel
 from scvi_codegen.mechanics import force, momentum
-from scvi_codegen.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.precision import Matrix, Vector, mp
 from scvi_codegen.program import CoupledSweep, Kernel
+from scvi_codegen.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
+from scvi_codegen.solvers.velocity_tables import VelocityTables
 from scvi_codegen.system import LagrangianSystem
-from scvi_codegen.velocity_tables import VelocityTables
 
 __all__ = ["coupled_sweep"]
 

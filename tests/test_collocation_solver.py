@@ -16,7 +16,7 @@ from scvi_codegen.methods import (
     RadauIIA,
     SpectralCollocation,
 )
-from scvi_codegen.sweeps import sweep_of
+from scvi_codegen.solvers.choice import sweep_of
 
 POSITION = (
     SpectralCollocation(1),

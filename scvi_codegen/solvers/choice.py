@@ -1,8 +1,8 @@
 """Which fixed-point solver serves a method and a system.
 
 All of them iterate on kernels at points that are the lanes of one vector, without a Newton matrix:
-:mod:`~scvi_codegen.separable_sweep` on positions, :mod:`~scvi_codegen.coupled_sweep` on velocities,
-:mod:`~scvi_codegen.collocation_sweep` on accelerations, :mod:`~scvi_codegen.shooting_sweep` on accelerations and
+:mod:`~scvi_codegen.solvers.separable` on positions, :mod:`~scvi_codegen.solvers.coupled` on velocities,
+:mod:`~scvi_codegen.solvers.collocation` on accelerations, :mod:`~scvi_codegen.solvers.shooting` on accelerations and
 multipliers.
 """
 
@@ -10,18 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from scvi_codegen.collocation_sweep import position_sweep, printed_sweep
-from scvi_codegen.coupled_sweep import coupled_sweep
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics import is_separable
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.program import Splitting, Sweep
-from scvi_codegen.separable_sweep import separable_sweep
-from scvi_codegen.shooting_sweep import shooting_sweep
+from scvi_codegen.solvers.collocation import position_sweep, printed_sweep
+from scvi_codegen.solvers.coupled import coupled_sweep
+from scvi_codegen.solvers.separable import separable_sweep
+from scvi_codegen.solvers.shooting import shooting_sweep
+from scvi_codegen.solvers.velocity_tables import velocity_tables
 from scvi_codegen.system import LagrangianSystem
-from scvi_codegen.velocity_tables import velocity_tables
 
 __all__ = ["check_solver", "sweep_of"]
 

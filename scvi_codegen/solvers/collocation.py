@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from scvi_codegen.basis import cardinal_slopes, cardinal_values
-from scvi_codegen.curves import node_tables, point_tables
 from scvi_codegen.lowering import lower_kernel
 from scvi_codegen.mechanics import applied_force, mass_entries
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.padding import MOST_LANES, lane_count, pad_vector
 from scvi_codegen.precision import Number
 from scvi_codegen.program import CollocationSweep, Kernel, PrintedEnds
+from scvi_codegen.solvers.curve_tables import node_tables, point_tables
+from scvi_codegen.solvers.padding import MOST_LANES, lane_count, pad_vector
 from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import Tableau
 

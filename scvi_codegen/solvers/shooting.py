@@ -10,7 +10,6 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
-from scvi_codegen.curves import node_tables, point_tables
 from scvi_codegen.derivatives import gradient
 from scvi_codegen.lowering import lower_kernel
 from scvi_codegen.mechanics import (
@@ -21,8 +20,9 @@ from scvi_codegen.mechanics import (
     multipliers,
 )
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
 from scvi_codegen.program import Kernel, ShootingSweep
+from scvi_codegen.solvers.curve_tables import node_tables, point_tables
+from scvi_codegen.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
 from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["shooting_sweep"]
