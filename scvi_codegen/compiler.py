@@ -2,6 +2,7 @@
 
     LagrangianSystem, Method
       -> derive    StepEquations   the equations as the paper prints them, to look at (:mod:`scvi_codegen.equations`)
+      -> solvers   Sweep           a solver without a matrix, where there is one (:mod:`scvi_codegen.solvers`)
       -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)
       -> render    Source          header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering`)
       -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
