@@ -1407,12 +1407,13 @@ static void save_state(const state *now, kepler_scvi_2_run *run)
   memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
-/* x += increment, with what rounding cuts off in carry (Kahan). */
+/* x += increment, with what rounding cuts off in carry: Kahan's sum with Knuth's error of an addition, right also where x
+ * is smaller than its increment. */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
   for (int i = 0; i < M; i++) {
-    const double term = increment[i] + carry[i], sum = x[i] + term;
-    carry[i] = term - (sum - x[i]);
+    const double term = increment[i] + carry[i], sum = x[i] + term, part = sum - x[i];
+    carry[i] = (x[i] - (sum - part)) + (term - part);
     x[i] = sum;
   }
 }
