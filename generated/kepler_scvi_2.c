@@ -1289,6 +1289,8 @@ static int solve_again(const step_data *step, const solver_data *data, double *m
     int keep;
     status = newton_from_line(step, &newtons, dp, &keep, options, report);
     gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
+    memset(dq + M, 0, sizeof(double) * M);
+    memset(dp + M, 0, sizeof(double) * M);
     steps = 0;
   }
   if (status == KEPLER_SCVI_2_OK)
@@ -1359,7 +1361,7 @@ int kepler_scvi_2_step(double t, double h, const double *q0, const double *p0, c
   const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace, 1};
   kepler_scvi_2_report unread;
   solver_data data;
-  double *memory = workspace + SCRATCH, dq[M], dp[M];
+  double *memory = workspace + SCRATCH, dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
   long long guess = 0;
   int status;
   report = report ? report : &unread;
@@ -1371,8 +1373,8 @@ int kepler_scvi_2_step(double t, double h, const double *q0, const double *p0, c
     return status;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
-    q1[i] = q0[i] + dq[i];
-    p1[i] = p0[i] + dp[i];
+    q1[i] = q0[i] + (dq[i] + dq[M + i]);
+    p1[i] = p0[i] + (dp[i] + dp[M + i]);
   }
   return KEPLER_SCVI_2_OK;
 }
@@ -1407,14 +1409,14 @@ static void save_state(const state *now, kepler_scvi_2_run *run)
   memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
-/* x += increment, with what rounding cuts off in carry: Kahan's sum with Knuth's error of an addition, right also where x
- * is smaller than its increment. */
+/* x + carry += increment with its low part, in twice the precision (Knuth's error of an addition, then Dekker's). */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
   for (int i = 0; i < M; i++) {
-    const double term = increment[i] + carry[i], sum = x[i] + term, part = sum - x[i];
-    carry[i] = (x[i] - (sum - part)) + (term - part);
-    x[i] = sum;
+    const double sum = x[i] + increment[i], part = sum - x[i];
+    const double rest = ((x[i] - (sum - part)) + (increment[i] - part)) + (carry[i] + increment[M + i]);
+    x[i] = sum + rest;
+    carry[i] = rest - (x[i] - sum);
   }
 }
 
@@ -1428,7 +1430,7 @@ int kepler_scvi_2_advance(kepler_scvi_2_run *run, long long steps, long long eve
   kepler_scvi_2_report unread;
   solver_data data;
   long long stored = 0;
-  double dq[M], dp[M];
+  double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   load_state(run, &now);

@@ -661,7 +661,7 @@ int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const do
   const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace, 1};
   pendulum_stoermer_verlet_report unread;
   solver_data data;
-  double *memory = workspace + SCRATCH, dq[M], dp[M];
+  double *memory = workspace + SCRATCH, dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
   long long guess = 0;
   int status;
   report = report ? report : &unread;
@@ -673,8 +673,8 @@ int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const do
     return status;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
-    q1[i] = q0[i] + dq[i];
-    p1[i] = p0[i] + dp[i];
+    q1[i] = q0[i] + (dq[i] + dq[M + i]);
+    p1[i] = p0[i] + (dp[i] + dp[M + i]);
   }
   return PENDULUM_STOERMER_VERLET_OK;
 }
@@ -709,14 +709,14 @@ static void save_state(const state *now, pendulum_stoermer_verlet_run *run)
   memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
-/* x += increment, with what rounding cuts off in carry: Kahan's sum with Knuth's error of an addition, right also where x
- * is smaller than its increment. */
+/* x + carry += increment with its low part, in twice the precision (Knuth's error of an addition, then Dekker's). */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
   for (int i = 0; i < M; i++) {
-    const double term = increment[i] + carry[i], sum = x[i] + term, part = sum - x[i];
-    carry[i] = (x[i] - (sum - part)) + (term - part);
-    x[i] = sum;
+    const double sum = x[i] + increment[i], part = sum - x[i];
+    const double rest = ((x[i] - (sum - part)) + (increment[i] - part)) + (carry[i] + increment[M + i]);
+    x[i] = sum + rest;
+    carry[i] = rest - (x[i] - sum);
   }
 }
 
@@ -730,7 +730,7 @@ int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long lon
   pendulum_stoermer_verlet_report unread;
   solver_data data;
   long long stored = 0;
-  double dq[M], dp[M];
+  double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   load_state(run, &now);

@@ -788,9 +788,24 @@ static inline int sweep_status(double change, double last, double tolerance, int
   return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
-/* One step. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; then once more, and the increments, with
- * all digits of the coefficients. Small terms are summed first: added to a rounded sum, they would be rounded away. The
- * forces stay in memory. */
+/* a b + c with one rounding, on which a small c has its say. */
+static inline lanes multiply_add(lanes a, lanes b, lanes c)
+{
+  lane_view x = {a}, y = {b}, z = {c};
+  for (int j = 0; j < LANES; j++)
+    z.lane[j] = fma(x.lane[j], y.lane[j], z.lane[j]);
+  return z.all;
+}
+
+/* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
+static inline lanes sum_of_three(double x, lanes y, lanes rest)
+{
+  const lanes sum = x + y, part = sum - x;
+  return sum + (((x - (sum - part)) + (y - part)) + rest);
+}
+
+/* One step. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest; then once more, and the increments with
+ * their low parts, with all digits of the coefficients. The forces stay in memory. */
 static inline __attribute__((always_inline)) int sweep(const step_data *step, const sweep_data *data, double *memory, long long *steps, double *dq, double *dp,
     const two_point_pendulum_options *options, two_point_pendulum_report *report)
 {
@@ -836,15 +851,18 @@ static inline __attribute__((always_inline)) int sweep(const step_data *step, co
     return last < INFINITY ? TWO_POINT_PENDULUM_NOT_CONVERGED : TWO_POINT_PENDULUM_NOT_FINITE;
   for (int i = 0; i < M; i++) {
     const lanes sum = lanes_apply_at(POINT_PRODUCT, &F[i]), low = lanes_apply_at(POINT_PRODUCT_LOW, &F[i]);
-    const lanes small = step->carry_q[i] + POINT_DRIFT * drift_low[i] + POINT_DRIFT_LOW * drift[i];
-    const lanes rest = data->inverse_mass[i] * (data->square * low + data->square_low * sum);
-    X[i] = step->q0[i] + ((POINT_DRIFT * drift[i] + (small + rest)) + data->inverse_mass[i] * (data->square * sum));
+    const lanes rest = step->carry_q[i] + POINT_DRIFT * drift_low[i] + POINT_DRIFT_LOW * drift[i];
+    X[i] = sum_of_three(step->q0[i], POINT_DRIFT * drift[i] + data->inverse_mass[i] * (data->square * sum),
+        rest + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
   }
   force_lanes(X, step->parameters, F);
   for (int i = 0; i < M; i++) {
-    const double sum = lanes_total(POINT_END_POSITION * F[i] + POINT_END_POSITION_LOW * F[i]);
-    dp[i] = lanes_total(data->weight * F[i] + data->weight_low * F[i]);
-    dq[i] = drift[i] + (drift_low[i] + data->inverse_mass[i] * (data->square * sum + data->square_low * sum));
+    const double sum = lanes_total(multiply_add(POINT_END_POSITION, F[i], POINT_END_POSITION_LOW * F[i]));
+    const double kick = data->inverse_mass[i] * (data->square * sum), part = (drift[i] + kick) - drift[i];
+    dq[i] = drift[i] + kick;
+    dq[M + i] = (drift[i] - (dq[i] - part)) + (kick - part)
+        + (drift_low[i] + data->inverse_mass[i] * (data->square_low * sum));
+    dp[i] = lanes_total(multiply_add(data->weight, F[i], data->weight_low * F[i]));
   }
   if (!all_finite(dq, M) || !all_finite(dp, M))
     return TWO_POINT_PENDULUM_NOT_FINITE;
@@ -896,6 +914,8 @@ static int solve_again(const step_data *step, const solver_data *data, double *m
     int keep;
     status = newton_from_line(step, &newtons, dp, &keep, options, report);
     gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
+    memset(dq + M, 0, sizeof(double) * M);
+    memset(dp + M, 0, sizeof(double) * M);
     steps = 0;
   }
   if (status == TWO_POINT_PENDULUM_OK)
@@ -962,7 +982,7 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
   const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace, 1};
   two_point_pendulum_report unread;
   solver_data data;
-  double *memory = workspace + SCRATCH, dq[M], dp[M];
+  double *memory = workspace + SCRATCH, dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
   long long guess = 0;
   int status;
   report = report ? report : &unread;
@@ -974,8 +994,8 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
     return status;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
-    q1[i] = q0[i] + dq[i];
-    p1[i] = p0[i] + dp[i];
+    q1[i] = q0[i] + (dq[i] + dq[M + i]);
+    p1[i] = p0[i] + (dp[i] + dp[M + i]);
   }
   return TWO_POINT_PENDULUM_OK;
 }
@@ -1010,14 +1030,14 @@ static void save_state(const state *now, two_point_pendulum_run *run)
   memcpy(run->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
-/* x += increment, with what rounding cuts off in carry: Kahan's sum with Knuth's error of an addition, right also where x
- * is smaller than its increment. */
+/* x + carry += increment with its low part, in twice the precision (Knuth's error of an addition, then Dekker's). */
 static void add_compensated(double *x, double *carry, const double *increment)
 {
   for (int i = 0; i < M; i++) {
-    const double term = increment[i] + carry[i], sum = x[i] + term, part = sum - x[i];
-    carry[i] = (x[i] - (sum - part)) + (term - part);
-    x[i] = sum;
+    const double sum = x[i] + increment[i], part = sum - x[i];
+    const double rest = ((x[i] - (sum - part)) + (increment[i] - part)) + (carry[i] + increment[M + i]);
+    x[i] = sum + rest;
+    carry[i] = rest - (x[i] - sum);
   }
 }
 
@@ -1031,7 +1051,7 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
   two_point_pendulum_report unread;
   solver_data data;
   long long stored = 0;
-  double dq[M], dp[M];
+  double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   load_state(run, &now);

@@ -74,11 +74,12 @@ static inline double total(lanes x)
   return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]));
 }
 
-static inline void add(double *x, double *carry, double increment)
+static inline void add(double *x, double *carry, double increment, double low)
 {
-  const double y = increment + *carry, sum = *x + y;
-  *carry = y - (sum - *x);
-  *x = sum;
+  const double sum = *x + increment, part = sum - *x;
+  const double rest = ((*x - (sum - part)) + (increment - part)) + (*carry + low);
+  *x = sum + rest;
+  *carry = rest - (*x - sum);
 }
 
 /* Returns the number of sweeps, or -1 if a step does not converge. */
@@ -128,13 +129,16 @@ long hand_written(double *q, double *v, double strength, double h, long steps, l
     for (int i = 0; i < M; i++) {
       const lanes sum = apply(AA, f[i]), low = apply(AA_LOW, f[i]);
       const lanes small = cut_q[i] + C * drift_low[i] + C_LOW * drift[i] + (h2 * low + h2_low * sum);
-      x[i] = q[i] + ((C * drift[i] + small) + h2 * sum);
+      const lanes y = C * drift[i] + h2 * sum, near = q[i] + y, part = near - q[i];
+      x[i] = near + (((q[i] - (near - part)) + (y - part)) + small);
     }
     force(strength, x, f);
     for (int i = 0; i < M; i++) {
       const double sum = total(BB * f[i] + BB_LOW * f[i]);
-      add(q + i, cut_q + i, drift[i] + (drift_low[i] + (h2 * sum + h2_low * sum)));
-      add(v + i, cut_v + i, total(hb * f[i] + hb_low * f[i]));
+      const double kick = h2 * sum, both = drift[i] + kick, part = both - drift[i];
+      const double cut = (drift[i] - (both - part)) + (kick - part);
+      add(q + i, cut_q + i, both, cut + (drift_low[i] + h2_low * sum));
+      add(v + i, cut_v + i, total(hb * f[i] + hb_low * f[i]), 0.0);
     }
     sweeps += count;
     if (step % every == 0)
