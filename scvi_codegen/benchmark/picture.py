@@ -57,10 +57,20 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
         for method in result.methods():
             handles[method] = _draw_method(panel, result, method, colors[method])
         panel.set(xscale="log", yscale="log", xlabel="time of a trajectory, ms", ylabel="error", title=result.name)
+        _label_times(panel)
     for panel in panels[len(results) :]:
         panel.set_visible(False)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=min(4, len(handles)))
     return figure
+
+
+def _label_times(axes: Axes) -> None:
+    """Times as 0.1, 0.2, 0.5, 1, .. ms, as many as there is room for."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_method(axes: Axes, result: CaseResult, method: str, color: str) -> Artist:
