@@ -39,7 +39,8 @@ PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
 
 CACHE_VARIABLE = "SCVI_CODEGEN_CACHE"
-FLAGS_VARIABLE = "CFLAGS"
+FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
+"""Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
 COMPILE_SECONDS = 600
 _loaded: dict[str, ModuleType] = {}
 
@@ -76,7 +77,7 @@ def find_compiler() -> tuple[str, ...]:
 def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
     """The compiled module of a source, from memory, from the cache or built now.
 
-    Flags in the environment variable ``CFLAGS`` follow, and so override, those given.
+    Flags in the environment variable ``SCVI_CODEGEN_CFLAGS`` follow, and so override, those given.
 
     Returns:
         A cffi module with attributes ``lib`` and ``ffi``.

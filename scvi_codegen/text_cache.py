@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import TypeAlias
 
-from sympy import srepr
+import sympy
 
 from scvi_codegen.building import cache_folder
 from scvi_codegen.methods.method import Method
@@ -47,7 +47,7 @@ def _key(system: LagrangianSystem, method: Method, solver: str, prefix: str | No
     symbols = (*system.coordinates, *system.velocities, *system.parameters, system.time)
     parts = [
         system.name,
-        srepr(system.lagrangian),
+        sympy.srepr(system.lagrangian),
         " ".join(symbol.name for symbol in symbols),
         repr((len(system.coordinates), system.defaults)),
         repr(method),
@@ -60,10 +60,11 @@ def _key(system: LagrangianSystem, method: Method, solver: str, prefix: str | No
 
 @cache
 def _generator() -> str:
-    """Which version of this package, to the file."""
+    """Which version of this package, to the file, and of SymPy, which orders terms."""
     package = Path(__file__).parent
     files = sorted([*package.rglob("*.py"), *template_folder().rglob("*.jinja")])
-    return "\n".join(f"{path} {(stat := path.stat()).st_size} {stat.st_mtime_ns}" for path in files)
+    lines = [f"{path} {(stat := path.stat()).st_size} {stat.st_mtime_ns}" for path in files]
+    return "\n".join([*lines, f"sympy {sympy.__version__}"])
 
 
 def _read(path: Path) -> Texts | None:
