@@ -913,12 +913,12 @@ static const lanes LAST_ALONE[2] = {
   {2.0, 3.0}
 };
 static const lanes LAST[2] = {
-  {-0.75, -2.15},
-  {2.25, 4.05}
+  {-6.0, -20.0},
+  {4.0, 10.0}
 };
 static const lanes BEFORE[2] = {
-  {0.75, 1.95},
-  {-1.25, -2.85}
+  {-1.0, -4.0},
+  {4.0, 15.0}
 };
 
 /* sum_j table[j] x_j of a vector in memory, one after the other. */

@@ -858,7 +858,7 @@ static inline lanes multiply_add(lanes a, lanes b, lanes c)
 }
 
 /* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
-static inline lanes sum_of_three(double x, lanes y, lanes rest)
+static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
 {
   const lanes sum = x + y, part = sum - x;
   return sum + (((x - (sum - part)) + (y - part)) + rest);
@@ -912,7 +912,7 @@ static inline __attribute__((always_inline)) int sweep(const step_data *step, co
   for (int i = 0; i < M; i++) {
     const lanes sum = lanes_apply_at(POINT_PRODUCT, &F[i]), low = lanes_apply_at(POINT_PRODUCT_LOW, &F[i]);
     const lanes rest = step->carry_q[i] + POINT_DRIFT * drift_low[i] + POINT_DRIFT_LOW * drift[i];
-    X[i] = sum_of_three(step->q0[i], POINT_DRIFT * drift[i] + data->inverse_mass[i] * (data->square * sum),
+    X[i] = sum_of_three(lanes_of(step->q0[i]), POINT_DRIFT * drift[i] + data->inverse_mass[i] * (data->square * sum),
         rest + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
   }
   force_lanes(X, step->parameters, F);

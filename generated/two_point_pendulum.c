@@ -664,12 +664,12 @@ static const lanes LAST_ALONE[2] = {
   {0.20534180126147958, 0.7663460352255527}
 };
 static const lanes LAST[2] = {
-  {-0.08851481887425589, -0.33034180126147955},
-  {0.24700846792814624, 0.9218481522075892}
+  {-0.8823714390099914, -3.2930550415329503},
+  {0.4597217081996171, 1.7157047723433247}
 };
 static const lanes BEFORE[2] = {
-  {0.08034180126147955, 0.299839684279443},
-  {-0.13317301761277633, -0.49700846792814624}
+  {-0.13237143900999132, -0.4940169358562924},
+  {0.6606836025229592, 2.4657047723433245}
 };
 
 /* sum_j table[j] x_j of a vector in memory, one after the other. */
@@ -798,7 +798,7 @@ static inline lanes multiply_add(lanes a, lanes b, lanes c)
 }
 
 /* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
-static inline lanes sum_of_three(double x, lanes y, lanes rest)
+static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
 {
   const lanes sum = x + y, part = sum - x;
   return sum + (((x - (sum - part)) + (y - part)) + rest);
@@ -852,7 +852,7 @@ static inline __attribute__((always_inline)) int sweep(const step_data *step, co
   for (int i = 0; i < M; i++) {
     const lanes sum = lanes_apply_at(POINT_PRODUCT, &F[i]), low = lanes_apply_at(POINT_PRODUCT_LOW, &F[i]);
     const lanes rest = step->carry_q[i] + POINT_DRIFT * drift_low[i] + POINT_DRIFT_LOW * drift[i];
-    X[i] = sum_of_three(step->q0[i], POINT_DRIFT * drift[i] + data->inverse_mass[i] * (data->square * sum),
+    X[i] = sum_of_three(lanes_of(step->q0[i]), POINT_DRIFT * drift[i] + data->inverse_mass[i] * (data->square * sum),
         rest + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
   }
   force_lanes(X, step->parameters, F);

@@ -22,6 +22,7 @@ from conftest import sample_named, stepper_for
 
 from scvi_codegen.binding import SolverOptions
 from scvi_codegen.cli import main
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory, integrate_ensemble
 from scvi_codegen.ensemble_file import load_ensemble
 from scvi_codegen.errors import ModelFileError, StateError, StepFailedError
@@ -519,3 +520,17 @@ def test_a_stepper_from_a_pickle_has_its_lanes(kepler: Stepper):
     again = pickle.loads(pickle.dumps(kepler))
     first, second = (stepper.integrate_ensemble(q, p, h=0.05, steps=20) for stepper in (kepler, again))
     assert np.array_equal(first.q, second.q)
+
+
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
+def test_the_absolute_rule_is_that_of_single_trajectories(name):
+    """Lanes measure changes of q, not relative ones, where the options say so: as many sweeps, the same states."""
+    chosen = problem(name)
+    stepper = compile_stepper(chosen.system, SVI(4))
+    p = stepper.momentum(chosen.q, chosen.velocity)
+    options = SolverOptions(tolerance=1e-6, absolute=True)
+    single = stepper.integrate(chosen.q, p, h=0.05, steps=20, every=20, options=options)
+    many = stepper.integrate_ensemble([chosen.q] * 8, [p] * 8, h=0.05, steps=20, every=20, options=options)
+    exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, every=20)
+    np.testing.assert_allclose(many.q[-1, 0], single.q[-1], rtol=1e-13, atol=1e-13)
+    assert not np.allclose(exact.q[-1], single.q[-1], rtol=1e-14, atol=1e-14)

@@ -17,6 +17,8 @@ MOST_LANES = 32
 DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
 """Of the polynomials through the last step, or through the last two, that are continued into the next. Higher ones
 follow the motion longer, but multiply rounding errors, by about 1e6 for these."""
+INTERPOLATED = 5
+"""Up to this degree the polynomial of two steps goes through all points; above, least squares make better guesses."""
 
 
 def lane_count(points: int) -> int:
@@ -54,7 +56,9 @@ def guess_tables(abscissae: Vector, lanes: int, through: Matrix | None = None) -
     ``through``: a matrix to apply to the guess.
     """
     alone = extrapolation(abscissae, 1, min(len(abscissae) - 1, DEGREE_OF_ONE))
-    tables: tuple[Matrix, ...] = (alone, *continuation(abscissae, min(2 * len(abscissae) - 2, DEGREE_OF_TWO)))
+    places = len({*abscissae, *(x - 1 for x in abscissae)})  # one fewer if both ends of a step are points
+    through_most = max(2 * len(abscissae) - 2, INTERPOLATED)
+    tables: tuple[Matrix, ...] = (alone, *continuation(abscissae, min(places - 1, through_most, DEGREE_OF_TWO)))
     if through is not None:
         tables = tuple(matrix_product(through, table) for table in tables)
     last_alone, last, before = (pad_matrix(table, lanes) for table in tables)
