@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -98,7 +98,9 @@ def advise(
     solver: str = "auto",
     options: SolverOptions | None = None,
 ) -> Advice:
-    """The largest step with which the positions at the end of a run are as right as wished.
+    """The longest step with which the positions at the end of a run are as right as wished.
+
+    Where shorter ones need less work in all (near the limit of the fixed point), it is one of them.
 
     The step is one number for the whole run: a symplectic method whose step follows the motion is symplectic no longer,
     and its energy drifts. Motions with rare violent moments (a close encounter) therefore need the small step of these
@@ -130,27 +132,34 @@ def advise(
         raise StateError("the span is 0")
     if target <= 0.0:
         raise StateError(f"the tolerance must be positive, not {tolerance!r}")
+    state = {"p": p, "t": t, "parameters": parameters, "options": options}
     found: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
     for candidate in _candidates(method) if degree else [method]:
-        points = _points(candidate)
-        most = min(max(FEWEST, NUMBERS // (points * system.dimension)), MOST)
         for stepper in _steppers(system, candidate, solver):
-            start = stepper.start(q, p, h=1.0, t=t, parameters=parameters).q  # checks them
-            integrate = partial(stepper.integrate, p=p, t=t, parameters=parameters, options=options)
             try:
-                pilot = launch(integrate, candidate, start, length, goal=target / SAFETY, most=most)
+                found.append(_advised(stepper, candidate, q, state, length, target))
             except StateError as failure:
                 failures.append(failure)
                 continue
-            choice = _choose(pilot, target)
-            found.append((_cost(pilot, choice.n, points), _advice(pilot, choice, candidate)))
-            if choice.error <= target:
+            if found[-1][1].expected_error <= target:
                 break
     if not found:
         raise failures[-1]
     met = [pair for pair in found if pair[1].expected_error <= target]
     return min(met, key=lambda pair: pair[0])[1] if met else min(found, key=lambda pair: pair[1].expected_error)[1]
+
+
+def _advised(
+    stepper: Stepper, method: Method, q: ArrayLike, state: Mapping[str, Any], span: float, tolerance: float
+) -> tuple[float, Advice]:
+    """What pilot runs of one stepper advise, and what a unit of time costs then."""
+    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks them
+    points = _points(method)
+    most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
+    pilot = launch(partial(stepper.integrate, **state), method, start, span, goal=tolerance / SAFETY, most=most)
+    choice = _choose(pilot, tolerance)
+    return _cost(pilot, choice.n, points), _advice(pilot, choice, method)
 
 
 def _steppers(system: LagrangianSystem, method: Method, solver: str) -> Iterator[Stepper]:

@@ -119,54 +119,11 @@ class Composition(Method):
                 f"'{system.name}' is not: use an SVI"
             )
         gamma = self.fractions
-        kicks, _ = kicks_and_drifts(gamma)
         size = len(gamma)
-        drifted = tuple(tuple(x if k < n else mp.zero for k, x in enumerate(gamma)) for n in range(size + 1))
-        before = tuple(tuple(int(n <= k) for k in range(size)) for n in range(size + 1))
-        kick = PointFamily(
-            name="kick",
-            abscissae=tuple(mp.fsum(line) for line in drifted),
-            weights=kicks,
-            weight_names=tuple(f"w_{n}" for n in range(size + 1)),
-            gathers=(
-                Gather(
-                    arguments=system.coordinates,
-                    table=Table.joined(Table.constant(size + 1, 1, 1), Table.named("a", drifted)),
-                    power=0,
-                ),
-            ),
-            scatters=(
-                Scatter(
-                    results=force(system),
-                    table=Table.joined(Table.named("", before), Table.constant(size + 1, 1, 1)),
-                    power=1,
-                ),
-            ),
-        )
-        drift = PointFamily(
-            name="drift",
-            abscissae=tuple(mp.fsum(drifted[n]) for n in range(size)),
-            weights=(mp.one,) * size,
-            weight_names=("",) * size,
-            gathers=(
-                Gather(
-                    arguments=system.velocities,
-                    table=Table.joined(Table.constant(size, 1), Table.identity(size)),
-                    power=-1,
-                ),
-            ),
-            scatters=(
-                Scatter(
-                    results=momentum(system),
-                    table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)),
-                    power=0,
-                ),
-            ),
-        )
         return StageSystem(
             blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k in range(1, size + 1)),
             rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k in range(1, size + 1)),
-            families=(kick, drift),
+            families=(_kick_family(system, gamma), _drift_family(system, gamma)),
             end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (gamma,))),
             end_momentum=mp.one,
             end_numbers=("q1", "p1"),
@@ -176,6 +133,58 @@ class Composition(Method):
     def paper_form(self, system: LagrangianSystem) -> StageSystem:
         """The same equations: the paper does not use the method."""
         return self.stage_system(system)
+
+
+def _kick_family(system: LagrangianSystem, gamma: Vector) -> PointFamily:
+    """L_q at the s + 1 positions before, between and after the drifts; it kicks all velocities that follow."""
+    size = len(gamma)
+    drifted = tuple(tuple(x if k < n else mp.zero for k, x in enumerate(gamma)) for n in range(size + 1))
+    before = tuple(tuple(int(n <= k) for k in range(size)) for n in range(size + 1))
+    return PointFamily(
+        name="kick",
+        abscissae=tuple(mp.fsum(line) for line in drifted),
+        weights=kicks_and_drifts(gamma)[0],
+        weight_names=tuple(f"w_{n}" for n in range(size + 1)),
+        gathers=(
+            Gather(
+                arguments=system.coordinates,
+                table=Table.joined(Table.constant(size + 1, 1, 1), Table.named("a", drifted)),
+                power=0,
+            ),
+        ),
+        scatters=(
+            Scatter(
+                results=force(system),
+                table=Table.joined(Table.named("", before), Table.constant(size + 1, 1, 1)),
+                power=1,
+            ),
+        ),
+    )
+
+
+def _drift_family(system: LagrangianSystem, gamma: Vector) -> PointFamily:
+    """L_v at the velocity of each of the s drifts, which is its momentum."""
+    size = len(gamma)
+    return PointFamily(
+        name="drift",
+        abscissae=tuple(mp.fsum(gamma[:n]) for n in range(size)),
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(
+            Gather(
+                arguments=system.velocities,
+                table=Table.joined(Table.constant(size, 1), Table.identity(size)),
+                power=-1,
+            ),
+        ),
+        scatters=(
+            Scatter(
+                results=momentum(system),
+                table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)),
+                power=0,
+            ),
+        ),
+    )
 
 
 def kicks_and_drifts(fractions: Vector) -> tuple[Vector, Vector]:
