@@ -45,10 +45,10 @@ cannot be written; 130 after Ctrl-C.
 
 SOLVER_OPTION = click.option(
     "--solver",
-    type=click.Choice(["auto", "newton", "fixed-point"]),
+    type=click.Choice(["auto", "fixed-point", "newton", "explicit"]),
     default="auto",
     show_default=True,
-    help="Of the stage equations; auto: fixed-point iteration where there is one, Newton where that fails.",
+    help="Of the stage equations; auto: explicit or fixed point where there is one, Newton where that fails.",
 )
 
 
@@ -146,7 +146,6 @@ def run(
     _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance)
     model = read_model(model_name, Choices(**choices))
     from scvi_codegen.binding import SolverOptions
-    from scvi_codegen.cli.running import integrate_model, summary
 
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
@@ -158,15 +157,7 @@ def run(
         from scvi_codegen.cli.advising import advised_model
 
         model = advised_model(model, tolerance, solver=solver, options=options)
-    outcome = integrate_model(model, solver=solver, options=options)
-    click.echo(summary(model, outcome))
-    written = _write_outputs(outcome, output, plot)
-    if outcome.failure is not None:
-        raise _Failure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
-    if outcome.interrupted:
-        raise _Failure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
-    for path in written:
-        click.echo(f"wrote {path}")
+    _run_one(model, output, plot, solver, options)
 
 
 @main.command(short_help="Write MODEL as C and as a Python package.")
@@ -318,6 +309,20 @@ def _check_combination(
     for name, value in (("plot", plot), ("tolerance", tolerance)):
         if ensemble is not None and value is not None:
             raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
+
+
+def _run_one(model: Model, output: str | None, plot: str | None, solver: str, options: SolverOptions) -> None:
+    from scvi_codegen.cli.running import integrate_model, summary
+
+    outcome = integrate_model(model, solver=solver, options=options)
+    click.echo(summary(model, outcome))
+    written = _write_outputs(outcome, output, plot)
+    if outcome.failure is not None:
+        raise _Failure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
+    if outcome.interrupted:
+        raise _Failure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
+    for path in written:
+        click.echo(f"wrote {path}")
 
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions) -> None:
