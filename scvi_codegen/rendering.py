@@ -40,8 +40,8 @@ TRAJECTORY_SOURCES = ("u", "parameters")
 ENSEMBLE_LANES = 8
 INVERSE_ROOT = "inverse_root_"
 LARGEST_INLINED = 150
-"""Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies 3 per
-cent, a chain of 64 masses 20."""
+"""Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies
+3 per cent, a chain of 64 masses 20."""
 VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
 

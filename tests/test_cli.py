@@ -209,7 +209,8 @@ class TestRun:
             assert "a step" in output_of("run", "kepler", "--span", "5", "--solver", solver)
         output_of("generate", "kepler", "-o", "kepler_newton", "--solver", "newton")
         assert "lanes" not in Path("kepler_newton/kepler_newton.c").read_text()
-        assert "'newton', 'fixed-point'" in error_of("run", "kepler", "--solver", "guess")
+        assert "'newton', 'explicit'" in error_of("run", "kepler", "--solver", "guess")
+        assert "not explicit for this system" in error_of("run", "kepler", "--solver", "explicit")
 
     def test_a_drift_is_seen(self):
         text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")
