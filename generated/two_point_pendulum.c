@@ -222,7 +222,7 @@ static int all_finite(const double *x, int n)
 }
 
 /* Momenta at u = (q, v), and the mass matrix dp/dv in the first numbers of scratch. */
-static void momentum_and_mass(double t, const double *u, const double *parameters, double *value, double *scratch)
+static void momentum_and_slopes(double t, const double *u, const double *parameters, double *value, double *scratch)
 {
   const band shape = band_of(1);
   double *mass = scratch, *slope = scratch + band_size(&shape);
@@ -248,7 +248,7 @@ int two_point_pendulum_momentum(double t, const double *q, const double *v, cons
   double u[2 * M], value[M];
   memcpy(u, q, sizeof(double) * M);
   memcpy(u + M, v, sizeof(double) * M);
-  momentum_and_mass(t, u, parameters, value, workspace);
+  momentum_and_slopes(t, u, parameters, value, workspace);
   if (!all_finite(value, M))
     return TWO_POINT_PENDULUM_NOT_FINITE;
   memcpy(p, value, sizeof(double) * M);
@@ -261,7 +261,7 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
 {
   const band shape = band_of(1);
   double value[M], update[M], pivot[M], misfit;
-  momentum_and_mass(t, u, parameters, value, mass);
+  momentum_and_slopes(t, u, parameters, value, mass);
   misfit = largest_misfit(value, p);
   for (int k = 0; k < 50; k++) {
     double scale = 1.0, nearer, start[M], roundoff = 0.0;
@@ -280,7 +280,7 @@ static int invert_momentum(double t, double *u, const double *p, const double *p
     do {
       for (int i = 0; i < M; i++)
         u[M + i] = start[i] + scale * update[PLACE[i]];
-      momentum_and_mass(t, u, parameters, value, mass);
+      momentum_and_slopes(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, p) : INFINITY;
       scale *= 0.5;
     } while (!(nearer < misfit) && misfit > roundoff && scale > DBL_EPSILON);
@@ -1090,12 +1090,12 @@ static double action_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0.0;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 2 * M, 1);
-  offset(step, 2, u + 0, 2 * M);
-  gather(QUADRATURE_GATHER_1[0], 2, 1.0, z, u + 1, 2 * M, 1);
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 2, 1);
+  offset(step, 2, u + 0, 2);
+  gather(QUADRATURE_GATHER_1[0], 2, 1.0, z, u + 1, 2, 1);
   for (int n = 0; n < 2; n++) {
     double value[1];
-    lagrangian(u + n * 2 * M, step->parameters, value);
+    lagrangian(u + n * 2, step->parameters, value);
     sum += QUADRATURE_WEIGHT[n] * value[0];
   }
   return h * sum;
@@ -1114,12 +1114,12 @@ int two_point_pendulum_discrete_legendre(double t, double h, const double *q0, c
   int keep = 0, status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < M; i++)
     v[i] = (q1[i] - q0[i]) / h;
+  status = two_point_pendulum_momentum(t, q0, v, parameters, start_p, workspace);
+  for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++)
       data.z[i * B + b] = STRAIGHT[b] * v[i];
-  }
-  status = two_point_pendulum_momentum(t, q0, v, parameters, start_p, workspace);
   if (status == TWO_POINT_PENDULUM_OK)
     status = newton(&step, &data, q1, start_p, increment, &keep, options ? options : &standard, report);
   if (status != TWO_POINT_PENDULUM_OK)

@@ -23,6 +23,7 @@ _HOMES = {
     "advice": ("Advice", "advise"),
     "compiler": ("compile_stepper", "generate_source"),
     "ensemble": ("EnsembleTrajectory",),
+    "hamiltonian": ("HamiltonianSystem", "hamiltonian_of", "lagrangian_of"),
     "equations": ("StepEquations", "derive"),
     "errors": (
         "BuildError",

@@ -21,6 +21,7 @@ from scvi_codegen.arguments import checked_number
 from scvi_codegen.binding import SolverOptions
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.pilot import STEEP, Pilot, launch
 from scvi_codegen.stepper import Stepper
@@ -85,7 +86,7 @@ class Advice:
 
 
 def advise(
-    system: LagrangianSystem,
+    system: MechanicalSystem,
     method: Method,
     q: ArrayLike,
     p: ArrayLike,
@@ -162,7 +163,7 @@ def _advised(
     return _cost(pilot, choice.n, points), _advice(pilot, choice, method)
 
 
-def _steppers(system: LagrangianSystem, method: Method, solver: str) -> Iterator[Stepper]:
+def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Stepper]:
     """That asked for; but for ``"auto"`` first the fixed point alone, whose limit of h a good step should keep to."""
     if solver == "auto":
         with suppress(MethodError):

@@ -27,6 +27,7 @@ __all__ = [
     "continuation",
     "differentiation_matrix",
     "extrapolation",
+    "identity_matrix",
     "matrix_product",
     "transpose",
 ]
@@ -36,6 +37,11 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
     """Return left @ right; rows of ``left`` are as long as ``right`` has rows."""
     columns = transpose(right)
     return tuple(tuple(mp.fdot(row, column) for column in columns) for row in left)
+
+
+def identity_matrix(size: int) -> Matrix:
+    """Return the (size, size) identity."""
+    return tuple(tuple(mp.mpf(int(i == j)) for j in range(size)) for i in range(size))
 
 
 def transpose(matrix: Matrix) -> Matrix:

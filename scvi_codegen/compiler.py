@@ -1,6 +1,6 @@
 """The whole tour: a system and a method go in, a stepper comes out.
 
-    LagrangianSystem, Method
+    MechanicalSystem, Method
       -> derive    StepEquations   the equations as the paper prints them, to look at (:mod:`scvi_codegen.equations`)
       -> solvers   Sweep           a solver without a matrix, where there is one (:mod:`scvi_codegen.solvers`)
       -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)
@@ -18,6 +18,7 @@ import re
 
 from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.lowering import lower
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
@@ -26,7 +27,6 @@ from scvi_codegen.solvers.choice import check_solver, sweep_of
 from scvi_codegen.solvers.splitting import splitting_of
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.text_cache import Texts, remembered_texts
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
@@ -42,7 +42,7 @@ SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
 def compile_stepper(
-    system: LagrangianSystem,
+    system: MechanicalSystem,
     method: Method,
     *,
     solver: str = "auto",
@@ -76,14 +76,14 @@ def compile_stepper(
 
 
 def generate_source(
-    system: LagrangianSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
+    system: MechanicalSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
     program = _program(system, method, solver=solver, prefix=prefix)
     return render(program), describe(program, system, method)
 
 
-def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
+def _program(system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = solver in ("auto", "fixed-point") and splitting is None
@@ -93,7 +93,7 @@ def _program(system: LagrangianSystem, method: Method, *, solver: str, prefix: s
     return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton)
 
 
-def describe(program: Program, system: LagrangianSystem, method: Method) -> Interface:
+def describe(program: Program, system: MechanicalSystem, method: Method) -> Interface:
     """The interface of a program."""
     return Interface(
         prefix=program.prefix,

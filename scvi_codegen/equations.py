@@ -19,17 +19,18 @@ from functools import lru_cache
 
 import sympy
 
+from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.basis import differentiation_matrix
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import accelerations, euler_lagrange, force, momentum
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
-from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.nodes import exact_points
 from scvi_codegen.precision import DIGITS, Number, mp
 from scvi_codegen.quadrature import exact_rule
 from scvi_codegen.stage_system import Block, PointFamily, StageSystem, Table
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import exact_tableau
 
 __all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive"]
@@ -86,7 +87,7 @@ class StepEquations:
         initial_guess: of each unknown, on the straight line with velocity ``v_k``.
     """
 
-    system: LagrangianSystem
+    system: MechanicalSystem
     method: Method
     stages: StageSystem
     unknowns: tuple[sympy.Symbol, ...]
@@ -164,7 +165,7 @@ class MatrixForm:
     residual: sympy.ImmutableMatrix
 
 
-def derive(system: LagrangianSystem, method: Method, *, radicals: bool = False) -> StepEquations:
+def derive(system: MechanicalSystem, method: Method, *, radicals: bool = False) -> StepEquations:
     """The closed form of one step as the paper writes it.
 
     Args:
@@ -172,7 +173,8 @@ def derive(system: LagrangianSystem, method: Method, *, radicals: bool = False) 
         method: SVI: (27); SCVI: (34), with its multipliers unless as printed; SC: (18), (21); Runge-Kutta: (22).
         radicals: replace table entries by radicals where they have a short form.
     """
-    stages = method.paper_form(system)
+    check_regular(method, system)
+    stages = with_auxiliaries(system, method.paper_form(system))
     writer = _Writer(system, stages)
     equations = writer.equations()
     end_position, end_momentum = writer.end_state()
@@ -197,10 +199,12 @@ def derive(system: LagrangianSystem, method: Method, *, radicals: bool = False) 
 class _Writer:
     """Writes a stage system out: gathers into arguments, arguments into kernels, kernels into rows."""
 
-    def __init__(self, system: LagrangianSystem, stages: StageSystem) -> None:
+    def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages = system, stages
         names = [q.name for q in system.coordinates]
-        self.taken = {symbol.name for symbol in (*system.coordinates, *system.velocities, *system.parameters)}
+        self.taken = {
+            symbol.name for symbol in (*system.coordinates, *system.velocities, *system.auxiliaries, *system.parameters)
+        }
         self.step = self._symbol("h")
         self.q = tuple(self._symbol(f"{name}_k") for name in names)
         self.p = tuple(self._symbol(f"p_{name}_k" if len(names) > 1 else "p_k") for name in names)
@@ -243,7 +247,8 @@ class _Writer:
         for block, symbols in zip(self.stages.blocks, self.unknowns, strict=True):
             rest, moving = (_rational(x) for x in block.straight)
             for i, symbol in enumerate(symbols):
-                guess[symbol] = rest * self.q[i] + moving * self.step ** (1 - block.power) * self.v[i]
+                moved = moving * self.step ** (1 - block.power) * self.v[i]
+                guess[symbol] = rest * self.q[i] + moved + block.momentum * self.p[i]
         return guess
 
     def _rows(self) -> list[list[list[sympy.Expr]]]:
@@ -484,7 +489,7 @@ def _at_node(derived: StepEquations, i: int, q: sympy.Matrix, v: sympy.Matrix) -
 def _text_lines(derived: StepEquations) -> Iterator[str]:
     q, p = derived.state
     yield f"{derived.system.name}: {derived.method.title}"
-    yield f"L = {derived.system.to_text()}"
+    yield f"{'H' if derived.system.auxiliaries else 'L'} = {derived.system.to_text()}"
     yield f"known: {', '.join(s.name for s in (*q, *p, derived.time, derived.step))}"
     yield f"unknown: {', '.join(s.name for s in derived.unknowns)}"
     yield "\nequations"

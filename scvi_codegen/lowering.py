@@ -19,10 +19,13 @@ from collections.abc import Mapping, Sequence
 
 import sympy
 
+from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics import momentum
-from scvi_codegen.methods.method import Method
+from scvi_codegen.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import accelerations, auxiliary_multipliers, legendre_map, multipliers
+from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.ordering import bandwidth, places
 from scvi_codegen.precision import Matrix, Vector
 from scvi_codegen.program import (
@@ -39,8 +42,7 @@ from scvi_codegen.program import (
     Splitting,
     Sweep,
 )
-from scvi_codegen.stage_system import PointFamily, StageSystem
-from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.stage_system import Gather, PointFamily, StageSystem
 
 __all__ = ["lower", "lower_kernel", "lower_matrix", "lower_vector"]
 
@@ -283,7 +285,7 @@ def _first_arguments(graph: _Graph) -> list[float]:
 
 
 def lower(
-    system: LagrangianSystem,
+    system: MechanicalSystem,
     method: Method,
     *,
     prefix: str,
@@ -300,13 +302,15 @@ def lower(
         splitting: the explicit solver that replaces both (:func:`scvi_codegen.solvers.splitting.splitting_of`).
         newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
     """
-    stages = method.stage_system(system)
+    check_regular(method, system)
+    stages = with_auxiliaries(system, method.stage_system(system))
     common = {"time": system.time, "parameters": system.parameters}
-    momenta = momentum(system)
-    mass = jacobian(momenta, system.velocities)
-    state = (*system.coordinates, *system.velocities)
-    legendre = lower_kernel("legendre", arguments=state, values=momenta, slopes=tuple(mass.values()), **common)
-    lagrangian = lower_kernel("lagrangian", arguments=state, values=(system.lagrangian,), **common)
+    state, transformed = legendre_map(system)
+    mass = jacobian(transformed, state[system.dimension :])
+    legendre = lower_kernel("legendre", arguments=state, values=transformed, slopes=tuple(mass.values()), **common)
+    point = (*system.coordinates, *system.velocities, *system.auxiliaries)
+    lagrangian = lower_kernel("lagrangian", arguments=point, values=(system.lagrangian,), **common)
+    hamiltonian = lower_kernel("hamiltonian", arguments=state, values=(system.formula,), **common)
     families = tuple(_family(system, family) for family in stages.families)
     met = [*mass, *_meetings(families if newton else ())]
     order = places(met, system.dimension)
@@ -324,15 +328,23 @@ def lower(
         momentum_rows=lower_vector(tuple(row.momentum for row in stages.rows)),
         end_position=lower_vector(stages.end_position.entries[0][1:]),
         straight=tuple(int(block.straight[1]) for block in stages.blocks),
+        momentum_blocks=tuple(block.momentum for block in stages.blocks),
+        moving_blocks=tuple(int(block.moves) for block in stages.blocks),
         extrapolation=lower_matrix(_required_extrapolation(stages)),
         legendre=legendre,
         mass_entries=tuple(mass),
         lagrangian=lagrangian,
-        action=stages.action[0] if stages.action and newton else None,
+        hamiltonian=hamiltonian if system.auxiliaries else None,
+        action=stages.action[0] if stages.action and newton and _is_regular(system) else None,
         sweep=sweep,
         splitting=splitting,
         newton=newton,
     )
+
+
+def _is_regular(system: MechanicalSystem) -> bool:
+    """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist."""
+    return not isinstance(system, HamiltonianSystem) or system.is_regular
 
 
 def _meetings(families: Sequence[Family]) -> list[tuple[int, int]]:
@@ -361,11 +373,12 @@ def _required_extrapolation(stages: StageSystem) -> Matrix:
     return stages.extrapolation
 
 
-def _family(system: LagrangianSystem, family: PointFamily) -> Family:
+def _family(system: MechanicalSystem, family: PointFamily) -> Family:
     common = {"arguments": family.arguments, "time": system.time, "parameters": system.parameters}
     slopes, blocks = _slope_blocks(family)
     return Family(
         name=family.name,
+        arguments=tuple(_argument(system, gather) for gather in family.gathers),
         abscissae=lower_vector(family.abscissae),
         weights=lower_vector(family.weights),
         gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
@@ -374,6 +387,19 @@ def _family(system: LagrangianSystem, family: PointFamily) -> Family:
         slope=lower_kernel(f"{family.name}_slope", values=family.results, slopes=slopes, **common),
         blocks=blocks,
     )
+
+
+def _argument(system: MechanicalSystem, gather: Gather) -> str:
+    """What a gather gives, as the formulas call it."""
+    names = {
+        system.coordinates: "q",
+        system.velocities: "v",
+        accelerations(system): "a",
+        multipliers(system): "lambda",
+        system.auxiliaries: "p",
+        auxiliary_multipliers(system): "nu",
+    }
+    return names[gather.arguments]
 
 
 def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:

@@ -24,6 +24,9 @@
     span = 100.0                                        # length of time, or steps = 200
     every = 1                                           # distance between kept states; left out: 1
 
+A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
+the names ``p_q``.
+
 ``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and each of
 ``[initial]``, ``[method]``, ``[run]`` that is left out is the catalogue's. Files are written complete in themselves.
 '''
@@ -42,6 +45,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError
+from scvi_codegen.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.problems import Problem, problem
@@ -61,6 +66,7 @@ Section = Mapping[str, Any]
 DEFAULT_METHOD = SVI(8)
 """What the problems of the catalogue are integrated with unless another method is chosen."""
 
+SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "catalogue")
 SECTIONS = ("system", "parameters", "initial", "method", "run")
 SHORT_VECTOR = 4
 TEXT_WIDTH = 100
@@ -88,7 +94,7 @@ class Model:
             vector has m entries, and every number is finite and in its range.
     """
 
-    system: LagrangianSystem
+    system: MechanicalSystem
     method: Method
     q: tuple[float, ...]
     p: tuple[float, ...] | None = None
@@ -123,7 +129,13 @@ class Model:
     def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
         """An entry of the catalogue with a method."""
         return cls(
-            system=entry.system, method=method, q=entry.q, velocity=entry.velocity, h=entry.step, span=entry.span
+            system=entry.system,
+            method=method,
+            q=entry.q,
+            p=entry.p,
+            velocity=entry.velocity,
+            h=entry.step,
+            span=entry.span,
         )
 
     @property
@@ -216,8 +228,10 @@ def dump_model(model: Model) -> str:
 def _document(model: Model) -> dict[str, Any]:
     system = model.system
     names = [coordinate.name for coordinate in system.coordinates]
+    kind = "hamiltonian" if system.auxiliaries else "lagrangian"
+    momenta = {"momenta": [p.name for p in system.auxiliaries]} if system.auxiliaries else {}
     document: dict[str, Any] = {
-        "system": {"name": system.name, "coordinates": names, "lagrangian": _wrapped(system.to_text())}
+        "system": {"name": system.name, "coordinates": names, **momenta, kind: _wrapped(system.to_text())}
     }
     if system.parameters:
         values = zip(system.parameters, system.defaults, strict=True)
@@ -261,26 +275,36 @@ def _read_catalogue(section: Section) -> Problem | None:
     return _in_section("[system]", lambda: problem(name))
 
 
-def _read_system(section: Section, parameters: Section, entry: Problem | None) -> LagrangianSystem:
+def _read_system(section: Section, parameters: Section, entry: Problem | None) -> MechanicalSystem:
     values = {key: _real(value, f"[parameters] {key}") for key, value in parameters.items()}
     if entry is not None:
         return _in_section("[parameters]", lambda: entry.system.with_parameters(**values))
-    _check_keys(section, ("name", "coordinates", "lagrangian", "catalogue"), "key", "[system]")
-    name, lagrangian = _text(section, "name", "[system]"), _text(section, "lagrangian", "[system]")
-    coordinates = _required(section, "coordinates", "[system]")
-    if not isinstance(coordinates, list) or not all(isinstance(item, str) for item in coordinates):
-        raise ModelFileError(f"[system] coordinates must be a list of names, not {coordinates!r}")
-    return _in_section(
-        "[system]",
-        lambda: LagrangianSystem.from_text(
-            name=name, coordinates=coordinates, lagrangian=lagrangian, parameters=values
-        ),
-    )
+    _check_keys(section, SYSTEM_KEYS, "key", "[system]")
+    if ("lagrangian" in section) == ("hamiltonian" in section):
+        found = "both" if "lagrangian" in section else "neither"
+        raise ModelFileError(f"[system] has {found} of lagrangian and hamiltonian: give one of them")
+    name, coordinates = _text(section, "name", "[system]"), _names(section, "coordinates")
+    common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
+    if "hamiltonian" in section:
+        common["hamiltonian"] = _text(section, "hamiltonian", "[system]")
+        common["momenta"] = _names(section, "momenta") if "momenta" in section else None
+        return _in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
+    if "momenta" in section:
+        raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
+    common["lagrangian"] = _text(section, "lagrangian", "[system]")
+    return _in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 
-def _read_state(document: Mapping[str, Section], system: LagrangianSystem, default: Model | None) -> dict[str, Any]:
+def _names(section: Section, key: str) -> list[str]:
+    names = _required(section, key, "[system]")
+    if not isinstance(names, list) or not all(isinstance(item, str) for item in names):
+        raise ModelFileError(f"[system] {key} must be a list of names, not {names!r}")
+    return names
+
+
+def _read_state(document: Mapping[str, Section], system: MechanicalSystem, default: Model | None) -> dict[str, Any]:
     if default and "initial" not in document:
-        return {"q": default.q, "velocity": default.velocity}
+        return {"q": default.q, "p": default.p, "velocity": default.velocity}
     section = _section(document, "initial")
     _check_keys(section, ("q", "p", "q_dot", "t"), "key", "[initial]")
     if ("p" in section) == ("q_dot" in section):
@@ -310,8 +334,8 @@ def _read_method(section: Section) -> Method:
         _check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")
     if not isinstance(section.get("variational", True), bool):
         raise ModelFileError(f"[method] variational must be true or false, not {section['variational']!r}")
-    if not isinstance(section.get("abscissae", []), list):
-        raise ModelFileError(f"[method] abscissae must be a list of numbers, not {section['abscissae']!r}")
+    if not isinstance(section.get("abscissae", []), list | str):
+        raise ModelFileError(f"[method] abscissae must be a list of numbers or a name, not {section['abscissae']!r}")
     return _in_section("[method]", lambda: method_from_specification(section))
 
 

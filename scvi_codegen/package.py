@@ -155,10 +155,13 @@ def _example(model: Model) -> ExampleRun:
 def _momenta(model: Model) -> tuple[float, ...]:
     """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
     from scvi_codegen.expression_text import evaluate
+    from scvi_codegen.hamiltonian import lagrangian_twin
     from scvi_codegen.mechanics import momentum
     from scvi_codegen.precision import mp
 
-    system = model.system
+    system = lagrangian_twin(model.system)
+    if system is None:
+        raise StateError("velocities do not determine the momenta of this Hamiltonian: give p, not q_dot")
     symbols = (*system.coordinates, *system.velocities, system.time, *system.parameters)
     numbers = (*model.q, *(model.velocity or ()), model.t, *system.defaults)
     point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))

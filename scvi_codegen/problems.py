@@ -14,6 +14,8 @@ from types import MappingProxyType
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.expression_text import closest
+from scvi_codegen.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.system import LagrangianSystem
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "kepler",
     "outer_solar_system",
     "planar_pendulum",
+    "point_vortices",
     "problem",
     "relativistic_particle",
     "spherical_pendulum",
@@ -46,7 +49,8 @@ class Problem:
         title: one line that says what it is.
         system: the Lagrangian.
         q: initial coordinates, m numbers.
-        velocity: initial velocities, m numbers.
+        velocity: initial velocities, m numbers, or ``None`` where ``p`` is given.
+        p: initial momenta, m numbers, or ``None``.
         step: a step size that suits a method of eight points.
         span: a length of time that shows what the system does.
         reference: where it is described.
@@ -54,18 +58,20 @@ class Problem:
 
     name: str
     title: str
-    system: LagrangianSystem
+    system: MechanicalSystem
     q: tuple[float, ...]
-    velocity: tuple[float, ...]
+    velocity: tuple[float, ...] | None = None
+    p: tuple[float, ...] | None = None
     step: float
     span: float
     reference: str
 
     def __post_init__(self) -> None:
-        if not len(self.q) == len(self.velocity) == self.system.dimension:
+        given = [part for part in (self.velocity, self.p) if part is not None]
+        if len(given) != 1 or not len(self.q) == len(given[0]) == self.system.dimension:
             raise SystemDefinitionError(
                 f"problem '{self.name}' has {self.system.dimension} coordinates, but an initial state of "
-                f"{len(self.q)} coordinates and {len(self.velocity)} velocities"
+                f"{len(self.q)} coordinates and {' and '.join(str(len(part)) for part in given)} velocities or momenta"
             )
 
 
@@ -244,20 +250,49 @@ def outer_solar_system() -> LagrangianSystem:
     )
 
 
+def point_vortices(n: int = 4) -> HamiltonianSystem:
+    """Motion of n point vortices in the plane; x_k is the abscissa of vortex k, y_k its ordinate times its strength.
+
+    H = -1/(4 pi) sum over pairs of strength_i strength_j log(distance_ij^2). There is no Lagrangian: a shift of all
+    ordinates does not change H.
+    """
+    pairs = [(i, j) for i in range(1, n + 1) for j in range(1, i)]
+    terms = [
+        f"strength_{i}*strength_{j}*log((x_{i} - x_{j})**2 + (y_{i}/strength_{i} - y_{j}/strength_{j})**2)"
+        for i, j in pairs
+    ]
+    return HamiltonianSystem.from_text(
+        name=f"{n} point vortices",
+        coordinates=[f"x_{k}" for k in range(1, n + 1)],
+        momenta=[f"y_{k}" for k in range(1, n + 1)],
+        hamiltonian=f"-({' + '.join(terms)})/(4*pi)",
+        parameters={f"strength_{k}": 1.0 if k % 2 else -1.0 for k in range(1, n + 1)},
+    )
+
+
 def _entry(
     name: str,
     title: str,
-    system: Callable[[], LagrangianSystem],
+    system: Callable[[], MechanicalSystem],
     *,
     start: tuple[Sequence[float], Sequence[float]],
     step: float,
     span: float,
     reference: str,
+    momenta: bool = False,
 ) -> tuple[str, Callable[[], Problem]]:
     def build() -> Problem:
-        q, velocity = map(tuple, start)
+        q, second = map(tuple, start)
         return Problem(
-            name=name, title=title, system=system(), q=q, velocity=velocity, step=step, span=span, reference=reference
+            name=name,
+            title=title,
+            system=system(),
+            q=q,
+            velocity=None if momenta else second,
+            p=second if momenta else None,
+            step=step,
+            span=span,
+            reference=reference,
         )
 
     return name, build
@@ -384,6 +419,16 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
                 step=200.0,
                 span=200_000.0,
                 reference=f"{_HLW}, section I.2.4",
+            ),
+            _entry(
+                "point-vortices",
+                "two pairs of vortices that leapfrog; given by a Hamiltonian, without a Lagrangian",
+                point_vortices,
+                start=((-0.5, 0.5, -0.25, 0.25), (0.0, 0.0, 0.0, 0.0)),
+                step=0.2,
+                span=20.0,
+                reference="H. Aref, J. Math. Phys. 48 (2007) 065401",
+                momenta=True,
             ),
             ("fput-chain", _fput_problem),
         ]

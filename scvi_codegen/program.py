@@ -165,9 +165,10 @@ class SlopeBlock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """Points of one kind with the loops around their kernel."""
+    """Points of one kind with the loops around their kernel; ``arguments`` are what the gathers give, m each."""
 
     name: str
+    arguments: tuple[str, ...]
     abscissae: tuple[float, ...]
     weights: tuple[float, ...]
     gathers: tuple[GatherLoop, ...]
@@ -515,11 +516,14 @@ class Program:
         bandwidth: how many places they are apart at most.
         momentum_rows: (B,) coefficient of p0 in each row.
         end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
-        straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is zero.
+        straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is not.
+        momentum_blocks: (B,) 1 where that guess is p0.
+        moving_blocks: (B,) 1 where h times the block is a length; convergence is judged by these.
         extrapolation: (B, B) guess for the next step.
-        legendre: momenta and mass matrix at (q, v).
+        legendre: p and dp/dv at (q, v); where a Hamiltonian is given, v and dv/dp at (q, p).
         mass_entries: (i, j) of the slopes of ``legendre``.
-        lagrangian: L at (q, v).
+        lagrangian: L at (q, v); where a Hamiltonian is given, p . v - H at (q, v, p).
+        hamiltonian: H at (q, p) where it is given, else ``None``.
         action: name of the family whose weighted sum of L is the discrete Lagrangian, or ``None``.
         sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
         splitting: the explicit sequence that replaces both, or ``None``.
@@ -539,10 +543,13 @@ class Program:
     momentum_rows: tuple[float, ...]
     end_position: tuple[float, ...]
     straight: tuple[int, ...]
+    momentum_blocks: tuple[int, ...]
+    moving_blocks: tuple[int, ...]
     extrapolation: tuple[tuple[float, ...], ...]
     legendre: Kernel
     mass_entries: tuple[tuple[int, int], ...]
     lagrangian: Kernel
+    hamiltonian: Kernel | None
     action: str | None
     sweep: Sweep | None
     splitting: Splitting | None
@@ -562,7 +569,9 @@ class Program:
     def kernels(self) -> tuple[Kernel, ...]:
         """Every kernel, in the order of emission."""
         pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
-        return (*pairs, self.legendre, self.lagrangian)
+        energy = (self.hamiltonian,) if self.hamiltonian else ()
+        action = (self.lagrangian,) if self.action or not energy else ()
+        return (*pairs, self.legendre, *energy, *action)
 
     @property
     def memory(self) -> int:

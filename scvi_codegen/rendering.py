@@ -34,7 +34,6 @@ KEEP_CHANGE = 1e-2
 KEEP_RATE = 0.1
 GOOD_GUESS = 1e-3
 """Relative error below which the next guess is continued from two steps, not one."""
-ARGUMENT_NAMES = {1: "the argument alone", 2: "(q, v)", 3: "(q, v, a)", 4: "(q, v, a, lambda)"}
 POINT_SOURCES = ("u", "t")
 TRAJECTORY_SOURCES = ("u", "parameters")
 ENSEMBLE_LANES = 8
@@ -153,14 +152,17 @@ def _purposes(program: Program) -> dict[str, str]:
     purposes = {
         "legendre": "Momenta L_v and mass matrix L_vv at u = (q, v).",
         "lagrangian": "L at u = (q, v).",
+        "hamiltonian": "H at u = (q, p).",
         "force_lanes": "L_q at all points.",
         "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
         "action_lanes": "L_q and L_v at all points, u = (q, v).",
         "applied_force_lanes": "L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
         "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
     }
+    if program.hamiltonian:
+        purposes |= {"legendre": "H_p and H_pp at u = (q, p).", "lagrangian": "p . v - H at u = (q, v, p)."}
     for family in program.families:
-        arguments = ARGUMENT_NAMES[len(family.gathers)]
+        arguments = f"({', '.join(family.arguments)})"
         purposes[family.value.name] = f"{_results(family)} at u = {arguments}."
         purposes[family.slope.name] = f"The same, and the non-zero derivatives with respect to u = {arguments}."
     return purposes
@@ -168,10 +170,9 @@ def _purposes(program: Program) -> dict[str, str]:
 
 def _results(family: Family) -> str:
     if family.name == "node":
-        return "Derivatives of lambda . E" if len(family.gathers) == 4 else "The Euler-Lagrange residual E"
-    if len(family.scatters) == 2:
-        return "L_q and L_v"
-    return "L_q" if family.name == "kick" else "L_v"
+        return "Derivatives of lambda . E" if "lambda" in family.arguments else "The Euler-Lagrange residual E"
+    slopes = " and ".join(f"L_{name}" for name in family.arguments)
+    return slopes if len(family.scatters) == len(family.gathers) else "L_v"
 
 
 def _lane_context(sweep: Sweep | None) -> dict[str, object]:

@@ -101,11 +101,15 @@ class Block:
         name: its symbol in displayed equations.
         power: the power of h that makes it a position.
         straight: (a, b) of the straight-line guess z = a q0 + b h^(1 - power) v0.
+        momentum: coefficient of p0 in that guess.
+        moves: whether it is measured in positions, once multiplied by h^power; momenta and their multipliers are not.
     """
 
     name: str
     power: int
     straight: tuple[Number, Number]
+    momentum: int = 0
+    moves: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +144,7 @@ class Scatter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointFamily:
-    """Points c_n in [0, 1] with weights, evaluated by one kernel."""
+    """Points c_n in [0, 1] with weights, evaluated by one kernel; its ``scalar`` where the kernel is a gradient."""
 
     name: str
     abscissae: Vector
@@ -148,6 +152,7 @@ class PointFamily:
     gathers: tuple[Gather, ...]
     scatters: tuple[Scatter, ...]
     weight_names: tuple[str, ...]
+    scalar: sympy.Expr | None = None
 
     @property
     def arguments(self) -> tuple[sympy.Symbol, ...]:
@@ -224,6 +229,7 @@ class ScalarFamily:
             weight_names=self.weight_names,
             gathers=self.gathers,
             scatters=scatters,
+            scalar=self.scalar,
         )
 
 

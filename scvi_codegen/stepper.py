@@ -378,7 +378,8 @@ class Stepper:
             self.binding.workspace(),
         )
         if status:
-            raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]})")
+            hint = "; does this Hamiltonian determine momenta by velocities? Give p" if name == "momentum" else ""
+            raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]}{hint})")
         return result
 
     def _vector(self, value: ArrayLike, name: str) -> Array:

@@ -19,10 +19,10 @@ from typing import TypeAlias
 import sympy
 
 from scvi_codegen.building import cache_folder
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.rendering import template_folder
 from scvi_codegen.source import Interface, Source
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.trajectory import write_atomically
 
 __all__ = ["Texts", "remembered_texts"]
@@ -32,7 +32,7 @@ Texts: TypeAlias = tuple[Source, Interface, Source | None]
 
 
 def remembered_texts(
-    system: LagrangianSystem, method: Method, solver: str, prefix: str | None, make: Callable[[], Texts]
+    system: MechanicalSystem, method: Method, solver: str, prefix: str | None, make: Callable[[], Texts]
 ) -> Texts:
     """What ``make`` returns for these arguments, from the cache if it was made before."""
     path = cache_folder() / "texts" / f"{_key(system, method, solver, prefix)}.json"
@@ -43,13 +43,13 @@ def remembered_texts(
     return found
 
 
-def _key(system: LagrangianSystem, method: Method, solver: str, prefix: str | None) -> str:
-    symbols = (*system.coordinates, *system.velocities, *system.parameters, system.time)
+def _key(system: MechanicalSystem, method: Method, solver: str, prefix: str | None) -> str:
+    symbols = (*system.coordinates, *system.auxiliaries, *system.parameters, system.time)
     parts = [
         system.name,
-        sympy.srepr(system.lagrangian),
+        sympy.srepr(system.formula),
         " ".join(symbol.name for symbol in symbols),
-        repr((len(system.coordinates), system.defaults)),
+        repr((len(system.coordinates), len(system.auxiliaries), system.defaults)),
         repr(method),
         solver,
         str(prefix),

@@ -19,8 +19,12 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 FLOORS = """
     errors precision program source ordering
     derivatives expression_text nodes arguments
-    quadrature system
+    symbols regularity quadrature
+    mechanical_system translation
+    system
+    hamiltonian
     basis mechanics stage_system
+    auxiliaries
     tableau
     methods.method
     methods.galerkin
@@ -41,8 +45,10 @@ FLOORS = """
     problems pilot
     model_file
     package plotting advice distributed ensemble_file
+    exact
     __init__
     benchmark
+    reproduce
     cli
     __main__
 """
@@ -57,7 +63,7 @@ OWNERS = {
     "jinja2": ["rendering"],
     "cffi": ["building"],
     "platformdirs": ["building"],
-    "matplotlib": ["plotting", "benchmark"],
+    "matplotlib": ["plotting", "benchmark", "reproduce"],
     "click": ["cli"],
 }
 

@@ -10,6 +10,7 @@ import sympy
 from sympy import Symbol, cos, sin
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.problems import PROBLEMS, Problem, fput_chain, outer_solar_system, problem
 from scvi_codegen.system import LagrangianSystem
 
@@ -147,15 +148,20 @@ def test_every_entry_starts_from_a_finite_state_and_its_text_comes_back(name: st
     assert entry.title
     assert entry.reference
     assert 0 < entry.step < entry.span
-    state = dict(zip((*system.coordinates, *system.velocities), (*entry.q, *entry.velocity), strict=True))
-    values = state | dict(zip(system.parameters, system.defaults, strict=True)) | {system.time: 0.0}
-    assert np.isfinite(float(sympy.lambdify(list(values), system.lagrangian)(*values.values())))
-    assert system == LagrangianSystem.from_text(
-        name=system.name,
-        coordinates=[coordinate.name for coordinate in system.coordinates],
-        lagrangian=system.to_text(),
-        parameters=dict(zip((parameter.name for parameter in system.parameters), system.defaults, strict=True)),
-    )
+    second = system.auxiliaries or system.velocities
+    state = dict(zip((*system.coordinates, *second), (*entry.q, *(entry.p or entry.velocity)), strict=True))
+    values = state | system.constants | {system.time: 0.0}
+    assert np.isfinite(float(sympy.lambdify(list(values), system.formula)(*values.values())))
+    common = {
+        "name": system.name,
+        "coordinates": [coordinate.name for coordinate in system.coordinates],
+        "parameters": {parameter.name: value for parameter, value in system.constants.items()},
+    }
+    if isinstance(system, LagrangianSystem):
+        assert system == LagrangianSystem.from_text(**common, lagrangian=system.to_text())
+    else:
+        momenta = [p.name for p in system.momenta]
+        assert system == HamiltonianSystem.from_text(**common, momenta=momenta, hamiltonian=system.to_text())
 
 
 def test_states_that_the_titles_promise() -> None:

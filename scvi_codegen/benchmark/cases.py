@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.expression_text import closest
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.problems import problem
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["CASES", "STATES", "Case", "Formulation", "case"]
 
@@ -66,7 +66,7 @@ class Case:
     """
 
     name: str
-    system: LagrangianSystem
+    system: MechanicalSystem
     formulations: tuple[Formulation, ...]
     q: Array
     velocity: Array
@@ -279,6 +279,7 @@ def _kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
 
 def _outer_solar_system() -> Case:
     entry = problem("outer-solar-system")
+    assert entry.velocity is not None
     values = dict(zip((str(symbol) for symbol in entry.system.parameters), entry.system.defaults, strict=True))
     masses = tuple(value for name, value in values.items() if name.startswith("m_"))
     return Case(

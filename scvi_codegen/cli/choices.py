@@ -36,7 +36,7 @@ class Choices:
     quadrature: str | None
     form: str | None
     variational: bool | None
-    abscissae: tuple[float, ...] | None
+    abscissae: tuple[float, ...] | str | None
     parameter: tuple[tuple[str, float], ...]
     q: tuple[float, ...] | None
     p: tuple[float, ...] | None
@@ -55,6 +55,14 @@ def _numbers(context: click.Context, parameter: click.Parameter, value: str | No
         return tuple(float(word) for word in re.split(r"[,\s]+", value.strip()))
     except ValueError as error:
         raise click.BadParameter(f"{error}; write numbers with commas between them, as in 0.5,-1.2e-3") from error
+
+
+def _numbers_or_name(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> tuple[float, ...] | str | None:
+    if value is not None and re.fullmatch(r"[a-z]+(-[a-z]+)*", value):
+        return value
+    return _numbers(context, parameter, value)
 
 
 def _assignments(
@@ -90,7 +98,12 @@ METHOD_OPTIONS = (
         default=None,
         help="SCVI: the variational method, or the form printed in the paper, which is not symplectic.",
     ),
-    _option("--abscissae", metavar="C1,C2,..", callback=_numbers, help="Abscissae in [0, 1] (collocation)."),
+    _option(
+        "--abscissae",
+        metavar="C1,C2,..",
+        callback=_numbers_or_name,
+        help="Abscissae in [0, 1] (collocation, scvi); scvi also: gauss, radau-iia, lobatto-iiia, ..",
+    ),
 )
 STATE_OPTIONS = (
     _option(

@@ -16,10 +16,10 @@ import sympy
 from numpy.typing import NDArray
 
 from scvi_codegen.expression_text import evaluate
-from scvi_codegen.mechanics import force, momentum
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import constitutive, force, momentum
 from scvi_codegen.plotting import AXES, Body, bodies
 from scvi_codegen.precision import Number, mp
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.trajectory import Trajectory
 
 __all__ = ["MomentumMap", "energy_report", "momentum_maps"]
@@ -54,28 +54,32 @@ class MomentumMap:
         value, size = np.sum(terms, axis=0), np.sum(np.abs(terms), axis=0)
         return float(np.abs(value - value[0]).max() / (size.max() or 1.0))
 
-    def change(self, system: LagrangianSystem, slopes: _Slopes) -> Number:
+    def change(self, system: MechanicalSystem, slopes: _Slopes) -> Number:
         """DL . xi at a point, 0 if L is invariant."""
         total = mp.fsum(slopes.force[i] for i in self.shifted)
         for i, j in self.turned:
             total += slopes.q[i] * slopes.force[j] - slopes.q[j] * slopes.force[i]
             total += slopes.v[i] * slopes.momentum[j] - slopes.v[j] * slopes.momentum[i]
+            if slopes.p:
+                total += slopes.p[i] * slopes.constitutive[j] - slopes.p[j] * slopes.constitutive[i]
         return total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Slopes:
-    """A point and the derivatives of L there, 60 digits, m numbers each."""
+    """A point and the derivatives of L there, 60 digits, m numbers each; p and L_p where a Hamiltonian is given."""
 
     q: tuple[Number, ...]
     v: tuple[Number, ...]
     force: tuple[Number, ...]
     momentum: tuple[Number, ...]
+    p: tuple[Number, ...]
+    constitutive: tuple[Number, ...]
 
 
-def momentum_maps(system: LagrangianSystem) -> tuple[MomentumMap, ...]:
+def momentum_maps(system: MechanicalSystem) -> tuple[MomentumMap, ...]:
     """The momentum maps found for a system; there may be others."""
-    free = system.lagrangian.free_symbols
+    free = system.formula.free_symbols
     cyclic = [i for i, coordinate in enumerate(system.coordinates) if coordinate not in free]
     found = [MomentumMap(name=f"momentum of {system.coordinates[i]}", shifted=(i,)) for i in cyclic[:MOST_CYCLIC]]
     candidates = list(_candidates([coordinate.name for coordinate in system.coordinates]))
@@ -89,13 +93,13 @@ def momentum_maps(system: LagrangianSystem) -> tuple[MomentumMap, ...]:
     return tuple(found)
 
 
-def energy_report(system: LagrangianSystem, trajectory: Trajectory) -> str:
+def energy_report(system: MechanicalSystem, trajectory: Trajectory) -> str:
     """One line: the largest relative energy error and its drift, the part that grows linearly."""
     energy = trajectory.energy()
     scale = abs(float(energy[0]))
     error = (energy - energy[0]) / (scale or 1.0)
     what = "relative energy error" if scale else "energy error"
-    if system.time in system.lagrangian.free_symbols:
+    if system.depends_on_time:
         return f"energy: L depends on time, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
     return f"{what}: {np.abs(error).max():.2e} at most, drift {_drift(trajectory.t, error):+.1e} over the run"
 
@@ -126,18 +130,19 @@ def _candidates(names: Sequence[str]) -> Iterator[MomentumMap]:
         )
 
 
-def _random_slopes(system: LagrangianSystem) -> Iterator[_Slopes]:
+def _random_slopes(system: MechanicalSystem) -> Iterator[_Slopes]:
     """A few random points, always the same, at which L can be differentiated."""
     generator = random.Random(20250101)
-    forces, momenta = force(system), momentum(system)
+    slopes = (force(system), momentum(system), constitutive(system))
     parameters = dict(zip(system.parameters, map(mp.mpf, system.defaults), strict=True))
     for _ in range(POINTS):
         q, v = (tuple(mp.mpf(generator.uniform(-1, 1)) for _ in system.coordinates) for _ in range(2))
         point: dict[sympy.Symbol, Number] = {**parameters, system.time: mp.mpf(generator.uniform(0, 1))}
-        point |= dict(zip((*system.coordinates, *system.velocities), (*q, *v), strict=True))
+        p = tuple(mp.mpf(generator.uniform(-1, 1)) for _ in system.auxiliaries)
+        point |= dict(zip((*system.coordinates, *system.velocities, *system.auxiliaries), (*q, *v, *p), strict=True))
         known: dict[sympy.Expr, Number] = {}
         try:
-            values = [tuple(evaluate(entry, point, known) for entry in entries) for entries in (forces, momenta)]
+            values = [tuple(evaluate(entry, point, known) for entry in entries) for entries in slopes]
         except ArithmeticError:
             continue
-        yield _Slopes(q=q, v=v, force=values[0], momentum=values[1])
+        yield _Slopes(q=q, v=v, force=values[0], momentum=values[1], p=p, constitutive=values[2])

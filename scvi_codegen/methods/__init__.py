@@ -60,7 +60,7 @@ METHODS: dict[str, Callable[..., Method]] = {
 
 ARGUMENTS: dict[str, tuple[str, ...]] = {
     "svi": ("degree", "quadrature", "nodes"),
-    "scvi": ("degree", "quadrature", "nodes", "variational"),
+    "scvi": ("degree", "quadrature", "nodes", "variational", "abscissae"),
     "sc": ("degree", "nodes", "form"),
     **dict.fromkeys(TABLEAU_METHODS, ("stages", "form")),
     "collocation": ("abscissae", "form"),
@@ -68,7 +68,12 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {
     "composition": ("order",),
     "explicit-euler": ("form",),
 }
-REQUIRED = ("degree", "stages", "abscissae", "order")
+REQUIRED = {
+    **dict.fromkeys(("svi", "scvi", "sc"), "degree"),
+    **dict.fromkeys(TABLEAU_METHODS, "stages"),
+    "collocation": "abscissae",
+    "composition": "order",
+}
 
 
 def method_from_specification(specification: Specification) -> Method:
@@ -87,9 +92,8 @@ def method_from_specification(specification: Specification) -> Method:
     for argument in arguments:
         if argument not in accepted:
             raise MethodError(f"{name} takes no {argument!r}; it takes {', '.join(accepted) or 'no arguments'}")
-    for argument in accepted:
-        if argument in REQUIRED and argument not in arguments:
-            raise MethodError(f"{name} needs {argument!r}")
+    if name in REQUIRED and REQUIRED[name] not in arguments:
+        raise MethodError(f"{name} needs {REQUIRED[name]!r}")
     if name == "composition":
         return Composition(arguments["order"])
     return METHODS[name](**arguments)

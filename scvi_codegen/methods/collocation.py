@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from scvi_codegen import tableau as tableaux
-from scvi_codegen.basis import differentiation_matrix, extrapolation, matrix_product
+from scvi_codegen.basis import differentiation_matrix, extrapolation, identity_matrix, matrix_product
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import accelerations, euler_lagrange, momentum
 from scvi_codegen.methods.galerkin import (
     EXTRAPOLATION_DEGREE,
     galerkin_system,
-    identity_matrix,
     position_block,
     resolve_nodes,
 )
@@ -34,7 +34,6 @@ from scvi_codegen.methods.method import Method, Specification, check_count, lagr
 from scvi_codegen.nodes import Nodes
 from scvi_codegen.precision import Matrix, Number, Vector, mp
 from scvi_codegen.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import Tableau
 
 __all__ = [
@@ -100,6 +99,11 @@ class RungeKutta(Method):
         """From the tableau; never promised in position form, where p is not an unknown."""
         return self.form == "phase-space" and self.tableau.is_symplectic
 
+    @property
+    def needs_regular(self) -> bool:
+        """In position form."""
+        return self.form == "position"
+
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
         family, _, stages = self.tableau.name.partition(":")
@@ -109,7 +113,7 @@ class RungeKutta(Method):
             return {"method": family, "form": self.form}
         return {"method": "collocation", "abscissae": [float(c) for c in self.tableau.c], "form": self.form}
 
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Symplectic tableaux by their generating function (exactly symplectic when rounded), others as they are."""
         tableau = self.tableau
         if self.form == "position":
@@ -127,7 +131,7 @@ class RungeKutta(Method):
             extrapolation=_extrapolation(tableau.c),
         )
 
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """The stage equations (22)-(23)."""
         return (position_system if self.form == "position" else phase_space_system)(system, self.tableau)
 
@@ -187,22 +191,27 @@ class SpectralCollocation(Method):
         """From the equivalent tableau, in phase space."""
         return self.form == "phase-space" and self.tableau.is_symplectic
 
+    @property
+    def needs_regular(self) -> bool:
+        """In position form."""
+        return self.form == "position"
+
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
         return {"method": "sc", "degree": self.degree, "nodes": self.node_set.name, "form": self.form}
 
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """The equivalent Runge-Kutta stage equations."""
         return (position_system if self.form == "position" else phase_space_system)(system, self.tableau)
 
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """(18) with unknowns Q^1 .. Q^s and v0, or (21) with the stage velocities V_i as unknowns for H_p."""
         if self.form == "position":
             return nodal_collocation(system, self.node_set)
         return phase_space_system(system, self.tableau)
 
 
-def phase_space_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
+def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """(22) on Hamilton's equations, momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
     family = PointFamily(
@@ -243,7 +252,7 @@ def phase_space_system(system: LagrangianSystem, tableau: Tableau) -> StageSyste
     )
 
 
-def position_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
+def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """(22) on (q, v): unknowns v0 and z_i = h a_i; v0 from p0 by the Legendre transform, p1 from v1."""
     b, size = tableau.b, len(tableau.b)
     momenta = momentum(system)
@@ -280,7 +289,7 @@ def position_system(system: LagrangianSystem, tableau: Tableau) -> StageSystem:
 
 
 def residual_family(
-    system: LagrangianSystem,
+    system: MechanicalSystem,
     abscissae: Vector,
     gathers: tuple[Gather, ...],
     residual: Scatter,
@@ -306,7 +315,7 @@ def acceleration_unknowns(size: int) -> tuple[Block, ...]:
 
 
 def acceleration_gathers(
-    system: LagrangianSystem, A: Matrix, *, other_blocks: int = 0
+    system: MechanicalSystem, A: Matrix, *, other_blocks: int = 0
 ) -> tuple[Gather, Gather, Gather]:
     """Position, velocity and acceleration at the stages from (q0, v0, z_1 .. z_s).
 
@@ -336,7 +345,7 @@ def acceleration_extrapolation(tableau: Tableau) -> Matrix:
     return ((mp.one, *tableau.b), *((mp.zero, *inner[i]) for i in range(size)))
 
 
-def nodal_collocation(system: LagrangianSystem, nodes: Nodes) -> StageSystem:
+def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
     """(18) as printed: unknowns Q^1 .. Q^s and v0; v0 from p0, p1 from v1 = V_s by the Legendre transform."""
     size = nodes.degree
     momenta = momentum(system)
@@ -374,7 +383,7 @@ def nodal_blocks(nodes: Nodes) -> tuple[Block, ...]:
     return (*(position_block(v, nodes) for v in range(1, nodes.degree + 1)), VELOCITY_BLOCK)
 
 
-def nodal_gathers(system: LagrangianSystem, nodes: Nodes, *, other_blocks: int = 0) -> tuple[Gather, Gather, Gather]:
+def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int = 0) -> tuple[Gather, Gather, Gather]:
     """Q^i, V_i = (A Q + a0 q0)_i (15) and (A V + a0 v0)_i (16) at nodes 1 .. s, from (q0; Q^1 .. Q^s, v0)."""
     size = nodes.degree
     full = differentiation_matrix(nodes.points)[1:]
@@ -413,7 +422,7 @@ def nodal_gathers(system: LagrangianSystem, nodes: Nodes, *, other_blocks: int =
 
 
 def _single_point(
-    system: LagrangianSystem, name: str, abscissa: Number, position: Table, *, velocity_block: int = 0
+    system: MechanicalSystem, name: str, abscissa: Number, position: Table, *, velocity_block: int = 0
 ) -> PointFamily:
     """One point whose velocity is the block ``velocity_block`` alone; scatters are added by the caller."""
     columns = len(position.entries[0])

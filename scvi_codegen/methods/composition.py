@@ -13,13 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
+from scvi_codegen.basis import identity_matrix
 from scvi_codegen.errors import MethodError
+from scvi_codegen.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, is_separable, momentum
-from scvi_codegen.methods.galerkin import identity_matrix
 from scvi_codegen.methods.method import Method, Specification
 from scvi_codegen.precision import Vector, mp
 from scvi_codegen.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["Composition", "kicks_and_drifts"]
 
@@ -111,9 +112,10 @@ class Composition(Method):
         """See :meth:`Method.specification`."""
         return {"method": "composition", "order": self.composition_order}
 
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns: the velocities V_k of the drifts; explicit, row after row."""
-        if not is_separable(system):
+        twin = lagrangian_twin(system)
+        if twin is None or not is_separable(twin):
             raise MethodError(
                 f"{self.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses; "
                 f"'{system.name}' is not: use an SVI"
@@ -123,19 +125,19 @@ class Composition(Method):
         return StageSystem(
             blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k in range(1, size + 1)),
             rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k in range(1, size + 1)),
-            families=(_kick_family(system, gamma), _drift_family(system, gamma)),
+            families=(_kick_family(twin, gamma), _drift_family(twin, gamma)),
             end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (gamma,))),
             end_momentum=mp.one,
             end_numbers=("q1", "p1"),
             extrapolation=identity_matrix(size),
         )
 
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """The same equations: the paper does not use the method."""
         return self.stage_system(system)
 
 
-def _kick_family(system: LagrangianSystem, gamma: Vector) -> PointFamily:
+def _kick_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
     """L_q at the s + 1 positions before, between and after the drifts; it kicks all velocities that follow."""
     size = len(gamma)
     drifted = tuple(tuple(x if k < n else mp.zero for k, x in enumerate(gamma)) for n in range(size + 1))
@@ -162,7 +164,7 @@ def _kick_family(system: LagrangianSystem, gamma: Vector) -> PointFamily:
     )
 
 
-def _drift_family(system: LagrangianSystem, gamma: Vector) -> PointFamily:
+def _drift_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
     """L_v at the velocity of each of the s drifts, which is its momentum."""
     size = len(gamma)
     return PointFamily(

@@ -15,8 +15,9 @@ import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 
-from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, extrapolation
+from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, extrapolation, identity_matrix
 from scvi_codegen.errors import MethodError, MethodWarning
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.method import Method, Specification, check_count, unit_sum
 from scvi_codegen.nodes import Nodes, nodes_by_name
 from scvi_codegen.precision import Matrix, Vector, mp
@@ -32,14 +33,12 @@ from scvi_codegen.stage_system import (
     stationary_increments,
     stationary_nodal,
 )
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import lobatto_iiia
 
 __all__ = [
     "SVI",
     "StoermerVerlet",
     "galerkin_system",
-    "identity_matrix",
     "nodal_quadrature_family",
     "position_block",
     "resolve_nodes",
@@ -123,11 +122,16 @@ class SVI(Method):
         """Always."""
         return True
 
+    @property
+    def needs_regular(self) -> bool:
+        """With more (or fewer) points than the degree: velocities at the points are then not independent."""
+        return len(self.rule) != self.degree
+
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
         return {"method": "svi", "degree": self.degree, "quadrature": self.rule.name, "nodes": self.node_set.name}
 
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns V_b at the quadrature points if there are s of them, else at the s Gauss points."""
         rule = self.rule
         points = rule.abscissae if len(rule) == self.degree else gauss_legendre(self.degree).abscissae
@@ -141,7 +145,7 @@ class SVI(Method):
             extrapolation=extrapolation(points, 1, min(self.degree - 1, EXTRAPOLATION_DEGREE)),
         )
 
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c)."""
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
@@ -196,7 +200,7 @@ class StoermerVerlet(Method):
         """See :meth:`Method.specification`."""
         return {"method": "stoermer-verlet"}
 
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """The pair written by its generating function, unknowns V_1, V_2."""
         tableau = lobatto_iiia(2)
         return galerkin_system(
@@ -209,13 +213,13 @@ class StoermerVerlet(Method):
             extrapolation=extrapolation(tableau.c, 1),
         )
 
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """The same equations: the paper uses the method without printing it."""
         return self.stage_system(system)
 
 
 def galerkin_system(
-    system: LagrangianSystem,
+    system: MechanicalSystem,
     *,
     abscissae: Vector,
     weights: Vector,
@@ -267,7 +271,7 @@ def galerkin_system(
 
 
 def nodal_quadrature_family(
-    system: LagrangianSystem, nodes: Nodes, rule: Quadrature, *, other_blocks: int = 0
+    system: MechanicalSystem, nodes: Nodes, rule: Quadrature, *, other_blocks: int = 0
 ) -> ScalarFamily:
     """The quadrature of L along the interpolant through Q^0 .. Q^s, in the paper's notation.
 
@@ -322,8 +326,3 @@ def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
 def position_block(v: int, nodes: Nodes) -> Block:
     """The unknown Q^v, first guessed on the straight line."""
     return Block(name=f"Q_{v}", power=0, straight=(mp.one, (nodes.points[v] + 1) / 2))
-
-
-def identity_matrix(size: int) -> Matrix:
-    """The (size, size) identity."""
-    return tuple(tuple(mp.mpf(int(i == j)) for j in range(size)) for i in range(size))

@@ -8,12 +8,13 @@ from collections.abc import Mapping, Sequence
 import sympy
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
 from scvi_codegen.precision import Number, Vector, mp
 from scvi_codegen.stage_system import PointFamily, Scatter, StageSystem, dyadic
-from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["Method", "Specification", "check_count", "lagrangian_scatters", "unit_sum"]
+__all__ = ["Method", "Specification", "check_count", "check_regular", "lagrangian_scatters", "unit_sum"]
 
 Specification = Mapping[str, str | int | bool | Sequence[float]]
 
@@ -44,6 +45,11 @@ class Method(ABC):
         """Whether the step preserves dq ^ dp for every regular Lagrangian."""
 
     @property
+    def needs_regular(self) -> bool:
+        """Whether momenta must be determined by velocities: for a Hamiltonian, d2H/dp2 regular."""
+        return False
+
+    @property
     @abstractmethod
     def title(self) -> str:
         """One line for people."""
@@ -53,12 +59,22 @@ class Method(ABC):
         """The method as plain data, read back by ``method_from_specification`` (model files, command line)."""
 
     @abstractmethod
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """The equations as compiled: velocities as unknowns."""
 
     @abstractmethod
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """The equations as the paper prints them."""
+
+
+def check_regular(method: Method, system: MechanicalSystem) -> None:
+    """Raise :class:`MethodError` for a Hamiltonian that determines no velocities and a method that needs them."""
+    if method.needs_regular and isinstance(system, HamiltonianSystem) and not system.is_regular:
+        raise MethodError(
+            f"{method.name} needs a Hamiltonian that determines momenta by velocities, but d2H/dp2 of '{system.name}' "
+            "is singular: use an SVI with as many quadrature points as its degree, or a Runge-Kutta or collocation "
+            "method in phase-space form"
+        )
 
 
 def check_count(value: int, what: str, *, least: int = 1) -> None:
@@ -83,7 +99,7 @@ def unit_sum(weights: Sequence[Number]) -> Vector:
 
 
 def lagrangian_scatters(
-    family: PointFamily, system: LagrangianSystem, force_scatter: Scatter, momentum_scatter: Scatter
+    family: PointFamily, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
 ) -> PointFamily:
     """``family`` with L_q and L_v as kernel results, scattered as given (their ``results`` are filled in)."""
     filled = (

@@ -15,10 +15,13 @@ map: ``variational=False`` gives it, to reproduce the paper.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, matrix_product
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import multiplied_residual, multipliers
 from scvi_codegen.methods.collocation import (
     acceleration_extrapolation,
@@ -46,10 +49,12 @@ from scvi_codegen.stage_system import (
     stationary_increments,
     stationary_nodal,
 )
-from scvi_codegen.system import LagrangianSystem
-from scvi_codegen.tableau import Tableau, collocation_tableau
+from scvi_codegen.tableau import Tableau, collocation_tableau, tableau_by_name
 
 __all__ = ["SCVI"]
+
+COLLOCATION_FAMILIES = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")
+"""Families of tableaux that are collocation on their abscissae."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,24 +65,35 @@ class SCVI(Method):
         degree: degree s of the collocation polynomial, at least 1.
         quadrature: rule for the action, an object or a name; default: s-point Gauss-Legendre.
         nodes: collocation nodes of that degree, containing both ends; default Chebyshev-Lobatto (the paper's).
+        abscissae: collocation abscissae in [0, 1] in place of nodes, s distinct numbers or the name of a family:
+            ``"gauss"``, ``"radau-iia"``, ``"lobatto-iiia"``, ``"chebyshev-gauss"`` or ``"chebyshev-lobatto"``, s points
+            of it. On symmetric ones the step is reversible; Gauss with s Gauss points is, for constant mass, the SVI.
         variational: ``True`` differentiates the discrete Lagrangian in full: symplectic and momentum-preserving, order
             min(2s, order of the quadrature). ``False`` is the paper's printed form (34a)-(34e), which drops the
             chain-rule term: for degree >= 2 it is neither symplectic nor momentum-preserving.
 
     Raises:
-        MethodError: on a degree below 1, nodes without the end points or of another degree.
+        MethodError: on a degree below 1, nodes without the end points or of another degree, abscissae beside nodes or
+            of another number, and for the printed form on abscissae, which needs nodes at both ends.
     """
 
     degree: int
     quadrature: Quadrature | str | None = None
     nodes: Nodes | str | None = None
     variational: bool = True
+    abscissae: Sequence[Any] | str | None = None
 
     def __post_init__(self) -> None:
         check_count(self.degree, "the degree of a spectral-collocation variational integrator")
         if not isinstance(self.variational, bool):
             raise MethodError(f"variational is True or False, not {self.variational!r}")
         object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
+        if self.abscissae is not None:
+            if self.nodes is not None:
+                raise MethodError("give nodes or abscissae, not both: they say where the curve is collocated")
+            if not self.variational:
+                raise MethodError("the form printed in the paper needs nodes at both ends: leave out the abscissae")
+            object.__setattr__(self, "abscissae", _resolve_abscissae(self.abscissae, self.degree))
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
 
     @property
@@ -88,28 +104,39 @@ class SCVI(Method):
 
     @property
     def node_set(self) -> Nodes:
-        """The nodes, resolved."""
+        """The nodes, resolved; without meaning where abscissae are given."""
         assert isinstance(self.nodes, Nodes)
         return self.nodes
 
     @property
     def tableau(self) -> Tableau:
-        """The collocation tableau (23) on the nodes 1 .. s."""
-        return collocation_tableau(tuple((x + 1) / 2 for x in self.node_set.points[1:]))
+        """The collocation tableau (23) on the nodes 1 .. s, or on the abscissae."""
+        if self.abscissae is None:
+            return collocation_tableau(tuple((x + 1) / 2 for x in self.node_set.points[1:]))
+        if isinstance(self.abscissae, str):
+            return tableau_by_name(f"{self.abscissae}:{self.degree}")
+        return collocation_tableau(self.abscissae)
+
+    @property
+    def places(self) -> str:
+        """Where the curve is collocated, for people: ``chebyshev-lobatto nodes``, ``gauss abscissae``."""
+        if self.abscissae is None:
+            return f"{self.node_set.name} nodes"
+        return f"{self.abscissae} abscissae" if isinstance(self.abscissae, str) else "own abscissae"
 
     @property
     def name(self) -> str:
-        """``scvi[-printed]-<degree>-<nodes>-<quadrature>``."""
+        """``scvi[-printed]-<degree>-<nodes or abscissae>-<quadrature>``."""
         form = "scvi" if self.variational else "scvi-printed"
-        return f"{form}-{self.degree}-{self.node_set.name}-{self.rule.name.replace(':', '-')}"
+        places = self.places.removesuffix(" nodes").replace(" ", "-")
+        return f"{form}-{self.degree}-{places}-{self.rule.name.replace(':', '-')}"
 
     @property
     def title(self) -> str:
         """One line for people."""
         form = "" if self.variational else ", as printed in the paper"
         return (
-            f"Spectral-collocation variational integrator, degree {self.degree}, {self.node_set.name} nodes, "
-            f"{self.rule.name}{form}"
+            f"Spectral-collocation variational integrator, degree {self.degree}, {self.places}, {self.rule.name}{form}"
         )
 
     @property
@@ -131,31 +158,53 @@ class SCVI(Method):
         """Yes, but for the printed form of degree >= 2."""
         return self.variational or self.degree == 1
 
+    @property
+    def needs_regular(self) -> bool:
+        """The Euler-Lagrange equations are collocated, but for degree 1 with one point."""
+        return self.degree > 1 or len(self.rule) > 1
+
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {
-            "method": "scvi",
-            "degree": self.degree,
-            "quadrature": self.rule.name,
-            "nodes": self.node_set.name,
-            "variational": self.variational,
-        }
+        common: dict[str, Any] = {"method": "scvi", "degree": self.degree, "quadrature": self.rule.name}
+        if self.abscissae is None:
+            return common | {"nodes": self.node_set.name, "variational": self.variational}
+        named = isinstance(self.abscissae, str)
+        return common | {"abscissae": self.abscissae if named else [float(c) for c in self.abscissae]}
 
-    def stage_system(self, system: LagrangianSystem) -> StageSystem:
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI of degree 1 with the same quadrature."""
         if self.degree == 1:
             return SVI(1, self.rule, self.node_set).stage_system(system)
         build = _shooting_increments if self.variational else _printed_increments
         return build(system, self.tableau, self.rule, self.node_set)
 
-    def paper_form(self, system: LagrangianSystem) -> StageSystem:
-        """(34a)-(34e), with the multiplier terms unless the degree is 1 (where they vanish) or as printed."""
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
+        """(34a)-(34e), with the multiplier terms unless the degree is 1 (where they vanish) or as printed.
+
+        On abscissae, which the paper does not write out: the compiled equations, unknowns v0, h a_i and h^-2 lambda_i.
+        """
+        if self.abscissae is not None:
+            return self.stage_system(system)
         if self.variational and self.degree > 1:
             return _shooting_nodal(system, self.node_set, self.rule)
         return _printed_nodal(system, self.node_set, self.rule)
 
 
-def _shooting_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadrature, _nodes: Nodes) -> StageSystem:
+def _resolve_abscissae(abscissae: Sequence[Any] | str, degree: int) -> Vector | str:
+    """The name of a family of collocation methods, or s numbers."""
+    if isinstance(abscissae, str):
+        if abscissae not in COLLOCATION_FAMILIES:
+            raise MethodError(
+                f"there are no abscissae called {abscissae!r}: give {', '.join(COLLOCATION_FAMILIES)}, or numbers"
+            )
+        return abscissae
+    numbers = tuple(collocation_tableau(tuple(abscissae)).c)
+    if len(numbers) != degree:
+        raise MethodError(f"a curve of degree {degree} has {degree} abscissae, not {len(numbers)}")
+    return numbers
+
+
+def _shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, _nodes: Nodes) -> StageSystem:
     """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i)."""
     size = len(tableau.b)
     position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
@@ -189,7 +238,7 @@ def _shooting_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadr
     )
 
 
-def _multiplier_family(system: LagrangianSystem, tableau: Tableau) -> ScalarFamily:
+def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFamily:
     """The collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
     size = len(tableau.b)
     position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
@@ -223,7 +272,7 @@ def _curve(tableau: Tableau, at: Vector) -> tuple[Matrix, Matrix, Vector]:
 
 
 def _curve_gathers(
-    system: LagrangianSystem, position: Matrix, velocity: Matrix, *, other_blocks: int = 0
+    system: MechanicalSystem, position: Matrix, velocity: Matrix, *, other_blocks: int = 0
 ) -> tuple[Gather, Gather]:
     points = len(position)
     padding = Table.constant(points, other_blocks)
@@ -241,7 +290,7 @@ def _curve_gathers(
     )
 
 
-def _printed_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
+def _printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
     """(34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
     size, points = len(tableau.b), len(rule)
     position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
@@ -285,7 +334,7 @@ def _printed_increments(system: LagrangianSystem, tableau: Tableau, rule: Quadra
     )
 
 
-def _shooting_nodal(system: LagrangianSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+def _shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
     """G = L_d + sum lambda_i . E_i in the paper's unknowns Q^1 .. Q^s, v0 and lambda_1 .. lambda_s."""
     size = nodes.degree
     own = Gather(
@@ -320,7 +369,7 @@ def _shooting_nodal(system: LagrangianSystem, nodes: Nodes, rule: Quadrature) ->
     )
 
 
-def _printed_nodal(system: LagrangianSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+def _printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
     """(34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
     size = nodes.degree
     action = nodal_quadrature_family(system, nodes, rule, other_blocks=1)

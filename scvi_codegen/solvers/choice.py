@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import is_separable
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
 from scvi_codegen.methods.method import Method
@@ -26,8 +28,16 @@ from scvi_codegen.system import LagrangianSystem
 __all__ = ["check_solver", "sweep_of"]
 
 
-def sweep_of(system: LagrangianSystem, method: Method) -> Sweep | None:
-    """The fixed-point iteration of a method for a system, or ``None`` where there is none."""
+def sweep_of(system: MechanicalSystem, method: Method) -> Sweep | None:
+    """The fixed-point iteration of a method for a system, or ``None`` where there is none.
+
+    Of a Hamiltonian that has a Lagrangian it is the one of the Lagrangian: the step is the same (35f).
+    """
+    twin = lagrangian_twin(system)
+    return None if twin is None else _lagrangian_sweep(twin, method)
+
+
+def _lagrangian_sweep(system: LagrangianSystem, method: Method) -> Sweep | None:
     if isinstance(method, SCVI) and method.degree > 1:
         return shooting_sweep(system, method) if method.variational else printed_sweep(system, method)
     separable = is_separable(system)

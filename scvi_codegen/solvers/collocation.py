@@ -12,19 +12,19 @@ from collections.abc import Iterable
 
 from scvi_codegen.basis import cardinal_slopes, cardinal_values
 from scvi_codegen.lowering import lower_kernel
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import applied_force, mass_entries
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.precision import Number
 from scvi_codegen.program import CollocationSweep, Kernel, PrintedEnds
 from scvi_codegen.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.solvers.padding import MOST_LANES, lane_count, pad_vector
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import Tableau
 
 __all__ = ["position_sweep", "printed_sweep"]
 
 
-def position_sweep(system: LagrangianSystem, tableau: Tableau) -> CollocationSweep | None:
+def position_sweep(system: MechanicalSystem, tableau: Tableau) -> CollocationSweep | None:
     """The fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
     lanes = lane_count(len(tableau.b))
     if lanes > MOST_LANES:
@@ -40,7 +40,7 @@ def position_sweep(system: LagrangianSystem, tableau: Tableau) -> CollocationSwe
     )
 
 
-def printed_sweep(system: LagrangianSystem, method: SCVI) -> CollocationSweep | None:
+def printed_sweep(system: MechanicalSystem, method: SCVI) -> CollocationSweep | None:
     """The fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
     lanes = lane_count(max(method.degree, len(method.rule)))
     if lanes > MOST_LANES:
@@ -72,7 +72,7 @@ def _printed_ends(method: SCVI, lanes: int) -> PrintedEnds:
     )
 
 
-def _node_kernel(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+def _node_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
     """L_q - L_vq v - L_vt and the lower triangle of the mass."""
     mass = {key: entry for key, entry in mass_entries(system).items() if key[0] >= key[1]}
     kernel = lower_kernel(

@@ -14,19 +14,19 @@ from __future__ import annotations
 from scvi_codegen.basis import transpose
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.lowering import lower_kernel
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
 from scvi_codegen.precision import Matrix, Vector, mp
 from scvi_codegen.program import CoupledSweep, Kernel
 from scvi_codegen.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.solvers.velocity_tables import VelocityTables
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["coupled_sweep"]
 
 FRACTION_BITS = 51
 
 
-def coupled_sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | None:
+def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSweep | None:
     """The fixed-point iteration of a system; ``None`` with too many points."""
     points, blocks = len(tables.abscissae), len(tables.blocks)
     lanes = lane_count(max(points, blocks))
@@ -72,7 +72,7 @@ def _over(numbers: Vector, divisors: Vector) -> Vector:
     return tuple(x / y for x, y in zip(numbers, divisors, strict=True))
 
 
-def _force_kernel(system: LagrangianSystem) -> Kernel:
+def _force_kernel(system: MechanicalSystem) -> Kernel:
     return lower_kernel(
         "force_lanes",
         arguments=(*system.coordinates, *system.velocities),
@@ -82,7 +82,7 @@ def _force_kernel(system: LagrangianSystem) -> Kernel:
     )
 
 
-def _point_kernel(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+def _point_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
     """L_q, L_v and the lower triangle of the mass."""
     momenta = momentum(system)
     mass = {key: entry for key, entry in jacobian(momenta, system.velocities).items() if key[0] >= key[1]}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from scvi_codegen.basis import cardinal_integrals, cardinal_values
 from scvi_codegen.lowering import lower_kernel
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
 from scvi_codegen.precision import mp
 from scvi_codegen.program import NodeTables, PointTables
 from scvi_codegen.quadrature import Quadrature
 from scvi_codegen.solvers.padding import guess_tables, pad_matrix, pad_vector
-from scvi_codegen.system import LagrangianSystem
 from scvi_codegen.tableau import Tableau
 
 __all__ = ["node_tables", "point_tables"]
@@ -28,7 +28,7 @@ def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
     )
 
 
-def point_tables(system: LagrangianSystem, tableau: Tableau, rule: Quadrature, lanes: int) -> PointTables:
+def point_tables(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, lanes: int) -> PointTables:
     """The points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
     return PointTables(
         abscissae=pad_vector(rule.abscissae, lanes, repeat=True),

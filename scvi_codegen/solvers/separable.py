@@ -14,17 +14,17 @@ from __future__ import annotations
 from scvi_codegen.basis import matrix_product
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.lowering import lower_kernel
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
 from scvi_codegen.precision import mp
 from scvi_codegen.program import Kernel, SeparableSweep
 from scvi_codegen.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_split, pad_split_matrix, pad_vector
 from scvi_codegen.solvers.velocity_tables import VelocityTables
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["separable_sweep"]
 
 
-def separable_sweep(system: LagrangianSystem, tables: VelocityTables) -> SeparableSweep | None:
+def separable_sweep(system: MechanicalSystem, tables: VelocityTables) -> SeparableSweep | None:
     """The fixed-point iteration of a separable system; ``None`` with too many points."""
     lanes = lane_count(len(tables.abscissae))
     if lanes > MOST_LANES:
@@ -46,7 +46,7 @@ def separable_sweep(system: LagrangianSystem, tables: VelocityTables) -> Separab
     )
 
 
-def _force_kernel(system: LagrangianSystem) -> Kernel:
+def _force_kernel(system: MechanicalSystem) -> Kernel:
     return lower_kernel(
         "force_lanes",
         arguments=system.coordinates,
@@ -56,7 +56,7 @@ def _force_kernel(system: LagrangianSystem) -> Kernel:
     )
 
 
-def _mass_kernel(system: LagrangianSystem) -> Kernel:
+def _mass_kernel(system: MechanicalSystem) -> Kernel:
     return lower_kernel(
         "mass",
         arguments=(),

@@ -12,6 +12,7 @@ from sympy import S
 from scvi_codegen.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
 from scvi_codegen.derivatives import gradient
 from scvi_codegen.lowering import lower_kernel
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import (
     accelerations,
     euler_lagrange,
@@ -23,7 +24,6 @@ from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.program import Kernel, ShootingSweep
 from scvi_codegen.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["shooting_sweep"]
 
@@ -31,7 +31,7 @@ LARGEST_DIMENSION = 8
 """Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
 
 
-def shooting_sweep(system: LagrangianSystem, method: SCVI) -> ShootingSweep | None:
+def shooting_sweep(system: MechanicalSystem, method: SCVI) -> ShootingSweep | None:
     """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
     tableau, rule = method.tableau, method.rule
     lanes = lane_count(max(len(tableau.b), len(rule)))
@@ -54,7 +54,7 @@ def shooting_sweep(system: LagrangianSystem, method: SCVI) -> ShootingSweep | No
     )
 
 
-def _node_kernel(system: LagrangianSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+def _node_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
     """E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
     scalar = multiplied_residual(system)
     slopes = gradient(scalar, (*system.coordinates, *system.velocities))

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
+from scvi_codegen.hamiltonian import lagrangian_twin
 from scvi_codegen.lowering import lower_kernel, lower_vector
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, is_separable, mass_entries
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.methods.galerkin import StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import mp
 from scvi_codegen.program import Splitting
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["splitting_of"]
 
 
-def splitting_of(system: LagrangianSystem, method: Method) -> Splitting | None:
+def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """The sequence of kicks and drifts, or ``None`` where the method is implicit."""
     if isinstance(method, StoermerVerlet):
         method = Composition(2)
-    if not isinstance(method, Composition) or not is_separable(system):
+    twin = lagrangian_twin(system) if isinstance(method, Composition) else None
+    if twin is None or not is_separable(twin):
         return None
+    assert isinstance(method, Composition)  # or there would be no twin
     kicks, drifts = kicks_and_drifts(method.fractions)
     common = {"time": system.time, "parameters": system.parameters}
-    mass = mass_entries(system)
+    mass = mass_entries(twin)
     return Splitting(
         kicks=lower_vector(kicks),
         drifts=lower_vector(drifts),
         abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
-        force=lower_kernel("force", arguments=system.coordinates, values=force(system), **common),
+        force=lower_kernel("force", arguments=system.coordinates, values=force(twin), **common),
         mass=lower_kernel("mass", arguments=(), values=tuple(mass.values()), **common),
     )

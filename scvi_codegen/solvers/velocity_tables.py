@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.basis import matrix_product, transpose
+from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import is_separable
 from scvi_codegen.methods.collocation import phase_space_system
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import Matrix, Vector, mp
 from scvi_codegen.quadrature import gauss_legendre
 from scvi_codegen.stage_system import PointFamily, StageSystem
-from scvi_codegen.system import LagrangianSystem
 
 __all__ = ["VelocityTables", "velocity_tables"]
 
@@ -48,7 +48,7 @@ class VelocityTables:
     variational: bool
 
 
-def velocity_tables(system: LagrangianSystem, method: Method) -> VelocityTables | None:
+def velocity_tables(system: MechanicalSystem, method: Method) -> VelocityTables | None:
     """Those of a method for a system, or ``None`` where its equations have another shape."""
     stages = _velocity_stages(system, method)
     if stages is None:
@@ -71,7 +71,7 @@ def velocity_tables(system: LagrangianSystem, method: Method) -> VelocityTables 
     )
 
 
-def _velocity_stages(system: LagrangianSystem, method: Method) -> StageSystem | None:
+def _velocity_stages(system: MechanicalSystem, method: Method) -> StageSystem | None:
     """Stage equations with one family whose kernel is (L_q, L_v) and whose unknowns are velocities."""
     if getattr(method, "form", None) == "position":
         return phase_space_system(system, method.tableau) if is_separable(system) else None  # type: ignore[attr-defined]
