@@ -229,7 +229,7 @@ static void quadrature_slope(const double *u, const double *parameters, double *
   slope[2] = w6;
 }
 
-/* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
+/* Derivatives of d^1L/dt^1 at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
 static void node_value(const double *u, const double *parameters, double *value)
 {
   value[2] = 0.0;
@@ -1464,8 +1464,8 @@ int kepler_scvi_2_advance(kepler_scvi_2_run *run, long long steps, long long eve
   return KEPLER_SCVI_2_OK;
 }
 
-/* h sum_n w_n L along the curve given by z. */
-static double action_sum(const step_data *step, const double *z)
+/* h^1 sum_n w_n lagrangian along the curve given by z. */
+static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0.0;
@@ -1507,6 +1507,6 @@ int kepler_scvi_2_discrete_legendre(double t, double h, const double *q0, const 
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  *action = action_sum(&step, data.z);
+  *action = quadrature_sum(&step, data.z);
   return KEPLER_SCVI_2_OK;
 }

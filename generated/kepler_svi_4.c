@@ -1148,8 +1148,8 @@ int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every
   return KEPLER_SVI_4_OK;
 }
 
-/* h sum_n w_n L along the curve given by z. */
-static double action_sum(const step_data *step, const double *z)
+/* h^1 sum_n w_n lagrangian along the curve given by z. */
+static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0.0;
@@ -1191,6 +1191,6 @@ int kepler_svi_4_discrete_legendre(double t, double h, const double *q0, const d
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  *action = action_sum(&step, data.z);
+  *action = quadrature_sum(&step, data.z);
   return KEPLER_SVI_4_OK;
 }

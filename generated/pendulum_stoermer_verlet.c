@@ -764,8 +764,8 @@ int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long lon
   return PENDULUM_STOERMER_VERLET_OK;
 }
 
-/* h sum_n w_n L along the curve given by z. */
-static double action_sum(const step_data *step, const double *z)
+/* h^1 sum_n w_n lagrangian along the curve given by z. */
+static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0.0;
@@ -807,6 +807,6 @@ int pendulum_stoermer_verlet_discrete_legendre(double t, double h, const double 
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  *action = action_sum(&step, data.z);
+  *action = quadrature_sum(&step, data.z);
   return PENDULUM_STOERMER_VERLET_OK;
 }

@@ -1085,8 +1085,8 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
   return TWO_POINT_PENDULUM_OK;
 }
 
-/* h sum_n w_n L along the curve given by z. */
-static double action_sum(const step_data *step, const double *z)
+/* h^1 sum_n w_n lagrangian along the curve given by z. */
+static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0.0;
@@ -1128,6 +1128,6 @@ int two_point_pendulum_discrete_legendre(double t, double h, const double *q0, c
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  *action = action_sum(&step, data.z);
+  *action = quadrature_sum(&step, data.z);
   return TWO_POINT_PENDULUM_OK;
 }

@@ -106,7 +106,7 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         defaults=program.parameter_defaults,
         unknowns=program.unknowns,
         workspace=workspace_size(program),
-        has_action=program.action is not None,
+        has_action=program.action,
     )
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import sympy
 
@@ -24,7 +25,7 @@ from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import accelerations, auxiliary_multipliers, legendre_map, multipliers
+from scvi_codegen.mechanics import auxiliary_multipliers, curve_rates, legendre_map, multipliers
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.ordering import bandwidth, places
 from scvi_codegen.precision import Matrix, Vector
@@ -308,9 +309,7 @@ def lower(
     state, transformed = legendre_map(system)
     mass = jacobian(transformed, state[system.dimension :])
     legendre = lower_kernel("legendre", arguments=state, values=transformed, slopes=tuple(mass.values()), **common)
-    point = (*system.coordinates, *system.velocities, *system.auxiliaries)
-    lagrangian = lower_kernel("lagrangian", arguments=point, values=(system.lagrangian,), **common)
-    hamiltonian = lower_kernel("hamiltonian", arguments=state, values=(system.formula,), **common)
+    energy = "hamiltonian" if system.auxiliaries else "lagrangian"
     families = tuple(_family(system, family) for family in stages.families)
     met = [*mass, *_meetings(families if newton else ())]
     order = places(met, system.dimension)
@@ -333,9 +332,8 @@ def lower(
         extrapolation=lower_matrix(_required_extrapolation(stages)),
         legendre=legendre,
         mass_entries=tuple(mass),
-        lagrangian=lagrangian,
-        hamiltonian=hamiltonian if system.auxiliaries else None,
-        action=stages.action[0] if stages.action and newton and _is_regular(system) else None,
+        energy=lower_kernel(energy, arguments=state, values=(system.formula,), **common),
+        hamiltonian=bool(system.auxiliaries),
         sweep=sweep,
         splitting=splitting,
         newton=newton,
@@ -374,7 +372,11 @@ def _required_extrapolation(stages: StageSystem) -> Matrix:
 
 
 def _family(system: MechanicalSystem, family: PointFamily) -> Family:
-    common = {"arguments": family.arguments, "time": system.time, "parameters": system.parameters}
+    common: dict[str, Any] = {
+        "arguments": family.arguments,
+        "time": system.time,
+        "parameters": system.parameters,
+    }
     slopes, blocks = _slope_blocks(family)
     return Family(
         name=family.name,
@@ -386,7 +388,15 @@ def _family(system: MechanicalSystem, family: PointFamily) -> Family:
         value=lower_kernel(f"{family.name}_value", values=family.results, **common),
         slope=lower_kernel(f"{family.name}_slope", values=family.results, slopes=slopes, **common),
         blocks=blocks,
+        action=_action(family, common) if family.in_action and _is_regular(system) else None,
+        action_power=family.scalar_power,
     )
+
+
+def _action(family: PointFamily, common: dict[str, Any]) -> Kernel:
+    """The scalar of a family; that of the values is called after the function it is."""
+    name = "lagrangian" if family.name == "quadrature" else f"{family.name}_action"
+    return lower_kernel(name, values=(family.scalar,), **common)
 
 
 def _argument(system: MechanicalSystem, gather: Gather) -> str:
@@ -394,7 +404,7 @@ def _argument(system: MechanicalSystem, gather: Gather) -> str:
     names = {
         system.coordinates: "q",
         system.velocities: "v",
-        accelerations(system): "a",
+        **dict(zip(curve_rates(system, 3), ("a", "j", "s"), strict=True)),
         multipliers(system): "lambda",
         system.auxiliaries: "p",
         auxiliary_multipliers(system): "nu",

@@ -20,10 +20,12 @@ __all__ = [
     "applied_force",
     "auxiliary_multipliers",
     "constitutive",
+    "curve_rates",
     "energy",
     "euler_lagrange",
     "force",
     "is_separable",
+    "lagrangian_rates",
     "legendre_map",
     "mass_entries",
     "momentum",
@@ -35,6 +37,12 @@ __all__ = [
 def accelerations(system: MechanicalSystem) -> tuple[sympy.Symbol, ...]:
     """The m symbols that stand for second time derivatives."""
     return tuple(sympy.Symbol(f"{q.name}_ddot", real=True) for q in system.coordinates)
+
+
+def curve_rates(system: MechanicalSystem, count: int) -> tuple[tuple[sympy.Symbol, ...], ...]:
+    """The symbols of the second and ``count - 1`` higher time derivatives of q, m each."""
+    higher = [[sympy.Symbol(f"{q.name}_d{k}", real=True) for q in system.coordinates] for k in range(3, count + 2)]
+    return (accelerations(system), *map(tuple, higher))[:count]
 
 
 def multipliers(system: MechanicalSystem) -> tuple[sympy.Symbol, ...]:
@@ -125,6 +133,17 @@ def multiplied_residual(system: MechanicalSystem) -> sympy.Expr:
     for multiplier, residual in zip((*multipliers(system), *auxiliary_multipliers(system)), residuals, strict=True):
         terms.extend(multiplier * term for term in sympy.Add.make_args(residual))
     return sympy.Add(*terms)
+
+
+def lagrangian_rates(system: MechanicalSystem, count: int) -> tuple[sympy.Expr, ...]:
+    """DL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""
+    curve = (system.coordinates, system.velocities, *curve_rates(system, count))
+    variables = (*(symbol for group in curve[:-1] for symbol in group), system.time)
+    rates = (*(symbol for group in curve[1:] for symbol in group), sympy.S.One)
+    found = [system.lagrangian]
+    for _ in range(count):
+        found.append(_rate(found[-1:], variables, rates)[0])
+    return tuple(found[1:])
 
 
 def is_separable(system: MechanicalSystem) -> bool:

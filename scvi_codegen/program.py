@@ -165,7 +165,13 @@ class SlopeBlock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """Points of one kind with the loops around their kernel; ``arguments`` are what the gathers give, m each."""
+    """Points of one kind with the loops around their kernel.
+
+    Attributes:
+        arguments: what the gathers give, m each.
+        value, slope: the kernel, and the kernel with its derivatives.
+        action: what is summed to the discrete Lagrangian with h^(1 + action_power), or ``None``.
+    """
 
     name: str
     arguments: tuple[str, ...]
@@ -176,6 +182,8 @@ class Family:
     value: Kernel
     slope: Kernel
     blocks: tuple[SlopeBlock, ...]
+    action: Kernel | None
+    action_power: int
 
     @property
     def points(self) -> int:
@@ -522,9 +530,8 @@ class Program:
         extrapolation: (B, B) guess for the next step.
         legendre: p and dp/dv at (q, v); where a Hamiltonian is given, v and dv/dp at (q, p).
         mass_entries: (i, j) of the slopes of ``legendre``.
-        lagrangian: L at (q, v); where a Hamiltonian is given, p . v - H at (q, v, p).
-        hamiltonian: H at (q, p) where it is given, else ``None``.
-        action: name of the family whose weighted sum of L is the discrete Lagrangian, or ``None``.
+        energy: L at (q, v), from which and ``legendre`` follows the energy; where a Hamiltonian is given, H at (q, p).
+        hamiltonian: whether a Hamiltonian is given.
         sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
@@ -548,9 +555,8 @@ class Program:
     extrapolation: tuple[tuple[float, ...], ...]
     legendre: Kernel
     mass_entries: tuple[tuple[int, int], ...]
-    lagrangian: Kernel
-    hamiltonian: Kernel | None
-    action: str | None
+    energy: Kernel
+    hamiltonian: bool
     sweep: Sweep | None
     splitting: Splitting | None
     newton: bool
@@ -569,9 +575,13 @@ class Program:
     def kernels(self) -> tuple[Kernel, ...]:
         """Every kernel, in the order of emission."""
         pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
-        energy = (self.hamiltonian,) if self.hamiltonian else ()
-        action = (self.lagrangian,) if self.action or not energy else ()
-        return (*pairs, self.legendre, *energy, *action)
+        actions = {family.action.name: family.action for family in self.families if self.newton and family.action}
+        return (*pairs, self.legendre, *({self.energy.name: self.energy} | actions).values())
+
+    @property
+    def action(self) -> bool:
+        """Whether there is a discrete Lagrangian."""
+        return self.newton and any(family.action for family in self.families)
 
     @property
     def memory(self) -> int:

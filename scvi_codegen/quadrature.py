@@ -28,7 +28,7 @@ from scvi_codegen.nodes import (
     radau_right_points,
     to_number,
 )
-from scvi_codegen.precision import DIGITS, Number, Vector, mp
+from scvi_codegen.precision import DIGITS, Matrix, Number, Vector, mp
 
 __all__ = [
     "QUADRATURE_FAMILIES",
@@ -39,6 +39,7 @@ __all__ = [
     "gauss_legendre",
     "gauss_lobatto",
     "gauss_radau",
+    "hermite",
     "is_made_by",
     "quadrature_by_name",
     "split_name",
@@ -53,29 +54,36 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quadrature:
-    """A rule sum_n w_n f(x_n) for the integral of f over [-1, 1].
+    """A rule sum_n w_n f(x_n) for the integral of f over [-1, 1], or with derivatives sum_n sum_k w_kn f^(k)(x_n).
 
     ``points`` are ascending in [-1, 1], ``weights`` as many, of any sign, with sum 2; floats, integers, fractions,
-    decimal strings and SymPy numbers are converted to 60 digits. ``order`` is the p such that polynomials of degree
-    below p are integrated exactly; left out (or 0) it is computed from the Legendre moments, which must then vanish to
-    12 digits; given, it is checked to 8 digits. Raises ``MethodError`` when any of this fails.
+    decimal strings and SymPy numbers are converted to 60 digits. ``derivative_weights`` has one row for f', one for f''
+    and so on. ``order`` is the p such that polynomials of degree below p are integrated exactly; left out (or 0) it is
+    computed from the Legendre moments, which must then vanish to 12 digits; given, it is checked to 8 digits. Raises
+    ``MethodError`` when any of this fails.
     """
 
     name: str
     points: Vector
     weights: Vector
+    derivative_weights: Matrix = ()
     order: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", ascending_points(self.points, "quadrature point"))
         object.__setattr__(self, "weights", tuple(map(to_number, self.weights)))
-        if len(self.points) != len(self.weights) or not self.points:
-            raise MethodError(
-                f"quadrature {self.name!r} has {len(self.points)} points and {len(self.weights)} weights; "
-                "give one weight for each point, and at least one point"
-            )
+        object.__setattr__(
+            self, "derivative_weights", tuple(tuple(map(to_number, line)) for line in self.derivative_weights)
+        )
+        for weights in (self.weights, *self.derivative_weights):
+            if len(self.points) != len(weights) or not self.points:
+                raise MethodError(
+                    f"quadrature {self.name!r} has {len(self.points)} points and {len(weights)} weights; "
+                    "give one weight for each point, and at least one point"
+                )
         claimed = checked_count(self.order, "the order of a quadrature", 0)
-        found = moment_order(self.points, self.weights, CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE)
+        tolerance = CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE
+        found = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
         if found == 0:
             total = mp.nstr(mp.fsum(self.weights), 15)
             raise MethodError(f"the weights of quadrature {self.name!r} have sum {total}; scale them to sum 2")
@@ -93,8 +101,17 @@ class Quadrature:
     def symmetric(self) -> bool:
         """Whether points and weights are symmetric about 0, to 50 digits."""
         tolerance = mp.mpf(10) ** (10 - DIGITS)
-        pairs = zip(self.weights, reversed(self.weights), strict=True)
+        pairs = [
+            (left, (-1) ** k * right)
+            for k, weights in enumerate((self.weights, *self.derivative_weights))
+            for left, right in zip(weights, reversed(weights), strict=True)
+        ]
         return is_antisymmetric(self.points) and all(abs(left - right) <= tolerance for left, right in pairs)
+
+    @property
+    def conditions(self) -> int:
+        """The number of values that the rule uses: points, times 1 and the derivatives."""
+        return len(self.points) * (1 + len(self.derivative_weights))
 
     @property
     def abscissae(self) -> Vector:
@@ -106,26 +123,39 @@ class Quadrature:
         """The weights for [0, 1], with sum 1: b = w / 2."""
         return tuple(weight / 2 for weight in self.weights)
 
+    @property
+    def unit_derivative_weights(self) -> Matrix:
+        """The same of the derivatives by c in [0, 1]: the k-th divided by 2^(k+1)."""
+        return tuple(tuple(w / 2 ** (k + 1) for w in line) for k, line in enumerate(self.derivative_weights, 1))
 
-def moment_order(points: Vector, weights: Vector, tolerance: Number) -> int:
-    """Return the first degree whose Legendre polynomial is not integrated to ``tolerance`` (at most 2 n).
+
+def moment_order(points: Vector, weights: Matrix, tolerance: Number) -> int:
+    """Return the first degree whose Legendre polynomial is not integrated to ``tolerance``, at most 2 n a derivative.
 
     Legendre polynomials are the well-conditioned test: for a Gauss rule the moment of degree 2n is of size 1, while
     that of x^(2n) is below 4^-n.
     """
-    before, values = [mp.zero] * len(points), [mp.one] * len(points)
-    for degree in range(2 * len(points)):
-        moment = mp.fdot(weights, values)
+    most = 2 * len(points) * len(weights)
+    none: Matrix = ((mp.zero,) * len(points),) * len(weights)
+    before, values = none, ((mp.one,) * len(points), *none[1:])
+    for degree in range(most):
+        moment = mp.fsum(mp.fdot(w, f) for w, f in zip(weights, values, strict=True))
         if abs(moment - (2 if degree == 0 else 0)) > tolerance:
             return degree
-        before, values = (
-            values,
-            [
-                ((2 * degree + 1) * x * value - degree * last) / (degree + 1)
-                for x, value, last in zip(points, values, before, strict=True)
-            ],
+        before, values = values, next_legendre(degree, points, values, before)
+    return most
+
+
+def next_legendre(degree: int, points: Vector, values: Matrix, before: Matrix) -> Matrix:
+    """Return P_(degree + 1) and its derivatives at the points, one row a derivative, from those of the two below."""
+    lines = []
+    for k, (line, last) in enumerate(zip(values, before, strict=True)):
+        lower = values[k - 1] if k else line
+        terms = zip(points, line, lower, last, strict=True)
+        lines.append(
+            tuple(((2 * degree + 1) * (x * f + k * slope) - degree * old) / (degree + 1) for x, f, slope, old in terms)
         )
-    return 2 * len(points)
+    return tuple(lines)
 
 
 def legendre_value(degree: int, x: Number) -> Number:
@@ -229,6 +259,31 @@ def fejer(n: int) -> Quadrature:
     return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
 
 
+@lru_cache(maxsize=None, typed=True)
+def hermite(n: int, derivatives: int = 1) -> Quadrature:
+    """Return the rule that integrates the Hermite interpolant of f and its derivatives at n Lobatto points.
+
+    Order n (1 + derivatives), one more where that is odd. Two points with f' is the corrected trapezoidal rule of order
+    4, f(-1) + f(1) + (f'(-1) - f'(1)) / 3 (Davis & Rabinowitz, section 2.8).
+
+    >>> rule = hermite(2)
+    >>> rule.name, rule.order, [float(w) for w in rule.derivative_weights[0]]
+    ('hermite:2', 4, [0.3333333333333333, -0.3333333333333333])
+    """
+    n = checked_count(n, "the number of Hermite points", 2)
+    kinds = 1 + checked_count(derivatives, "the number of derivatives of a Hermite rule", 1)
+    points, count = legendre_lobatto_points(n), n * kinds
+    with mp.workdps(DIGITS + GUARD + 2 * count):
+        rows = mp.matrix(
+            [[mp.ff(j, k) * x ** max(j - k, 0) for k in range(kinds) for x in points] for j in range(count)]
+        )
+        moments = mp.matrix([(1 - (-1) ** (j + 1)) / mp.mpf(j + 1) for j in range(count)])
+        solved = list(mp.lu_solve(rows, moments))
+    lines = [tuple(+w for w in solved[k * n : (k + 1) * n]) for k in range(kinds)]
+    name = f"hermite:{n}" if kinds == 2 else f"hermite-{derivatives}:{n}"
+    return Quadrature(name=name, points=points, weights=lines[0], derivative_weights=tuple(lines[1:]))
+
+
 def symmetrised(weights: Vector) -> Vector:
     """Return the mean of the weights and their mirror image: symmetric to the last bit."""
     return tuple((left + right) / 2 for left, right in zip(weights, reversed(weights), strict=True))
@@ -241,6 +296,9 @@ QUADRATURE_FAMILIES: Mapping[str, Callable[[int], Quadrature]] = {
     "gauss-radau-right": lambda n: gauss_radau(n, "right"),
     "clenshaw-curtis": clenshaw_curtis,
     "fejer": fejer,
+    "hermite": hermite,
+    "hermite-2": lambda n: hermite(n, 2),
+    "hermite-3": lambda n: hermite(n, 3),
 }
 
 
@@ -287,6 +345,8 @@ def exact_rule(quadrature: Quadrature) -> tuple[Expressions, Expressions] | None
     the cosines as radicals. A rule that a user made carries no closed form, whatever its name.
     """
     family, count = quadrature.name.partition(":")[0], len(quadrature)
+    if family not in POINT_FAMILIES:
+        return None
     if quadrature.name != f"{family}:{count}" or not is_made_by(quadrature_by_name, quadrature.name, quadrature):
         return None
     points = exact_family_points(POINT_FAMILIES[family], count)

@@ -135,7 +135,6 @@ def _context(program: Program) -> dict[str, object]:
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalar_kernels))),
         "purpose": _purposes(program),
         "legendre": program.legendre,
-        "lagrangian": program.lagrangian,
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
         "tolerance": DEFAULT_TOLERANCE,
@@ -152,6 +151,9 @@ def _purposes(program: Program) -> dict[str, str]:
     purposes = {
         "legendre": "Momenta L_v and mass matrix L_vv at u = (q, v).",
         "lagrangian": "L at u = (q, v).",
+        "derivative_1_action": "dL/dt at u = (q, v, a).",
+        "derivative_2_action": "d^2L/dt^2 at u = (q, v, a, j).",
+        "derivative_3_action": "d^3L/dt^3 at u = (q, v, a, j, s).",
         "hamiltonian": "H at u = (q, p).",
         "force_lanes": "L_q at all points.",
         "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
@@ -169,6 +171,8 @@ def _purposes(program: Program) -> dict[str, str]:
 
 
 def _results(family: Family) -> str:
+    if family.action_power:
+        return f"Derivatives of d^{family.action_power}L/dt^{family.action_power}"
     if family.name == "node":
         return "Derivatives of lambda . E" if "lambda" in family.arguments else "The Euler-Lagrange residual E"
     slopes = " and ".join(f"L_{name}" for name in family.arguments)

@@ -144,7 +144,11 @@ class Scatter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointFamily:
-    """Points c_n in [0, 1] with weights, evaluated by one kernel; its ``scalar`` where the kernel is a gradient."""
+    """Points c_n in [0, 1] with weights, evaluated by one kernel.
+
+    Where the kernel is the gradient of a ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
+    function, and of the discrete Lagrangian if ``in_action``.
+    """
 
     name: str
     abscissae: Vector
@@ -153,6 +157,8 @@ class PointFamily:
     scatters: tuple[Scatter, ...]
     weight_names: tuple[str, ...]
     scalar: sympy.Expr | None = None
+    scalar_power: int = 0
+    in_action: bool = False
 
     @property
     def arguments(self) -> tuple[sympy.Symbol, ...]:
@@ -176,8 +182,8 @@ class StageSystem:
         end_position: one row, 1 + B columns: q1 = E_0 q0 + sum_b h^(power of b) E_b z_b.
         end_momentum: coefficient of p0 in p1.
         end_numbers: the paper's numbers of the equations for q1 and p1.
-        action: (family, scalar) whose weighted sum is the discrete Lagrangian, or ``None`` where there is none.
         extrapolation: (B, B) matrix from the unknowns of one step to a guess for the next, or ``None``.
+        block_abscissae: (B,) where on the step the unknowns are the curve's velocities, or empty where they are not.
     """
 
     blocks: tuple[Block, ...]
@@ -186,8 +192,8 @@ class StageSystem:
     end_position: Table
     end_momentum: Number
     end_numbers: tuple[str, str]
-    action: tuple[str, sympy.Expr] | None = None
     extrapolation: Matrix | None = None
+    block_abscissae: Vector = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,6 +208,7 @@ class ScalarFamily:
     scalar: sympy.Expr
     power: int = 0
     scale: Fraction = Fraction(1)
+    in_action: bool = True
 
     def slopes(self) -> list[tuple[Gather, tuple[sympy.Expr, ...]]]:
         """The derivatives of the scalar, one tuple of m a gather."""
@@ -230,6 +237,8 @@ class ScalarFamily:
             gathers=self.gathers,
             scatters=scatters,
             scalar=self.scalar,
+            scalar_power=self.power,
+            in_action=self.in_action,
         )
 
 
@@ -245,8 +254,8 @@ def stationary_increments(
     blocks: tuple[Block, ...],
     end_position: Sequence[Number],
     rows: tuple[Row, ...],
-    action: tuple[str, sympy.Expr],
     extrapolation: Matrix | None,
+    block_abscissae: Vector = (),
 ) -> StageSystem:
     """The variational method of G(q0, z, mu, q1) = S(q0, z) + mu . (q0 + h sum_b beta_b z_b - q1), unknowns velocities.
 
@@ -272,8 +281,8 @@ def stationary_increments(
         end_position=Table.named("beta", [(1, *beta)], column=0),
         end_momentum=mp.one,
         end_numbers=("q1", "p1"),
-        action=action,
         extrapolation=extrapolation,
+        block_abscissae=block_abscissae,
     )
 
 
@@ -283,7 +292,6 @@ def stationary_nodal(
     blocks: tuple[Block, ...],
     end_block: int,
     rows: tuple[Row, ...],
-    action: tuple[str, sympy.Expr],
     end_numbers: tuple[str, str],
 ) -> StageSystem:
     """The variational method of G(q0, .., q1) in the paper's unknowns, q1 being the block ``end_block``.
@@ -300,5 +308,4 @@ def stationary_nodal(
         end_position=Table.named("", [(0, *unit)]),
         end_momentum=mp.zero,
         end_numbers=end_numbers,
-        action=action,
     )

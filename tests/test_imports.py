@@ -24,6 +24,7 @@ FLOORS = """
     system
     hamiltonian
     basis mechanics stage_system
+    spaces
     auxiliaries
     tableau
     methods.method

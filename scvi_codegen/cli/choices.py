@@ -34,6 +34,7 @@ class Choices:
     order: int | None
     nodes: str | None
     quadrature: str | None
+    space: str | None
     form: str | None
     variational: bool | None
     abscissae: tuple[float, ...] | str | None
@@ -92,6 +93,11 @@ METHOD_OPTIONS = (
     _option("--order", type=int, metavar="N", help="Order of a composition of Stoermer-Verlet: 2, 8 or 10."),
     _option("--quadrature", metavar="NAME:N", help="Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
     _option("--nodes", metavar="NAME", help="Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
+    _option(
+        "--space",
+        metavar="NAME",
+        help="Curves of an SVI: polynomials, trigonometric:RADIANS_A_STEP[:HARMONICS] or splines:PIECES.",
+    ),
     _option("--form", metavar="NAME", help="phase-space or position (sc and Runge-Kutta methods)."),
     _option(
         "--variational/--printed",
@@ -178,7 +184,7 @@ def _chosen_method(method: Method, choices: Choices) -> Method:
     """The method of the model with what the command line changes of it."""
     from scvi_codegen.methods import ARGUMENTS, method_from_specification
 
-    fields = ("degree", "stages", "order", "quadrature", "nodes", "form", "variational", "abscissae")
+    fields = ("degree", "stages", "order", "quadrature", "nodes", "space", "form", "variational", "abscissae")
     given = {field: getattr(choices, field) for field in fields if getattr(choices, field) is not None}
     if choices.method is None and not given:
         return method

@@ -59,7 +59,7 @@ METHODS: dict[str, Callable[..., Method]] = {
 """Constructors by the name used in model files and on the command line."""
 
 ARGUMENTS: dict[str, tuple[str, ...]] = {
-    "svi": ("degree", "quadrature", "nodes"),
+    "svi": ("degree", "quadrature", "nodes", "space"),
     "scvi": ("degree", "quadrature", "nodes", "variational", "abscissae"),
     "sc": ("degree", "nodes", "form"),
     **dict.fromkeys(TABLEAU_METHODS, ("stages", "form")),

@@ -6,22 +6,27 @@ The discrete Lagrangian is the quadrature of L along a polynomial curve of degre
 
 made stationary in the interior coefficients (26a); p0 = -D_1 L_d and p1 = D_{s+1} L_d (27). The step depends on the
 degree and the quadrature alone: the nodes parametrise the same polynomials. Compiled, the curve is therefore given by
-the values V_b of its velocity at s points, whatever the nodes: Q = q0 + h sum_b a_nb V_b.
+the values V_b of its velocity at s points, whatever the nodes: Q = q0 + h sum_b a_nb V_b. Nothing else changes where
+the curves are not polynomials (:mod:`scvi_codegen.spaces`), or where the quadrature uses derivatives of the integrand:
+then dL/dt = L_q v + L_v a + L_t along the curve is summed, too (paper, 4.2.3).
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, extrapolation, identity_matrix
+from scvi_codegen.basis import cardinal_slopes, cardinal_values, extrapolation, identity_matrix
 from scvi_codegen.errors import MethodError, MethodWarning
 from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import curve_rates, lagrangian_rates
 from scvi_codegen.methods.method import Method, Specification, check_count, unit_sum
 from scvi_codegen.nodes import Nodes, nodes_by_name
 from scvi_codegen.precision import Matrix, Vector, mp
 from scvi_codegen.quadrature import Quadrature, gauss_legendre, quadrature_by_name
+from scvi_codegen.spaces import CurveSpace, Polynomials, space_by_name
 from scvi_codegen.stage_system import (
     Block,
     Gather,
@@ -59,11 +64,15 @@ class SVI(Method):
     Args:
         degree: degree s of the trial curve, at least 1.
         quadrature: rule of at least s points, an object or a name such as ``"gauss-legendre:8"``; default: s-point
-            Gauss-Legendre, with which the method is the s-stage Gauss collocation method.
+            Gauss-Legendre, with which the method is the s-stage Gauss collocation method. Rules with derivatives,
+            ``"hermite:2"``, are used along the curve.
         nodes: of that degree, containing both ends; they appear in the derivation, the step does not depend on them.
+        space: of the trial curves, an object or a name such as ``"trigonometric:0.5"`` or ``"splines:2"``; default:
+            polynomials.
 
     Raises:
-        MethodError: on a degree below 1, nodes without the end points or of another degree.
+        MethodError: on a degree below 1, nodes without the end points or of another degree, or for curves other than
+            polynomials.
 
     Warns:
         MethodWarning: with fewer quadrature points than the degree, where the stage equations are singular.
@@ -72,24 +81,36 @@ class SVI(Method):
     degree: int
     quadrature: Quadrature | str | None = None
     nodes: Nodes | str | None = None
+    space: CurveSpace | str | None = None
 
     def __post_init__(self) -> None:
         check_count(self.degree, "the degree of a spectral variational integrator")
-        object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
+        object.__setattr__(self, "space", _resolve_space(self.space))
+        own = self.curves.default_rule(self.degree) if self.quadrature is None else self.quadrature
+        object.__setattr__(self, "quadrature", resolve_quadrature(own, self.degree))
+        if self.nodes is not None and not isinstance(self.curves, Polynomials):
+            raise MethodError(f"nodes parametrise polynomials, not {self.curves.name}: leave them out")
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
-        if len(self.rule) < self.degree:
+        size = self.curves.dimension(self.degree)
+        if self.rule.conditions < size:
             warnings.warn(
                 f"{len(self.rule)} quadrature points do not determine a curve of degree {self.degree}: the stage "
-                f"equations are singular for most systems and no order is claimed; use at least {self.degree} points",
+                f"equations are singular for most systems and no order is claimed; use at least {size} points",
                 MethodWarning,
                 stacklevel=3,
             )
 
     @property
+    def curves(self) -> CurveSpace:
+        """The space of trial curves, resolved."""
+        assert isinstance(self.space, CurveSpace)
+        return self.space
+
+    @property
     def rule(self) -> Quadrature:
-        """The quadrature, resolved."""
+        """The quadrature along the step."""
         assert isinstance(self.quadrature, Quadrature)
-        return self.quadrature
+        return self.curves.along(self.quadrature)
 
     @property
     def node_set(self) -> Nodes:
@@ -99,23 +120,28 @@ class SVI(Method):
 
     @property
     def name(self) -> str:
-        """``svi-<degree>-<quadrature>``."""
-        return f"svi-{self.degree}-{self.rule.name.replace(':', '-')}"
+        """``svi-<degree>-<quadrature>[-<curves>]``."""
+        own = [] if isinstance(self.curves, Polynomials) else [self.curves.name]
+        return "-".join(["svi", str(self.degree), self.rule.name, *own]).replace(":", "-").replace(" ", "-")
 
     @property
     def title(self) -> str:
         """One line for people."""
-        return f"Galerkin spectral variational integrator, degree {self.degree}, {self.rule.name}"
+        own = "" if isinstance(self.curves, Polynomials) else f" {self.curves.name},"
+        return f"Galerkin spectral variational integrator,{own} degree {self.degree}, {self.rule.name}"
 
     @property
     def order(self) -> int | None:
-        """min(2 degree, order of the quadrature); ``None`` with fewer points than the degree."""
-        return None if len(self.rule) < self.degree else min(2 * self.degree, self.rule.order)
+        """min(2 degree, order of the quadrature); ``None`` with too few points, and for trigonometric curves."""
+        best = self.curves.order(self.degree)
+        if best is None or self.rule.conditions < self.curves.dimension(self.degree):
+            return None
+        return min(best, self.rule.order)
 
     @property
     def symmetric(self) -> bool:
-        """True for a symmetric quadrature."""
-        return self.rule.symmetric
+        """True for a symmetric quadrature along symmetric curves."""
+        return self.rule.symmetric and self.curves.symmetric
 
     @property
     def symplectic(self) -> bool:
@@ -125,28 +151,45 @@ class SVI(Method):
     @property
     def needs_regular(self) -> bool:
         """With more (or fewer) points than the degree: velocities at the points are then not independent."""
-        return len(self.rule) != self.degree
+        return len(self.rule) != self.curves.dimension(self.degree) or bool(self.rule.derivative_weights)
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {"method": "svi", "degree": self.degree, "quadrature": self.rule.name, "nodes": self.node_set.name}
+        assert isinstance(self.quadrature, Quadrature)
+        common: dict[str, str | int] = {"method": "svi", "degree": self.degree, "quadrature": self.quadrature.name}
+        if isinstance(self.curves, Polynomials):
+            return common | {"nodes": self.node_set.name}
+        return common | {"space": self.curves.name}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Unknowns V_b at the quadrature points if there are s of them, else at the s Gauss points."""
-        rule = self.rule
-        points = rule.abscissae if len(rule) == self.degree else gauss_legendre(self.degree).abscissae
+        """Unknowns V_b at the quadrature points if there are s of them, else at points of the space of curves."""
+        rule, curves = self.rule, self.curves
+        points = curves.points(self.degree, rule)
+        if rule.derivative_weights and system.auxiliaries:
+            raise MethodError(
+                f"{rule.name} differentiates L along the curve of positions, which a Hamiltonian does not have: give L "
+                "(lagrangian_of), or use a quadrature without derivatives"
+            )
         return galerkin_system(
             system,
             abscissae=rule.abscissae,
             weights=rule.unit_weights,
-            position=cardinal_integrals(points, rule.abscissae, 0),
-            velocity=cardinal_values(points, rule.abscissae),
-            end_position=cardinal_integrals(points, (mp.one,), 0)[0],
-            extrapolation=extrapolation(points, 1, min(self.degree - 1, EXTRAPOLATION_DEGREE)),
+            position=curves.positions(points, rule.abscissae),
+            velocity=curves.velocities(points, rule.abscissae),
+            end_position=curves.positions(points, (mp.one,))[0],
+            extrapolation=extrapolation(points, 1, min(len(points) - 1, EXTRAPOLATION_DEGREE)),
+            block_abscissae=points,
+            derivative_weights=rule.unit_derivative_weights,
+            derivatives=[curves.velocities(points, rule.abscissae, k + 1) for k in range(len(rule.derivative_weights))],
         )
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c)."""
+        """Unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c).
+
+        Of curves other than polynomials, and of quadratures with derivatives, the compiled equations.
+        """
+        if not isinstance(self.curves, Polynomials) or self.rule.derivative_weights:
+            return self.stage_system(system)
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
         return stationary_nodal(
@@ -157,7 +200,6 @@ class SVI(Method):
                 Row(number="27a", kind="IDEL", momentum=mp.one),
                 *(Row(number="27b", kind="stage", momentum=mp.zero) for _ in range(s - 1)),
             ),
-            action=("quadrature", system.lagrangian),
             end_numbers=("27", "27c"),
         )
 
@@ -227,6 +269,9 @@ def galerkin_system(
     velocity: Matrix,
     end_position: Vector,
     extrapolation: Matrix,
+    block_abscissae: Vector = (),
+    derivative_weights: Matrix = (),
+    derivatives: Sequence[Matrix] = (),
 ) -> StageSystem:
     """Stationarity of h sum_n w_n L(q0 + h sum_b a_nb V_b, sum_b l_nb V_b, t_n) at fixed q1 = q0 + h sum_b beta_b V_b.
 
@@ -238,35 +283,52 @@ def galerkin_system(
         velocity: (g, s) matrix l.
         end_position: (s,) vector beta.
         extrapolation: (s, s), the guess for the next step.
+        block_abscissae: (s,) where the velocities are; left out, the points.
+        derivative_weights: rows of (g,) weights of h^k d^k L/dt^k, k = 1, 2, ..
+        derivatives: as many (g, s) matrices of the k-th derivatives of the l_nb.
     """
     points, size = len(abscissae), len(end_position)
     beta = unit_sum(end_position)
-    family = ScalarFamily(
-        name="quadrature",
-        abscissae=abscissae,
-        weights=unit_sum(weights),
-        weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
-        gathers=(
-            Gather(
-                arguments=system.coordinates,
-                table=Table.joined(Table.constant(points, 1, 1), Table.named("a", dyadic(position))),
-                power=0,
-            ),
-            Gather(
-                arguments=system.velocities,
-                table=Table.joined(Table.constant(points, 1, 0), Table.named("l", velocity)),
-                power=-1,
-            ),
-        ),
-        scalar=system.lagrangian,
-    )
+    tables = (velocity, *derivatives)
+    gathers = _curve_gathers(system, dyadic(position), tables)
+    scalars = (system.lagrangian, *lagrangian_rates(system, len(derivatives)))
+    families = [
+        ScalarFamily(
+            name=f"derivative_{k}" if k else "quadrature",
+            abscissae=abscissae,
+            weights=own,
+            weight_names=tuple(f"{'d' * k}w_{n}" for n in range(1, points + 1)),
+            gathers=gathers[: k + 2],
+            scalar=scalar,
+            power=k,
+        )
+        for k, (own, scalar) in enumerate(zip((unit_sum(weights), *derivative_weights), scalars, strict=True))
+    ]
     return stationary_increments(
-        families=(family,),
+        families=families,
         blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
         end_position=beta,
         rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=beta[b - 1]) for b in range(1, size + 1)),
-        action=("quadrature", system.lagrangian),
         extrapolation=extrapolation,
+        block_abscissae=block_abscissae or abscissae,
+    )
+
+
+def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Sequence[Matrix]) -> tuple[Gather, ...]:
+    """Q, v and as many further time derivatives of the curve as there are tables."""
+    points = len(position)
+    rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
+    place = Table.joined(Table.constant(points, 1, 1), Table.named("a", position))
+    return (
+        Gather(arguments=system.coordinates, table=place, power=0),
+        *(
+            Gather(
+                arguments=arguments,
+                table=Table.joined(Table.constant(points, 1), Table.named(f"{'d' * k}l", table)),
+                power=-1 - k,
+            )
+            for k, (arguments, table) in enumerate(zip(rates, velocities, strict=True))
+        ),
     )
 
 
@@ -303,6 +365,17 @@ def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quad
     if not isinstance(quadrature, Quadrature):
         raise MethodError(f"a quadrature is wanted, or a name such as 'gauss-legendre:{degree}', not {quadrature!r}")
     return quadrature
+
+
+def _resolve_space(space: CurveSpace | str | None) -> CurveSpace:
+    """A space given as an object, a name or not at all (then polynomials)."""
+    if space is None:
+        return Polynomials()
+    if isinstance(space, str):
+        return space_by_name(space)
+    if not isinstance(space, CurveSpace):
+        raise MethodError(f"a space of curves is wanted, or a name such as 'splines:2', not {space!r}")
+    return space
 
 
 def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:

@@ -230,7 +230,6 @@ def _shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadr
             *(Row(number=f"z_{i}", kind="IDEL", momentum=beta[i]) for i in range(size + 1)),
             *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
         ),
-        action=("quadrature", system.lagrangian),
         extrapolation=(
             *((*line, *(mp.zero,) * size) for line in extrapolated),
             *((*(mp.zero,) * (size + 1), *(mp.mpf(int(i == j)) for j in range(size))) for i in range(size)),
@@ -260,6 +259,7 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFami
         gathers=(rounded, velocity, acceleration, own),
         scalar=multiplied_residual(system),
         power=1,
+        in_action=False,
     )
 
 
@@ -350,6 +350,7 @@ def _shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) ->
         gathers=(*nodal_gathers(system, nodes, other_blocks=size), own),
         scalar=multiplied_residual(system),
         power=-1,
+        in_action=False,
     )
     return stationary_nodal(
         families=(nodal_quadrature_family(system, nodes, rule, other_blocks=1 + size), node),
@@ -364,7 +365,6 @@ def _shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) ->
             Row(number="dG/dv0", kind="multiplier", momentum=mp.zero, power=1),
             *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
         ),
-        action=("quadrature", system.lagrangian),
         end_numbers=("34c", "34e"),
     )
 
@@ -395,5 +395,4 @@ def _printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
         end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
         end_momentum=mp.zero,
         end_numbers=("34c", "34e"),
-        action=("quadrature", system.lagrangian),
     )

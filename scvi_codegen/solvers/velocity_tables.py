@@ -16,7 +16,6 @@ from scvi_codegen.mechanics import is_separable
 from scvi_codegen.methods.collocation import phase_space_system
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import Matrix, Vector, mp
-from scvi_codegen.quadrature import gauss_legendre
 from scvi_codegen.stage_system import PointFamily, StageSystem
 
 __all__ = ["VelocityTables", "velocity_tables"]
@@ -54,7 +53,7 @@ def velocity_tables(system: MechanicalSystem, method: Method) -> VelocityTables 
     if stages is None:
         return None
     family = stages.families[0]
-    if stages.action is not None:
+    if family.scalar is not None:
         return _variational_tables(family, stages)
     A = tuple(line[1:] for line in family.gathers[0].table.entries)
     b = stages.end_position.entries[0][1:]
@@ -99,7 +98,7 @@ def _variational_tables(family: PointFamily, stages: StageSystem) -> VelocityTab
             return None
         adjoint = matrix_product(inverse, rest)
         projection = _columns_scaled(matrix_product(inverse, transpose(velocity)), family.weights)
-        blocks = gauss_legendre(len(beta)).abscissae
+        blocks = stages.block_abscissae
     return VelocityTables(
         abscissae=family.abscissae,
         blocks=blocks,
