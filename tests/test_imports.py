@@ -41,8 +41,10 @@ FLOORS = """
     problems pilot
     model_file
     package plotting advice distributed ensemble_file
+    exact mathml
     __init__
     benchmark
+    reproduce
     cli
     __main__
 """
@@ -57,7 +59,7 @@ OWNERS = {
     "jinja2": ["rendering"],
     "cffi": ["building"],
     "platformdirs": ["building"],
-    "matplotlib": ["plotting", "benchmark"],
+    "matplotlib": ["plotting", "benchmark", "reproduce"],
     "click": ["cli"],
 }
 

@@ -1,0 +1,173 @@
+"""What an experiment gives back: what was run, what the paper claims of it, what was measured, numbers and a picture.
+
+Everything is plain data that travels between processes: a picture is a module-level function with its numbers bound by
+``functools.partial``, a formula is SymPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, TypeAlias
+
+import sympy
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "Block",
+    "Check",
+    "Experiment",
+    "Formula",
+    "Listing",
+    "Paragraph",
+    "Picture",
+    "Result",
+    "Table",
+    "Verdict",
+    "holds",
+]
+
+Cell: TypeAlias = float | int | str | None
+
+
+class Verdict(Enum):
+    """Whether what the paper says was found."""
+
+    HOLDS = "holds"
+    PARTLY = "holds in part"
+    FAILS = "does not hold"
+    SHOWN = "shown"
+    """Nothing is claimed, or nothing can be decided."""
+
+
+def holds(condition: bool) -> Verdict:
+    """``HOLDS`` or ``FAILS``."""
+    return Verdict.HOLDS if condition else Verdict.FAILS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One statement of the paper beside what was measured.
+
+    Attributes:
+        claim: what the paper says, in one sentence.
+        measured: what was found, in one sentence with its numbers.
+        verdict: whether they agree.
+        bears_on: keys of the claims (:mod:`scvi_codegen.reproduce.claims`) that this decides.
+    """
+
+    claim: str
+    measured: str
+    verdict: Verdict
+    bears_on: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """Numbers, written as CSV in full precision.
+
+    Attributes:
+        name: ``""`` for the main table of a result, else what is appended to the file's name.
+        columns: headings.
+        rows: as many cells as columns; ``None`` where there is no number.
+        formats: format specification by column, for the report; ``".3g"`` where none is given.
+        shown: whether the report prints it; long series of a curve are only drawn.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    name: str = ""
+    formats: Mapping[str, str] = field(default_factory=dict)
+    shown: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """``draw`` fills an empty Matplotlib figure of ``width`` x ``height`` inches."""
+
+    draw: Callable[[Figure], None]
+    width: float = 9.0
+    height: float = 4.2
+
+
+@dataclass(frozen=True, slots=True)
+class Paragraph:
+    """Prose."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Formula:
+    """A typeset equation, ``left = right``, or an expression alone.
+
+    Attributes:
+        right: SymPy; symbols called ``Q__2_x`` are set as Q with superscript 2 and subscript x.
+        left: SymPy or ``None``.
+        number: the paper's, or ``""``.
+    """
+
+    right: sympy.Basic
+    left: sympy.Basic | None = None
+    number: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """Text in a fixed-width font: C, an outline, output."""
+
+    text: str
+
+
+Block: TypeAlias = Paragraph | Formula | Listing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """What an experiment found.
+
+    Attributes:
+        name: ``"figure-4"``.
+        title: what the paper calls it, one line.
+        setting: what was run, and what the caption leaves open and how it was chosen, a sentence each.
+        checks: claims and findings.
+        tables: numbers; the first has no name.
+        picture: or ``None``.
+        body: text and formulas, in order, for experiments that are read rather than looked at.
+    """
+
+    name: str
+    title: str
+    setting: tuple[str, ...]
+    checks: tuple[Check, ...] = ()
+    tables: tuple[Table, ...] = ()
+    picture: Picture | None = None
+    body: tuple[Block, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The common verdict of all checks; ``PARTLY`` where they differ, ``SHOWN`` where there is none."""
+        found = {check.verdict for check in self.checks} - {Verdict.SHOWN}
+        if not found:
+            return Verdict.SHOWN
+        return found.pop() if len(found) == 1 else Verdict.PARTLY
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Experiment:
+    """Something of the paper that can be run.
+
+    Attributes:
+        name: on the command line.
+        title: one line.
+        run: gives the result; it is called with the results of ``needs``, by name.
+        needs: names of experiments whose results it judges.
+    """
+
+    name: str
+    title: str
+    run: Callable[[Mapping[str, Result]], Result]
+    needs: tuple[str, ...] = ()
