@@ -52,8 +52,8 @@ def judged(*conditions: bool) -> Verdict:
 
 def energy_error(run: Trajectory) -> Array:
     """H - H(0) along a run."""
-    energies = run.energy()
-    return energies - energies[0]
+    error: Array = run.energy() - run.energy()[0]
+    return error
 
 
 def largest(error: Array) -> float:

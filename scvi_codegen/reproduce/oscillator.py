@@ -21,12 +21,12 @@ from scvi_codegen.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "OSCILLATOR", "Q", "VELOCITY"]
+__all__ = ["EXPERIMENTS", "OSCILLATOR", "POSITION", "VELOCITY"]
 
 Array = NDArray[np.float64]
 
 OSCILLATOR = harmonic_oscillator()
-Q, VELOCITY = (0.0,), (1.0,)
+POSITION, VELOCITY = (0.0,), (1.0,)
 
 TITLES = {
     "figure-3": "Harmonic oscillator: phase trajectories of SVI and SC, every fifth step",
@@ -64,7 +64,7 @@ TOLERANCE = "The nonlinear iteration ends at 1e-14, the paper's rule."
 
 @lru_cache
 def _run(scheme: str, span: float) -> Trajectory:
-    return trajectory(OSCILLATOR, METHODS[scheme], Q, VELOCITY, h=1.0, span=span)
+    return trajectory(OSCILLATOR, METHODS[scheme], POSITION, VELOCITY, h=1.0, span=span)
 
 
 @lru_cache
@@ -143,8 +143,8 @@ def _position_errors(_: Mapping[str, Result]) -> Result:
             ),
             Check(
                 claim="The axis of the panel of SVI is scaled by 1e-11; the number of quadrature points is not given.",
-                measured=f"Such an error belongs to 7 Gauss points, one fewer than the degree ({sizes[svi[0]]:.1e}); with "
-                f"8 and 9 it is {sizes[svi[1]]:.1e} and {sizes[svi[2]]:.1e}, round-off.",
+                measured=f"Such an error belongs to 7 Gauss points, one fewer than the degree ({sizes[svi[0]]:.1e}); "
+                f"with 8 and 9 it is {sizes[svi[1]]:.1e} and {sizes[svi[2]]:.1e}, round-off.",
                 verdict=Verdict.SHOWN,
             ),
         ),
@@ -221,7 +221,7 @@ def _refined(scheme: str) -> tuple[Array, Array]:
     errors = []
     for degree in DEGREES[scheme]:
         stepper = stepper_of(OSCILLATOR, _of_degree(scheme, degree), "newton")
-        q, p = stepper.step(Q, VELOCITY, h=LONG_STEP, options=ROUNDOFF)
+        q, p = stepper.step(POSITION, VELOCITY, h=LONG_STEP, options=ROUNDOFF)
         errors.append((abs(q[0] - np.sin(LONG_STEP)), abs(stepper.energy(q, p) - 0.5)))
     of_q, of_energy = np.array(errors).T
     return of_q, of_energy

@@ -16,7 +16,7 @@ from scvi_codegen.reproduce.digits import derived_step
 from scvi_codegen.reproduce.drawing import COLORS, draw_powers, panels
 from scvi_codegen.reproduce.experiment import Cell, Check, Experiment, Picture, Result, Table, Verdict
 from scvi_codegen.reproduce.one_degree import judged, svi_with_points
-from scvi_codegen.reproduce.oscillator import OSCILLATOR, Q, SYSTEM, VELOCITY
+from scvi_codegen.reproduce.oscillator import OSCILLATOR, POSITION, SYSTEM, VELOCITY
 from scvi_codegen.reproduce.running import ROUNDOFF, stepper_of
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _errors(q: Number, p: Number, h: float) -> dict[str, float]:
 def _exact_errors(scheme: str, degree: int, steps: tuple[float, ...] = STEPS) -> dict[str, Array]:
     """By quantity, what the method itself errs in a step."""
     step = derived_step(OSCILLATOR, _method(scheme, degree))
-    ends = [(step(Q, VELOCITY, h), h) for h in steps]
+    ends = [(step(POSITION, VELOCITY, h), h) for h in steps]
     return _collected([_errors(end.q[0], end.p[0], h) for end, h in ends])
 
 
@@ -74,7 +74,7 @@ def _exact_errors(scheme: str, degree: int, steps: tuple[float, ...] = STEPS) ->
 def _compiled_errors(scheme: str, degree: int) -> dict[str, Array]:
     """By quantity, what the compiled code errs in a step."""
     stepper = stepper_of(OSCILLATOR, _method(scheme, degree))
-    ends = [(*stepper.step(Q, VELOCITY, h=h, options=ROUNDOFF), h) for h in STEPS]
+    ends = [(*stepper.step(POSITION, VELOCITY, h=h, options=ROUNDOFF), h) for h in STEPS]
     return _collected([_errors(q[0], p[0], h) for q, p, h in ends])
 
 
@@ -170,8 +170,8 @@ def _ahead(what: str, scheme: str) -> Check:
     cases = len(STEPS) * len(DEGREES)
     return Check(
         claim=f"SVI is more accurate than SC in {what} with the same number of points and the same step.",
-        measured=f"{scheme}, is more accurate in {wins} of {cases} pairs of N and h from {STEPS[0]:.2g} to {STEPS[-1]:.2g}"
-        + (f"; not at h = {', '.join(lost)}." if lost else "."),
+        measured=f"{scheme}, is more accurate in {wins} of {cases} pairs of N and h, from h = {STEPS[0]:g} "
+        f"to {STEPS[-1]:.2g}" + (f"; not at h = {', '.join(lost)}." if lost else "."),
         verdict=Verdict.HOLDS if wins == cases else Verdict.PARTLY if wins else Verdict.FAILS,
         bears_on=("accuracy",),
     )
