@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.problems import duffing
-from scvi_codegen.reproduce.drawing import COLORS, draw_error, panels
+from scvi_codegen.reproduce.drawing import COLORS, draw_error, panels, thinned
 from scvi_codegen.reproduce.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
 from scvi_codegen.reproduce.one_degree import (
     area_change,
@@ -50,6 +50,7 @@ METHODS: dict[str, Method] = {
     "SC, degree 6": SpectralCollocation(6),
 }
 DRAWN = ("SVI, degree 5", "SC, degree 5", "SRK6")
+MOST_DOTS = 450
 WINDOW = (0.6, 1.1)
 """Both coordinates of the paper's magnified part."""
 
@@ -86,7 +87,7 @@ def _phase(_: Mapping[str, Result]) -> Result:
     rough = {scheme: _roughness(run) for scheme, run in runs.items()}
     away = {scheme: largest(offset_from_curve(run)) for scheme, run in runs.items()}
     svi, sc, srk, *_finer = METHODS
-    orbits = {scheme: (runs[scheme].q[:, 0], runs[scheme].p[:, 0]) for scheme in DRAWN}
+    orbits = {scheme: (runs[scheme].q[:, 0], runs[scheme].p[:, 0], offset_from_curve(runs[scheme])) for scheme in DRAWN}
     rows: list[tuple[Cell, ...]] = [
         (scheme, away[scheme], rough[scheme], area_change(runs[scheme])) for scheme in METHODS
     ]
@@ -117,21 +118,26 @@ def _phase(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(Table(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[1:], ".1e")),),
-        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve()), width=10.0, height=6.4),
+        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve()), width=10.0, height=8.6),
     )
 
 
-def _draw_phase(orbits: Mapping[str, tuple[Array, Array]], exact: tuple[Array, Array], figure: Figure) -> None:
-    axes = panels(figure, 2, len(orbits))
-    for k, (scheme, (q, p)) in enumerate(orbits.items()):
-        whole, part = axes[k], axes[k + len(orbits)]
+def _draw_phase(orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Array], figure: Figure) -> None:
+    rows = np.reshape(np.array(panels(figure, 3, len(orbits)), dtype=object), (3, -1))
+    for (whole, part, distance), (scheme, (q, p, offset)) in zip(rows.T, orbits.items(), strict=True):
+        color = COLORS[_family(scheme)]
         near = (q > WINDOW[0]) & (q < WINDOW[1]) & (p > WINDOW[0]) & (p < WINDOW[1])
-        for place, shown, size in ((whole, slice(None), 2.0), (part, near, 4.0)):
-            place.plot(*exact, color="black", linewidth=0.6, label="exact")
-            place.plot(q[shown], p[shown], ".", color=COLORS[_family(scheme)], markersize=size, label=scheme)
-            place.set(xlabel="q", ylabel="p")
-        whole.set(title=scheme, xlim=(-1.5, 1.5), ylim=(-1.5, 1.5), aspect="equal")
-        part.set(title="magnified", xlim=WINDOW, ylim=WINDOW, aspect="equal")
+        whole.plot(*thinned(q, p, most=MOST_DOTS), ".", color=color, markersize=2)
+        part.plot(q[near], p[near], ".", color=color, markersize=4)
+        distance.plot(q[near], offset[near], ".", color=color, markersize=4)
+        for axes in (whole, part):
+            axes.plot(*exact, color="black", linewidth=0.6, zorder=1)
+            axes.set(xlabel="q", ylabel="p", aspect="equal")
+        whole.set(title=scheme, xlim=(-1.5, 1.5), ylim=(-1.5, 1.5))
+        part.set(title="magnified", xlim=WINDOW, ylim=WINDOW)
+        distance.set(xlabel="q", ylabel="distance", xlim=WINDOW)
+        distance.set_title("distance from the exact curve, magnified", loc="right")
+        distance.ticklabel_format(axis="y", scilimits=(0, 0))
 
 
 def _family(scheme: str) -> str:
