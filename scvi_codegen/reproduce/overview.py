@@ -106,7 +106,7 @@ def _four_methods(_: Mapping[str, Result]) -> Result:
             "e = 0.6, q(0) = (0.4, 0), p(0) = (0, 2), T = 100; steps as in the caption.",
             "The symplectic Runge-Kutta method is Gauss's of three stages; 5 collocation points are degree 4.",
             "Area: pi a b of the osculating ellipse, a mean over three periods at the end against three at the start.",
-            "The grey ellipse is the exact orbit.",
+            "The black ellipse is the exact orbit.",
         ),
         checks=(*_checks_of_areas(area), _accuracy(errors), _printed_solution()),
         tables=(Table(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[3:], ".1e") | {"h": "g"}),),
@@ -154,8 +154,8 @@ def _printed_solution() -> Check:
     return Check(
         claim="The analytic solution is q1 = cos t - e, q2 = sqrt(1 - e^2) sin t.",
         measured=f"These start with the velocity {minor:.1f} instead of {VELOCITY[1]:.1f} and miss q'' = -q/|q|^3 by "
-        f"up to {largest(residual):.1f}. The solution has the eccentric anomaly E, E - e sin E = t, in place of t: the same "
-        f"ellipse, so the drawn orbit stands; q2 differs by up to {q2:.2f}.",
+        f"up to {largest(residual):.1f}. The solution has the eccentric anomaly E, E - e sin E = t, in place of t: the "
+        f"same ellipse, so the drawn orbit stands; q2 differs by up to {q2:.2f}.",
         verdict=holds(largest(residual) < 1e-6),
     )
 
@@ -164,10 +164,12 @@ def _draw_orbits(orbits: Mapping[str, tuple[Array, Array]], figure: Figure) -> N
     angle = np.linspace(0.0, 2.0 * np.pi, 400)
     minor = math.sqrt(1.0 - ECCENTRICITY**2)
     for axes, (name, (x, y)), letter in zip(panels(figure, 2, 2), orbits.items(), "abcd", strict=True):
-        draw_orbit(axes, x, y, RUNS[name].color, name)
-        axes.plot(np.cos(angle) - ECCENTRICITY, minor * np.sin(angle), color="#777777", linewidth=1.6, label="exact")
+        style = {"marker": ".", "markersize": 3, "linestyle": ""} if RUNS[name].h > 0.2 else {}
+        draw_orbit(axes, x, y, RUNS[name].color, name, **style)
+        axes.plot(np.cos(angle) - ECCENTRICITY, minor * np.sin(angle), color="black", linewidth=1.2, label="exact")
         axes.plot(0.0, 0.0, "+", color="black", markersize=6)
-        axes.set(xlabel="q1", ylabel="q2", title=f"({letter}) {name}, h = {RUNS[name].h:g}", aspect="equal")
+        axes.set(xlabel="q1", ylabel="q2", title=f"({letter}) {name}, h = {RUNS[name].h:g}")
+        axes.set_aspect("equal", adjustable="datalim")
 
 
 CURVE = SVI(4, gauss_legendre(5), chebyshev_lobatto(4))
@@ -202,8 +204,8 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
         checks=(
             Check(
                 claim="The quadrature points may or may not be the interpolation points.",
-                measured=f"{common} of 5 Gauss points is a Chebyshev node (the middle), {at_lobatto} of 5 Gauss-Lobatto "
-                "points are Legendre-Gauss-Lobatto nodes.",
+                measured=f"{common} of 5 Gauss points is a Chebyshev node (the middle), {at_lobatto} of 5 "
+                "Gauss-Lobatto points are Legendre-Gauss-Lobatto nodes.",
                 verdict=judged(common < len(points), at_lobatto == len(points)),
             ),
             Check(
@@ -278,7 +280,7 @@ def _draw_curve(axes: Axes, values: Array) -> None:
     axes.vlines(_numbers(points), 0.0, at_points, color="red", linestyle=":", linewidth=0.7)
     axes.vlines(_numbers(nodes), 0.0, values, color="black", linestyle=":", linewidth=0.7)
     axes.set(
-        xticks=(-1.0, 1.0), xticklabels=("kh", "(k+1)h"), ylabel="q", title="trial curve of one step", ylim=(0.0, 2.6)
+        xticks=(-1.0, 1.0), xticklabels=("kh", "(k+1)h"), ylabel="q", title="trial curve of one step", ylim=(0.0, 2.1)
     )
     axes.legend(loc="upper left")
 
