@@ -192,7 +192,7 @@ def _draw(
                 _draw_curve(axes, exact[one, degree], compiled.get((one, degree)), mark, style, label)
         axes.set(xscale="log", yscale="log", xlabel="h", ylim=(1e-20, 1e2), title=scheme)
         axes.plot([], [], ":", color=COLORS["exact"], linewidth=0.8, label="legend of the paper")
-        axes.legend(loc="upper left")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.axes[0].set_ylabel(f"error of {what} after one step")
 
 
