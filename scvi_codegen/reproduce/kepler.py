@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,21 +133,26 @@ def _figure_13(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(_table(),),
-        picture=Picture(draw=partial(_draw_orbits, runs={s: _run(s)[1] for s in SCHEMES}), width=9.0, height=4.6),
+        picture=Picture(draw=partial(_draw_orbits, runs={s: _run(s)[:2] for s in SCHEMES}), width=12.0, height=4.2),
     )
 
 
-def _draw_orbits(figure: Figure, runs: Mapping[str, Array]) -> None:
-    for axes, (scheme, q) in zip(panels(figure, 1, 2), runs.items(), strict=True):
+def _draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> None:
+    """The orbits, and what they do not show: the distance from the ellipse."""
+    *orbits, distance = panels(figure, 1, 3)
+    for axes, (scheme, (t, q)) in zip(orbits, runs.items(), strict=True):
         draw_states(axes, q, scheme)
+        draw_error(distance, t, off_ellipse(q, ECCENTRICITY), scheme)
         draw_ellipse(axes, ECCENTRICITY)
         axes.set(title=f"{scheme}, T = 2000", xlabel="$q_1$", ylabel="$q_2$", aspect="equal")
         axes.legend(loc="upper right")
+    distance.set(title="distance from the ellipse", xlabel="t", ylabel="in semi-major axes, largest in each bin")
+    distance.legend(loc="center right")
 
 
 def draw_states(axes: Axes, q: Array, scheme: str, label: str | None = None) -> None:
     """Positions of a long run as dots, pixels also in SVG."""
-    style = {"color": COLORS[scheme], "markersize": 1.2, "rasterized": True}
+    style: dict[str, Any] = {"color": COLORS[scheme], "markersize": 1.2, "rasterized": True}
     axes.plot(q[:, 0], q[:, 1], ".", label=label or scheme, **style)
 
 

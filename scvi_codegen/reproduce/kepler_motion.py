@@ -7,7 +7,6 @@ is solved.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,10 +38,11 @@ def perihelion(e: float) -> tuple[Pair, Pair]:
     return (1.0 - e, 0.0), (0.0, math.sqrt((1.0 + e) / (1.0 - e)))
 
 
-def exact_flow(q: Sequence[float], p: Sequence[float], t: ArrayLike) -> tuple[Array, Array]:
+def exact_flow(q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
     """(q, p) after times t, one row each, by Kepler's equation for the change x of the eccentric anomaly."""
-    start, velocity, times = np.array(q), np.array(p), np.atleast_1d(np.asarray(t, dtype=float))
-    r0 = math.hypot(*q)
+    start, velocity = np.asarray(q, dtype=float), np.asarray(p, dtype=float)
+    times = np.atleast_1d(np.asarray(t, dtype=float))
+    r0 = float(np.hypot(*start))
     a = 1.0 / (2.0 / r0 - float(velocity @ velocity))
     inward, sigma = 1.0 - r0 / a, float(start @ velocity) / math.sqrt(a)
     mean = times / a**1.5

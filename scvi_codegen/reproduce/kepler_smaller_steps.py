@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 __all__ = ["EXPERIMENTS"]
 
 Array = NDArray[np.float64]
-Line = tuple[float, float]
+Line: TypeAlias = tuple[float, float]
 
 LEGEND = (2, 4, 6)
 STEPS = tuple(float(h) for h in np.geomspace(1e-3, 3.0, 36))
-Reading = tuple[str, float, Callable[[int], int]]
+Reading: TypeAlias = tuple[str, float, Callable[[int], int]]
 
 
 def _degree_of_points(n: int) -> int:
@@ -176,10 +176,10 @@ def _h_table(quantity: str) -> Table:
     )
 
 
-HCurves = Mapping[tuple[str, str], Mapping[tuple[str, int], Array]]
+Curves: TypeAlias = Mapping[tuple[str, str], Mapping[tuple[str, int], Array]]
 
 
-def _h_curves(quantities: tuple[str, ...]) -> HCurves:
+def _h_curves(quantities: tuple[str, ...]) -> Curves:
     return {
         (reading, q): {(s, n): _h_errors(s, degree(n), e, q) for s in SCHEMES for n in LEGEND}
         for q in quantities
@@ -190,20 +190,21 @@ def _h_curves(quantities: tuple[str, ...]) -> HCurves:
 MARKERS = {2: "o", 4: "s", 6: "^"}
 
 
-def _draw_h(figure: Figure, curves: HCurves) -> None:
+def _draw_h(figure: Figure, curves: Curves) -> None:
     for axes, ((reading, quantity), errors) in zip(panels(figure, len(curves) // 2, 2), curves.items(), strict=True):
         for (scheme, n), values in errors.items():
             shown = np.where(values > 0, values, np.nan)
-            style = {"marker": MARKERS[n], "markersize": 3.0, "linewidth": 0.9, "markevery": 3}
+            style: dict[str, Any] = {"marker": MARKERS[n], "markersize": 3.0, "linewidth": 0.9, "markevery": 3}
             axes.plot(STEPS, shown, color=COLORS[scheme], label=f"{scheme}, N = {n}", **style)
-        axes.set(xscale="log", yscale="log", ylim=(1e-18, 1e3))
+        axes.set(xscale="log", yscale="log", ylim=(1e-17, 1e3))
         axes.set(xlabel="step h", ylabel=f"error of {LABELS[quantity]}", title=reading)
         if reading == READINGS[0][0]:
             for constant, power in PAPER_POWERS.get(quantity, ()):
                 drawn = constant * np.array(STEPS) ** power
                 axes.plot(STEPS, drawn, ":", color=COLORS["exact"], linewidth=0.9)
-                first = int(np.argmax(drawn > 1e-17))
-                axes.annotate(f"$h^{{{power:g}}}$", (STEPS[first], drawn[first]), fontsize=7, color=COLORS["exact"])
+                first = int(np.argmax(drawn > 1e-16))
+                style = {"textcoords": "offset points", "xytext": (-15, 2) if first else (2, 5), "fontsize": 7}
+                axes.annotate(f"$h^{{{power:g}}}$", (STEPS[first], drawn[first]), color=COLORS["exact"], **style)
         axes.legend(loc="upper left", ncols=2)
 
 

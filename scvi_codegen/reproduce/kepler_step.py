@@ -88,5 +88,5 @@ def _error(stepper: Stepper, steps: int) -> float:
         run = stepper.integrate(*STATE, h=SPAN / steps, steps=steps, every=steps)
     except StepFailedError:
         return 0.0
-    exact = np.concatenate(exact_flow(*map(tuple, STATE), SPAN), axis=1)[0]
+    exact = np.concatenate(exact_flow(*STATE, SPAN), axis=1)[0]
     return float(np.abs(np.concatenate([run.q[-1], run.p[-1]]) - exact).max())
