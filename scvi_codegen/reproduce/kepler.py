@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,10 @@ from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.reproduce import kepler_more_points, kepler_smaller_steps
 from scvi_codegen.reproduce.drawing import COLORS, draw_error, panels
 from scvi_codegen.reproduce.experiment import Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.kepler_drawing import draw_ellipse, draw_states
 from scvi_codegen.reproduce.kepler_motion import (
     SYSTEM,
     angular_momentum,
-    ellipse,
     exact_flow,
     off_ellipse,
     perihelion,
@@ -29,7 +29,6 @@ from scvi_codegen.reproduce.kepler_motion import (
 from scvi_codegen.reproduce.running import trajectory
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["EXPERIMENTS"]
@@ -148,17 +147,6 @@ def _draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> Non
         axes.legend(loc="upper right")
     distance.set(title="distance from the ellipse", xlabel="t", ylabel="in semi-major axes, largest in each bin")
     distance.legend(loc="center right")
-
-
-def draw_states(axes: Axes, q: Array, scheme: str, label: str | None = None) -> None:
-    """Positions of a long run as dots, pixels also in SVG."""
-    style: dict[str, Any] = {"color": COLORS[scheme], "markersize": 1.2, "rasterized": True}
-    axes.plot(q[:, 0], q[:, 1], ".", label=label or scheme, **style)
-
-
-def draw_ellipse(axes: Axes, e: float) -> None:
-    """The exact orbit."""
-    axes.plot(*ellipse(e), color="black", linewidth=0.8, label="exact")
 
 
 def _figure_14(_: Mapping[str, Result]) -> Result:

@@ -38,7 +38,6 @@ LONG_STEP = 5.0
 POINTS = (8, 9, 10, 11, 12, 14, 16, 18, 20, 22)
 FIT_WINDOW = 1e-13, 1e-1
 """Errors to which the geometric rate is fitted: above round-off and below the size of the orbit."""
-Line: TypeAlias = tuple[float, float]
 PAPER_BASES: Mapping[tuple[str, str], Line] = {
     ("SC", "q1"): (1e7, 0.1),
     ("SC", "q2"): (1e7, 0.1),

@@ -83,8 +83,9 @@ def perihelion_turn(q: Array, p: Array) -> float:
     return float(angle[-1] - angle[0])
 
 
-def revolutions(t: Array, q: Array) -> Array:
-    """How long each revolution about the centre took, from one passage of the negative first axis to the next."""
-    angle = np.unwrap(np.arctan2(q[:, 1], q[:, 0]))
-    passages = np.arange(np.pi, angle.max(), 2 * np.pi)
-    return np.diff(np.interp(passages, np.maximum.accumulate(angle), t))
+def revolutions(t: Array, q: Array, p: Array) -> Array:
+    """How long each revolution took, from one greatest distance to the next: q . p falls through 0 there."""
+    outward = (q * p).sum(axis=1)
+    before = np.flatnonzero((outward[:-1] > 0) & (outward[1:] <= 0))
+    share = outward[before] / (outward[before] - outward[before + 1])
+    return np.diff(t[before] + share * (t[before + 1] - t[before]))
