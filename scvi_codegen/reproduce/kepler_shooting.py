@@ -1,7 +1,7 @@
 """Section 4.3.2: SCVI on Kepler's problem.
 
-Figs. 23-26, with two points, are here; 27-30, with more, where the printed equations and the variational ones part,
-are in :mod:`.kepler_many_points`.
+Figs. 23-26, with two points, are here. With more points the printed equations and the variational ones part: Fig. 27 in
+:mod:`.kepler_phase_plane`, Figs. 28-30 in :mod:`.kepler_many_points`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI, SpectralCollocation
-from scvi_codegen.reproduce import kepler_many_points
+from scvi_codegen.reproduce import kepler_many_points, kepler_phase_plane
 from scvi_codegen.reproduce.drawing import COLORS, draw_error, panels
 from scvi_codegen.reproduce.experiment import Check, Experiment, Picture, Result, Table, holds
 from scvi_codegen.reproduce.kepler_drawing import draw_ellipse, draw_states
@@ -338,6 +338,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(name="figure-24", title="Kepler: orbits of SCVI with two points, SC with three", run=_figure_24),
     Experiment(name="figure-25", title="Kepler: momentum of SCVI with two points, SC with three", run=_figure_25),
     Experiment(name="figure-26", title="Kepler: energies of SCVI with two points, SC with three", run=_figure_26),
+    *kepler_phase_plane.EXPERIMENTS,
     *kepler_many_points.EXPERIMENTS,
 )
 """Figs. 23-30."""
