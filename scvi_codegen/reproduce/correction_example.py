@@ -12,7 +12,7 @@ from functools import lru_cache
 import sympy
 
 from scvi_codegen.equations import StepEquations, derive
-from scvi_codegen.methods import SCVI
+from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.system import LagrangianSystem
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "lost_terms",
     "middle_value",
     "multipliers_agree",
+    "two_points_agree",
 ]
 
 QUADRATURE = "gauss-legendre:2"
@@ -32,13 +33,25 @@ h, q_k, p_k, Q_1, Q_2, v_0, lambda_1, lambda_2 = sympy.symbols("h q_k p_k Q_1 Q_
 tau = sympy.Symbol("tau", real=True)
 
 
+PENDULUM = LagrangianSystem.from_text(
+    name="planar pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", parameters={}
+)
+
+
 @lru_cache(maxsize=2)
 def compiled(variational: bool) -> StepEquations:
     """The compiler's equations of one step, SCVI(2) with two Gauss points, for L = q_dot^2/2 + cos(q)."""
-    pendulum = LagrangianSystem.from_text(
-        name="planar pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", parameters={}
+    return derive(PENDULUM, SCVI(2, QUADRATURE, variational=variational), radicals=True)
+
+
+def two_points_agree() -> bool:
+    """Whether the printed (34d), (34e) with two points are the equations (27a), (27c) of SVI, derivatives of L_d."""
+    shooting = derive(PENDULUM, SCVI(1, QUADRATURE, variational=False))
+    galerkin = derive(PENDULUM, SVI(1, QUADRATURE))
+    return all(
+        sympy.expand(one.residual - other.residual) == 0
+        for one, other in zip(shooting.idel_equations, galerkin.idel_equations, strict=True)
     )
-    return derive(pendulum, SCVI(2, QUADRATURE, variational=variational), radicals=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,14 +63,14 @@ def _generating_function() -> tuple[Block, ...]:
 def _chain_rule() -> tuple[Block, ...]:
     i, g = sympy.symbols("i g", integer=True, positive=True)
     w, times, h = sympy.IndexedBase("w"), sympy.IndexedBase("tau"), sympy.Symbol("h")
-    L, q, speed = sympy.Function("L"), sympy.Function("q"), sympy.Function(r"\dot{q}")
+    L, q, speed = sympy.Function("L"), sympy.Function("q"), sympy.Function("v")
     quadrature = h / 2 * sympy.Sum(w[i] * L(q(times[i]), speed(times[i])), (i, 1, g))
     total = _after(ACTION, q_0) + _after(ACTION, Q) * _after(INNER, q_0)
     return (
         Paragraph(
             "2. What the paper differentiates. The discrete Lagrangian (33) is a quadrature along the polynomial "
             "through the node values q_0, Q, q_1, where Q stands for the inner ones, Q^1 to Q^(s-1). Written out it is "
-            "a function of all of them:"
+            "a function of all of them (v is the velocity of the polynomial):"
         ),
         Formula(quadrature, ACTION, "33"),
         Paragraph(

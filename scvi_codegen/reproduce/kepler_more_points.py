@@ -111,7 +111,7 @@ def _check_lines(quantities: tuple[str, str]) -> Check:
         claim="The lines c b^N run along the errors.",
         measured=(
             f"The typical factor between an error and its line is {circle:.0f} on the circle and {ellipse:.0e} with "
-            "e = 0.5: the figure was made with e = 0."
+            "e = 0.5: the lines belong to the circle."
         ),
         verdict=holds(circle < 30.0),
     )

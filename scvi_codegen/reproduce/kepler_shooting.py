@@ -243,7 +243,7 @@ def _draw_periods(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> No
         last.set_title(f"{scheme}, the last 2 pi")
         for panel in (whole, last):
             draw_ellipse(panel, ECCENTRICITY)
-            panel.set(xlabel="$q_1$", ylabel="$q_2$", aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.5, 1.2))
+            panel.set(xlabel="$q_1$", ylabel="$q_2$", aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.6, 1.2))
             panel.legend(loc="upper right")
 
 
