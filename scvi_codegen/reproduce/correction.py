@@ -32,7 +32,8 @@ SETTLED = 7
 SETTING = (
     "Not a figure of the paper. First the derivation, in general and for the pendulum with three points; then Kepler's "
     "problem: one step h = 0.3 from q = (0.3, 0.8), p = (-1.1, 0.4), derivatives of the step by central differences of "
-    "order six (noise 1e-13), and runs over 2.4 with steps down to 0.025 for the order.",
+    "order six (noise 1e-13), and runs over 2.4 with steps down to 0.025 for the order. "
+    "With nine points the errors reach round-off before their slope settles.",
     "Chebyshev points and Gauss points as in the table of degrees.",
 )
 

@@ -91,13 +91,11 @@ class Orbit:
 
 
 @lru_cache(maxsize=16)
-def orbit_of(method: Method, h: float, span: float) -> Orbit:
-    """From the perihelion of e = 0.5, with the tolerance of section 4."""
+def orbit_of(method: Method, h: float, span: float, e: float = ECCENTRICITY) -> Orbit:
+    """From the perihelion, with the tolerance of section 4."""
     failed = False
     try:
-        run = trajectory(
-            SYSTEM, method, *perihelion(ECCENTRICITY), h=h, span=span, options=SECTION_4, solver=_solver(method)
-        )
+        run = trajectory(SYSTEM, method, *perihelion(e), h=h, span=span, options=SECTION_4, solver=_solver(method))
     except StepFailedError as failure:
         run, failed = failure.recorded, True
     energy, momentum = run.energy(), angular_momentum(run.q, run.p)

@@ -188,7 +188,7 @@ def _draw_n(figure: Figure, curves: Curves) -> None:
                 )
         axes.set(yscale="log", ylim=(1e-17, 1e3), xlabel="Chebyshev points N", ylabel=f"error of {LABELS[quantity]}")
         axes.set_title(f"e = {e:g}, one step h = 5")
-        axes.legend(loc="upper right" if e == CIRCLE else "lower left")
+        axes.legend(loc="upper right" if e == CIRCLE else "best")
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (

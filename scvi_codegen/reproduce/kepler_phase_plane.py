@@ -39,11 +39,13 @@ __all__ = ["EXPERIMENTS"]
 Array = NDArray[np.float64]
 
 SPAN = 60 * math.pi
+ROUNDER = 0.2
 FOUR_POINTS = 4, 3
+PRINTED_NAME = f"SCVI ({PRINTED})"
 METHODS: Mapping[str, tuple[Method, float, str]] = {
     "SRK4": (Gauss(2), STEP, "SRK"),
-    f"SCVI, {PRINTED}": (shooting(*FOUR_POINTS, PRINTED), STEP, "printed"),
-    f"SCVI, {VARIATIONAL}": (shooting(*FOUR_POINTS, VARIATIONAL), STEP, "SCVI"),
+    PRINTED_NAME: (shooting(*FOUR_POINTS, PRINTED), STEP, "printed"),
+    f"SCVI ({VARIATIONAL})": (shooting(*FOUR_POINTS, VARIATIONAL), STEP, "SCVI"),
     "Stoermer-Verlet": (StoermerVerlet(), STEP / 2, "Verlet"),
     "SC": (SpectralCollocation(3), STEP, "SC"),
 }
@@ -63,8 +65,8 @@ def _figure_27(_: Mapping[str, Result]) -> Result:
         title="Phase trajectories for the Kepler two-body problem",
         setting=SETTING,
         checks=(
-            _kept_check(orbits, [name for name in orbits if name not in ("SC", f"SCVI, {PRINTED}")]),
-            _kept_check(orbits, [f"SCVI, {PRINTED}"]),
+            _kept_check(orbits, [name for name in orbits if name not in ("SC", PRINTED_NAME)]),
+            _kept_check(orbits, [PRINTED_NAME], _with_less_eccentricity()),
             _sc_check(orbits["SC"]),
             *(structure_check(FOUR_POINTS[0], FOUR_POINTS[1:], form) for form in FORMS),
         ),
@@ -73,7 +75,13 @@ def _figure_27(_: Mapping[str, Result]) -> Result:
     )
 
 
-def _kept_check(orbits: Mapping[str, Orbit], names: list[str]) -> Check:
+def _with_less_eccentricity() -> str:
+    """What the printed form does on a rounder orbit, in case the paper's was one."""
+    energy, momentum = orbit_of(METHODS[PRINTED_NAME][0], STEP, SPAN, ROUNDER).largest
+    return f" With e = {ROUNDER:g}: energy {energy:.1e}, momentum {momentum:.1e}."
+
+
+def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -> Check:
     parts = []
     for name in names:
         energy, momentum = orbits[name].largest
@@ -82,8 +90,8 @@ def _kept_check(orbits: Mapping[str, Orbit], names: list[str]) -> Check:
     kept = [not orbits[name].failed and orbits[name].largest[0] < KEPT for name in names]
     return Check(
         claim=f"The phase trajectories are preserved by {', '.join(names)}.",
-        measured=f"Largest errors: {'; '.join(parts)}.",
-        verdict=holds(all(kept)) if all(kept) or not any(kept) else Verdict.PARTLY,
+        measured=f"Largest errors: {'; '.join(parts)}.{more}",
+        verdict=Verdict.PARTLY if any(kept) and not all(kept) else holds(all(kept)),
         bears_on=("scvi-structure",) if any("SCVI" in name for name in names) else (),
     )
 

@@ -105,7 +105,7 @@ def _check_powers() -> Check:
             f"With N points: q1 {_listed(found['q1'])} and q2 {_listed(found['q2'])}; h^11 is a line of SVI with six "
             f"points, whose order is 10. With N the degree: {_slopes_text('q1', 1)}; {_slopes_text('q2', 1)}."
         ),
-        verdict=holds(same == len(drawn)) if same in (0, len(drawn)) else Verdict.PARTLY,
+        verdict=Verdict.PARTLY if 0 < same < len(drawn) else holds(same == len(drawn)),
     )
 
 
