@@ -1,42 +1,25 @@
-"""Tables 1 to 4: the Gauss tableaux as printed against equation (23), and the properties of collocation methods."""
+"""Tables 1 to 3: the Gauss tableaux as printed against the collocation integrals (23)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import sympy
 
-from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.precision import Number, mp
-from scvi_codegen.reproduce.drawing import COLORS, panels
 from scvi_codegen.reproduce.experiment import (
     Block,
     Check,
     Experiment,
     Formula,
     Paragraph,
-    Picture,
     Result,
     Table,
     Verdict,
     holds,
 )
-from scvi_codegen.tableau import (
-    Tableau,
-    chebyshev_gauss,
-    chebyshev_lobatto,
-    exact_tableau,
-    gauss,
-    lobatto_iiia,
-    radau_ia,
-    radau_iia,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from scvi_codegen.tableau import Tableau, exact_tableau, gauss
 
 __all__ = ["EXPERIMENTS"]
 
@@ -83,24 +66,6 @@ LETTERS: Mapping[str, str] = {
 """What Table 3 is written in."""
 
 NAMES = {letter: sympy.Symbol(f"w_{letter[1]}" if letter[0] == "w" else f"w__'_{letter[1]}") for letter in LETTERS}
-MOST_STAGES = 9
-FAMILIES: Mapping[str, tuple[Callable[[int], Tableau], int, str]] = {
-    "Gauss": (gauss, 1, "Gauss"),
-    "Chebyshev-Gauss": (chebyshev_gauss, 1, "Chebyshev"),
-    "Chebyshev-Lobatto": (chebyshev_lobatto, 2, "Chebyshev"),
-    "Radau IIA": (radau_iia, 1, "Radau"),
-    "Radau IA": (radau_ia, 1, "Radau"),
-    "Lobatto IIIA": (lobatto_iiia, 2, "Lobatto IIIA"),
-}
-"""Tableaux by number of stages, the smallest number, and the column of Table 4."""
-
-MARKS: Mapping[str, tuple[str, ...]] = {
-    "A-stable": ("Gauss", "Chebyshev", "Radau", "Lobatto IIIA"),
-    "symmetric": ("Gauss", "Chebyshev", "Lobatto IIIA"),
-    "symplectic": ("Gauss",),
-    "superconvergent": ("Gauss",),
-}
-"""Table 4: the columns with a mark."""
 
 
 def table_1(results: Mapping[str, Result]) -> Result:
@@ -169,7 +134,7 @@ def _number(expression: sympy.Expr) -> Number:
     return mp.mpf(str(sympy.N(expression, 60)))
 
 
-def _labelled(A: Sequence[Sequence[object]], b: Sequence[object], c: Sequence[object]) -> Iterator[tuple[str, object]]:
+def _labelled(A: Sequence[Sequence[Any]], b: Sequence[Any], c: Sequence[Any]) -> Iterator[tuple[str, Any]]:
     for i, row in enumerate(A, start=1):
         yield f"c_{i}", c[i - 1]
         yield from ((f"a_{i}{j}", value) for j, value in enumerate(row, start=1))
@@ -194,7 +159,9 @@ def _entries_table(number: int, printed: Exact, computed: Tableau) -> Table:
 def _entries_check(number: int, printed: Exact, computed: Tableau) -> Check:
     table = _entries_table(number, printed, computed)
     wrong = [row for row in table.rows if row[-1] > AGREES]
-    named = "; ".join(f"{label} is printed {text} = {value:.6f}, it is {exact:.6f}" for label, text, value, exact, _ in wrong)
+    named = "; ".join(
+        f"{label} is printed {text} = {value:.6f}, it is {right:.6f}" for label, text, value, right, _ in wrong
+    )
     count = len(table.rows)
     return Check(
         claim=f"Table {number} lists the coefficients (23) of the Gauss method with {computed.stages} stages.",
@@ -276,139 +243,8 @@ def _typeset(number: int) -> Iterator[Block]:
             yield Formula(_expression(text, NAMES), NAMES[letter])
 
 
-@dataclass(frozen=True, slots=True)
-class Properties:
-    """Of one tableau, computed from its coefficients."""
-
-    family: str
-    stages: int
-    order: int
-    marks: Mapping[str, bool]
-
-
-def properties(family: str, tableau: Tableau) -> Properties:
-    """A-stability by Sturm's and Routh's theorems, symmetry and symplecticity by their identities, order by B, C, D."""
-    return Properties(
-        family,
-        tableau.stages,
-        tableau.order,
-        {
-            "A-stable": tableau.is_a_stable,
-            "symmetric": tableau.is_symmetric,
-            "symplectic": tableau.is_symplectic,
-            "superconvergent": tableau.order >= 2 * tableau.stages,
-        },
-    )
-
-
-@lru_cache(maxsize=1)
-def _all_properties() -> tuple[Properties, ...]:
-    methods = [
-        properties(family, build(s))
-        for family, (build, least, _) in FAMILIES.items()
-        for s in range(least, MOST_STAGES + 1)
-    ]
-    collocation = [properties("SC", SpectralCollocation(s).tableau) for s in range(1, MOST_STAGES + 1)]
-    return (*methods, *collocation)
-
-
-def table_4(results: Mapping[str, Result]) -> Result:
-    """Properties of collocation methods."""
-    found = _all_properties()
-    return Result(
-        name="table-4",
-        title="Properties of different collocation methods",
-        setting=(
-            f"Every mark is computed from A, b, c in 60 digits for all numbers of stages up to {MOST_STAGES}.",
-            "'Chebyshev methods' are taken to be collocation on the Chebyshev-Gauss and on the Chebyshev-Lobatto points, "
-            "'Radau methods' Radau IIA and IA; the paper names no points.",
-            "SC, the spectral collocation of the paper's experiments, collocates at the nodes 1 .. s of s + 1 "
-            "Chebyshev-Lobatto nodes and has no column in the paper's table; it is added here.",
-        ),
-        checks=(*(_mark_check(name, found) for name in MARKS), _collocation_check(found)),
-        tables=(_property_table(found),),
-        picture=Picture(draw=partial(draw_marks, found), width=9.0, height=5.2),
-    )
-
-
-def _property_table(found: Sequence[Properties]) -> Table:
-    return Table(
-        columns=("family", "stages", "order", *MARKS),
-        rows=tuple(
-            (one.family, one.stages, one.order, *("yes" if one.marks[name] else "no" for name in MARKS)) for one in found
-        ),
-        formats={"stages": "d", "order": "d"},
-    )
-
-
-def _mark_check(name: str, found: Sequence[Properties]) -> Check:
-    """Whether the marks of one row are right for every family and number of stages."""
-    agreeing, others = 0, []
-    for family, (_, _, column) in FAMILIES.items():
-        expected = column in MARKS[name]
-        members = [one for one in found if one.family == family]
-        differing = [one.stages for one in members if one.marks[name] != expected]
-        agreeing += len(members) - len(differing)
-        if differing:
-            others.append(f"{family} with {_listed(differing)} {'is not' if expected else 'is'}")
-    total = sum(one.family in FAMILIES for one in found)
-    return Check(
-        claim=f"{_joined(MARKS[name])} methods are {name}" + (", the others are not." if len(MARKS[name]) < 4 else "."),
-        measured=f"So it is for {agreeing} of {total} tableaux"
-        + (f"; {'; '.join(others)}." if others else f", all families with up to {MOST_STAGES} stages."),
-        verdict=holds(agreeing == total) if agreeing in (0, total) else Verdict.PARTLY,
-    )
-
-
-def _collocation_check(found: Sequence[Properties]) -> Check:
-    members = [one for one in found if one.family == "SC"]
-    named = {name: [one.stages for one in members if one.marks[name]] for name in MARKS}
-    unstable = [one.stages for one in members if not one.marks["A-stable"]]
-    orders = ", ".join(str(one.order) for one in members)
-    same = not unstable and len(named["symmetric"]) == len(members)
-    return Check(
-        claim="What the table says of Chebyshev methods, A-stable and symmetric, is true of the SC of the experiments.",
-        measured=f"SC is not A-stable with {_listed(unstable)}; symmetric: {_listed(named['symmetric'])}; symplectic: "
-        f"{_listed(named['symplectic'])}; order {orders} for 1 to {len(members)} stages.",
-        verdict=holds(same),
-    )
-
-
-def _listed(stages: Sequence[int]) -> str:
-    """``1, 3 stages``."""
-    if not stages:
-        return "no number of stages"
-    return f"{', '.join(map(str, stages))} stage{'s' * (list(stages) != [1])}"
-
-
-def _joined(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def draw_marks(found: Sequence[Properties], figure: Figure) -> None:
-    """A panel a property: families down, stages across, a filled square where it holds."""
-    families = list(dict.fromkeys(one.family for one in found))
-    for axes, name in zip(panels(figure, 2, 2), MARKS, strict=True):
-        for one in found:
-            color = COLORS["SRK"] if one.marks[name] else "#eeeeee"
-            axes.add_patch(_square(one.stages, families.index(one.family), color))
-        axes.set(xlim=(0.5, MOST_STAGES + 0.5), ylim=(len(families) - 0.5, -0.5), title=name)
-        axes.set_xticks(range(1, MOST_STAGES + 1))
-        axes.set_yticks(range(len(families)), families)
-        axes.set_xlabel("stages")
-        axes.tick_params(length=0)
-        axes.grid(False)
-
-
-def _square(x: float, y: float, color: str) -> object:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((x - 0.42, y - 0.42), 0.84, 0.84, facecolor=color, edgecolor="none")
-
-
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(name="table-1", title="Gauss method of order 4", run=table_1),
     Experiment(name="table-2", title="Gauss method of order 6", run=table_2),
     Experiment(name="table-3", title="Gauss method of order 8", run=table_3),
-    Experiment(name="table-4", title="Properties of different collocation methods", run=table_4),
 )
