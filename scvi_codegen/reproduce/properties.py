@@ -90,8 +90,8 @@ def table_4(results: Mapping[str, Result]) -> Result:
         title="Properties of different collocation methods",
         setting=(
             f"Every mark is computed from A, b, c in 60 digits for all numbers of stages up to {MOST_STAGES}.",
-            "The paper names no points: 'Chebyshev methods' are taken to be collocation on the Chebyshev-Gauss and on the "
-            "Chebyshev-Lobatto points, 'Radau methods' Radau IIA and IA.",
+            "The paper names no points: 'Chebyshev methods' are taken to be collocation on the Chebyshev-Gauss and on "
+            "the Chebyshev-Lobatto points, 'Radau methods' Radau IIA and IA.",
             "SC, the spectral collocation of the paper's experiments, collocates at the nodes 1 .. s of s + 1 "
             "Chebyshev-Lobatto nodes and has no column in the paper's table; it is added here.",
         ),
