@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -195,7 +195,8 @@ def _solver_checks(solver: str, found: Counts) -> Iterator[Check]:
     yield Check(
         claim="SVI converges faster than SC.",
         measured=f"Solver '{solver}': of {len(ratios)} settings where both stay on the orbit, SVI needs fewer "
-        f"iterations in {fewer} and as many in {equal}; it takes {statistics.median(ratios):.2f} of those of SC (median).",
+        f"iterations in {fewer} and as many in {equal}; its number is {statistics.median(ratios):.2f} of that of SC "
+        "(median).",
         verdict=_share(fewer / len(ratios)),
         bears_on=("svi-iterations",),
     )
@@ -242,6 +243,9 @@ def _text(count: Count) -> str:
 NOTES = dict.fromkeys(SOLVERS, "; in brackets: converged, but off the orbit")
 
 
+CENTRED: Mapping[str, Any] = {"ha": "center", "va": "center", "fontsize": 7}
+
+
 def draw_counts(tables: Mapping[str, Counts], figure: Figure) -> None:
     """The tables one below the other: colour is iterations a step, grey is failure."""
     from matplotlib.cm import ScalarMappable
@@ -261,11 +265,14 @@ def _draw_tiles(axes: Axes, found: Counts, norm: LogNorm) -> None:
     columns = list(dict.fromkeys((degree, scheme) for _, degree, scheme in found))
     colors = np.full((len(steps), len(columns), 4), (0.93, 0.93, 0.93, 1.0))
     for (h, degree, scheme), count in found.items():
-        y, x = steps.index(h), columns.index((degree, scheme))
+        y, x, shade = steps.index(h), columns.index((degree, scheme)), 0.0
         if count.total is not None:
-            colors[y, x] = colormaps["YlOrRd"](norm(count.total / steps_in(SPAN, h)))
+            shade = norm(count.total / steps_in(SPAN, h))
+            colors[y, x] = colormaps["YlOrRd"](shade)
         lost = count.converged and count.energy >= 1.0
-        axes.annotate(f"({_text(count)})" if lost else _text(count), (x, y), ha="center", va="center", fontsize=7)
+        axes.annotate(
+            f"({_text(count)})" if lost else _text(count), (x, y), color="white" if shade > 0.65 else "black", **CENTRED
+        )
     axes.imshow(colors, aspect="auto")
     axes.set_xticks(range(len(columns)), [f"{scheme}\nN = {degree}" for degree, scheme in columns], fontsize=7)
     axes.set_yticks(range(len(steps)), [f"h = {h:g}" for h in steps])
