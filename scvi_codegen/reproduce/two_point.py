@@ -121,8 +121,8 @@ def section_4_3(results: Mapping[str, Result]) -> Result:
         name="section-4.3",
         title="The two-point SCVI of the planar pendulum",
         setting=(
-            "m = l = g = 1, nodes -1 and 1, two Gauss points: the general derivation of SCVI, written with the names of "
-            "section 4.3.1.",
+            "m = l = g = 1, nodes -1 and 1, two Gauss points: the general derivation of SCVI, written with the names "
+            "of section 4.3.1.",
             "Formulas are compared by exact algebra; then steps of the compiled integrator are put into them.",
         ),
         checks=(*_symbolic_checks(scheme), *_correction_checks(), _numerical_check(rows)),
