@@ -20,8 +20,8 @@ class Claim:
 
 CLAIMS: Mapping[str, Claim] = {
     "efficiency": Claim(
-        "Galerkin spectral variational integrators partially inherit the computational efficiency of spectral methods and "
-        "compare very favorably to symplectic Runge-Kutta methods in terms of computational efficiency.",
+        "Galerkin spectral variational integrators partially inherit the computational efficiency of spectral methods "
+        "and compare very favorably to symplectic Runge-Kutta methods in terms of computational efficiency.",
         "section 5, (i)",
     ),
     "stability": Claim(
@@ -40,8 +40,8 @@ CLAIMS: Mapping[str, Claim] = {
         "section 5, (iii)",
     ),
     "scvi-structure": Claim(
-        "Shooting-based variational integrators from spectral-collocation methods are symplectic, momentum-preserving and "
-        "exhibit excellent energy behavior.",
+        "Shooting-based variational integrators from spectral-collocation methods are symplectic, momentum-preserving "
+        "and exhibit excellent energy behavior.",
         "section 5",
     ),
     "sc-unstable": Claim(
@@ -49,8 +49,8 @@ CLAIMS: Mapping[str, Claim] = {
         "section 4.3.2",
     ),
     "sc-period": Claim(
-        "The period of the system does not change when using the SCVI method, but the orbital period shrinks by a factor "
-        "of almost three when using the Chebyshev collocation method.",
+        "The period of the system does not change when using the SCVI method, but the orbital period shrinks by a "
+        "factor of almost three when using the Chebyshev collocation method.",
         "section 4.3.2, Fig. 24",
     ),
     "svi-iterations": Claim(
@@ -59,8 +59,9 @@ CLAIMS: Mapping[str, Claim] = {
         "section 3.3.4, Tables 8 and 9",
     ),
     "scvi-quadrature": Claim(
-        "If we fix the number of Chebyshev points, the SCVI achieves higher-order accuracy as we increase the number of "
-        "quadrature points, at least until the quadrature rule is sufficiently accurate to resolve the action integral.",
+        "If we fix the number of Chebyshev points, the SCVI achieves higher-order accuracy as we increase the number "
+        "of quadrature points, at least until the quadrature rule is sufficiently accurate to resolve the action "
+        "integral.",
         "section 4.3.2, Figs. 28 to 30",
     ),
     "svi-cheaper": Claim(

@@ -161,6 +161,7 @@ def _result(number: int) -> Result:
 
 def _table(printed: Counts, found: Mapping[str, Counts]) -> Table:
     headings = [f"{solver} {what}" for solver in SOLVERS for what in ("max", "total", "energy error", "failure")]
+    numbers = ["N", "paper max", "paper total", *(heading for heading in headings if "failure" not in heading)]
     return Table(
         columns=("h", "N", "scheme", "paper max", "paper total", *headings),
         rows=tuple(
@@ -172,7 +173,7 @@ def _table(printed: Counts, found: Mapping[str, Counts]) -> Table:
             )
             for setting, count in printed.items()
         ),
-        formats={heading: ".1e" for heading in headings if "energy" in heading} | {"h": "g"},
+        formats={"h": "g"} | {heading: ".1e" if "energy" in heading else "d" for heading in numbers},
     )
 
 

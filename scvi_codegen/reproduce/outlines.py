@@ -108,14 +108,14 @@ SCVI_STEPS = (
     Step(
         number=2,
         text="compute matrix A",
-        counterpart="Tables that integrate accelerations at the nodes to velocities and positions, which is what A^-1 and "
-        "A^-2 do, computed in 60 digits when the text is generated.",
+        counterpart="Tables that integrate accelerations at the nodes to velocities and positions, which is what A^-1 "
+        "and A^-2 do, computed in 60 digits when the text is generated.",
         evidence={"": ("NODE_GATHER_0", "NODE_GATHER_1", "NODE_GATHER_2")},
     ),
     Step(
         number=3,
-        text="choose initial guess of the collocation points Q and v0; a good guess for v0 can be obtained by inverting "
-        "the continuous Legendre transformation",
+        text="choose initial guess of the collocation points Q and v0; a good guess for v0 can be obtained by "
+        "inverting the continuous Legendre transformation",
         counterpart="The curve of the step before, continued; the straight line with the velocity that belongs to p_k "
         "where there is none or it fails.",
         evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "STRAIGHT[b] * v[i]")},

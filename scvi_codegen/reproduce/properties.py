@@ -95,7 +95,7 @@ def table_4(results: Mapping[str, Result]) -> Result:
             "SC, the spectral collocation of the paper's experiments, collocates at the nodes 1 .. s of s + 1 "
             "Chebyshev-Lobatto nodes and has no column in the paper's table; it is added here.",
         ),
-        checks=(*(_mark_check(name, found) for name in MARKS), _collocation_check(found)),
+        checks=(*(_mark_check(name, found) for name in MARKS), _collocation_check(found), _stability_check(found)),
         tables=(_property_table(found),),
         picture=Picture(draw=partial(draw_marks, found), width=9.0, height=5.2),
     )
@@ -142,6 +142,19 @@ def _collocation_check(found: Sequence[Properties]) -> Check:
         measured=f"SC is not A-stable with {_listed(unstable)}; symmetric: {_listed(named['symmetric'])}; symplectic: "
         f"{_listed(named['symplectic'])}; order {orders} for 1 to {len(members)} stages.",
         verdict=holds(same),
+    )
+
+
+def _stability_check(found: Sequence[Properties]) -> Check:
+    svi, sc = (
+        [one.stages for one in found if one.family == name and one.marks["A-stable"]] for name in ("Gauss", "SC")
+    )
+    return Check(
+        claim="SVI shows better stability than Chebyshev collocation methods when using large time-steps (section 5).",
+        measured=f"SVI with as many Gauss points as its degree is the Gauss method, A-stable with {_listed(svi)}; SC "
+        f"is with {_listed(sc)}.",
+        verdict=holds(set(svi) > set(sc)),
+        bears_on=("stability",),
     )
 
 
