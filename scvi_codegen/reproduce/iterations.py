@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -60,7 +60,7 @@ PRINTED: Mapping[int, Mapping[float, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Iterations of a run: the largest of a step, all; or why it ended early, and the energy error until then."""
+    """Iterations of a run: most of a step, all, and its largest relative energy error; or why it ended early."""
 
     largest: int | None
     total: int | None
@@ -74,14 +74,14 @@ class Count:
 
     @property
     def sound(self) -> bool:
-        """Whether besides the energy is not wrong by more than itself, when the body has left its orbit."""
+        """Whether besides the energy is not wrong by more than itself, as when the body escapes."""
         return self.converged and self.energy < 1.0
 
 
-Setting = tuple[float, int, str]
+Setting: TypeAlias = tuple[float, int, str]
 """Step size, degree, scheme."""
 
-Counts = Mapping[Setting, Count]
+Counts: TypeAlias = Mapping[Setting, Count]
 NONE = Count(None, None)
 
 
@@ -195,7 +195,7 @@ def _solver_checks(solver: str, found: Counts) -> Iterator[Check]:
     fewer, equal = sum(ratio < 1.0 for ratio in ratios), sum(ratio == 1.0 for ratio in ratios)
     yield Check(
         claim="SVI converges faster than SC.",
-        measured=f"Solver '{solver}': of {len(ratios)} settings where both stay on the orbit, SVI needs fewer "
+        measured=f"Solver '{solver}': of {len(ratios)} settings where both stay bound, SVI needs fewer "
         f"iterations in {fewer} and as many in {equal}; its number is {statistics.median(ratios):.2f} of that of SC "
         "(median).",
         verdict=_share(fewer / len(ratios)),
@@ -207,7 +207,7 @@ def _solver_checks(solver: str, found: Counts) -> Iterator[Check]:
     yield Check(
         claim="SVI is more stable than SC, especially with large time-steps.",
         measured=f"Solver '{solver}': of {len(found) // 2} settings SVI converges at {by_svi} and SC at {by_sc}, and "
-        f"stays on the orbit (energy error below 100 %) at {svi} and {sc}, with h >= {LARGE:g} at {svi_large} and "
+        f"stays bound (energy error below 100 %) at {svi} and {sc}, with h >= {LARGE:g} at {svi_large} and "
         f"{sc_large}; SC does so and SVI does not at {lost}.",
         verdict=Verdict.PARTLY if svi > sc and lost else holds(svi > sc),
         bears_on=("svi-iterations", "stability"),
@@ -220,7 +220,7 @@ def _share(part: float) -> Verdict:
 
 
 def _sound(found: Counts, least: float) -> tuple[int, int, int]:
-    """Settings with h >= least at which SC, at which SVI, and at which only SC stays on the orbit."""
+    """Settings with h >= least at which SC, at which SVI, and at which only SC stays bound."""
     pairs = [(sc.sound, svi.sound) for h, sc, svi in _pairs(found) if h >= least]
     return sum(sc for sc, _ in pairs), sum(svi for _, svi in pairs), sum(sc and not svi for sc, svi in pairs)
 
@@ -241,7 +241,7 @@ def _text(count: Count) -> str:
     return f"{count.largest}/{count.total}" if count.converged else "-"
 
 
-NOTES = dict.fromkeys(SOLVERS, "; in brackets: converged, but off the orbit")
+NOTES = dict.fromkeys(SOLVERS, "; in brackets: converged, energy error above 100 %")
 
 
 CENTRED: Mapping[str, Any] = {"ha": "center", "va": "center", "fontsize": 7}
