@@ -1,0 +1,92 @@
+"""Reads the generated C as far as an outline needs it: functions, the comments above them, and who calls whom.
+
+Not a C parser: it relies on what the templates write, a function's head in the first column and its closing brace alone
+on a line.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+__all__ = ["Function", "functions_of", "outline"]
+
+HEAD = re.compile(
+    r"(?:^/\*(?P<comment>(?:[^*]|\*(?!/))*)\*/\n)?"
+    r"^(?!typedef|struct|enum)[a-z_][\w *()]*?[ *](?P<name>\w+)\((?P<arguments>[^;{}]*)\)\n\{\n(?P<body>.*?)^\}$",
+    re.MULTILINE | re.DOTALL,
+)
+WIDTH = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """One function of the text.
+
+    Attributes:
+        name: as it is called.
+        arguments: their names in order.
+        comment: the one above it, on one line, or nothing.
+        body: its text.
+        calls: the functions of the same text that it calls, in order of first call.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    comment: str
+    body: str
+    calls: tuple[str, ...]
+
+
+def functions_of(code: str) -> dict[str, Function]:
+    """Every function with a body, by name, in the order of the text."""
+    found = {match["name"]: match for match in HEAD.finditer(code)}
+    return {name: _function(match, found) for name, match in found.items()}
+
+
+def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Function:
+    called = dict.fromkeys(re.findall(r"\b(\w+)\(", match["body"]))
+    return Function(
+        name=match["name"],
+        arguments=tuple(_last_word(argument) for argument in match["arguments"].split(",") if argument != "void"),
+        comment=" ".join((match["comment"] or "").replace("\n *", " ").split()),
+        body=match["body"],
+        calls=tuple(name for name in called if name in known and name != match["name"]),
+    )
+
+
+def _last_word(argument: str) -> str:
+    words: list[str] = re.findall(r"\w+", re.sub(r"\[.*?\]|\)", "", argument))
+    return words[-1]
+
+
+def outline(functions: Mapping[str, Function], start: str) -> str:
+    """The tree of calls below ``start``: heads, and the first sentences of comments.
+
+    A function without a comment is left out, and what it calls stands in its place; one that has been shown is not
+    shown again.
+    """
+    return "\n".join(_lines(functions, start, 0, set()))
+
+
+def _lines(functions: Mapping[str, Function], name: str, depth: int, shown: set[str]) -> Iterator[str]:
+    function = functions[name]
+    visible = bool(function.comment) or depth == 0
+    if name in shown:
+        return
+    shown.add(name)
+    if visible:
+        indent = "  " * depth
+        yield from textwrap.wrap(
+            f"{name}({', '.join(function.arguments)})", WIDTH, initial_indent=indent, subsequent_indent=indent + "    "
+        )
+        comment = _first_sentence(function.comment)
+        yield from textwrap.wrap(comment, WIDTH, initial_indent=f"{indent}  | ", subsequent_indent=f"{indent}  | ")
+    for called in function.calls:
+        yield from _lines(functions, called, depth + visible, shown)
+
+
+def _first_sentence(comment: str) -> str:
+    return re.split(r"(?<=[a-z0-9)])[.] (?=[A-Z])", comment)[0].removesuffix(".")
