@@ -39,7 +39,7 @@ Solve: TypeAlias = Callable[[Array], Array]
 
 BITS = 240
 """Of numbers in fixed point: 72 digits."""
-MOST_ITERATIONS = 60
+MOST_ITERATIONS = 30
 STALE = 1e-3
 """A Jacobian is computed anew where an iteration with the old one gains less than this factor."""
 LEAST_FRACTION = 1e-4
