@@ -124,12 +124,13 @@ def _checks(orders: list[Order]) -> tuple[Check, ...]:
 
 def _panel(name: str, key: str) -> Panel:
     def curves(label: str, degrees: tuple[int, ...], scheme: str, line: str, steps: tuple[float, ...]) -> list[Series]:
+        first = f"{label}, s = {', '.join(map(str, degrees))}" if key == "map" else ""
         return [
             Series(
                 x=steps,
                 y=[getattr(errors(name, METHODS[label](s), h), key) for h in steps],
                 scheme=scheme,
-                label=label if s == degrees[0] and key == "map" else "",
+                label=first if s == degrees[0] else "",
                 end=f"{s}",
                 line=line,
             )
@@ -139,7 +140,7 @@ def _panel(name: str, key: str) -> Panel:
     series = curves(FULL, DEGREES, "SCVI", "-", STEPS[name][::-1])
     if key == "map":
         series += curves(PRINTED, (3, 5), "printed", "--", STEPS[name])
-    return Panel(title=f"{TITLES[name]}: {SHOWN[key]}, s = 1 .. 5", series=tuple(series), steps=True)
+    return Panel(title=f"{TITLES[name]}: {SHOWN[key]}", series=tuple(series), steps=True)
 
 
 def _picture() -> Picture:
@@ -200,8 +201,8 @@ def _body(orders: list[Order]) -> tuple[Paragraph | Formula, ...]:
         Paragraph(
             "In the table the order expected is min(2s, q) for SCVI. For SVI it is min(2s, q, 2(q - s + 1)): the "
             "quadrature must also resolve the stationarity conditions, in which the variation has degree s and becomes "
-            "no smoother with h. Gauss and Lobatto rules of s points or more do; with Clenshaw-Curtis rules on Kepler's "
-            f"problem the order of the map is {found}; the order expected is in parentheses."
+            "no smoother with h. Gauss and Lobatto rules of s points or more do; with Clenshaw-Curtis rules the order "
+            f"of the map on Kepler's problem is {found}; the order expected is in parentheses."
         ),
     )
 

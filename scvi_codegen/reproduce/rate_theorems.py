@@ -169,7 +169,7 @@ def _bound_check(name: str, label: str) -> Check:
 
 
 def _bound_panel(name: str, label: str) -> Panel:
-    look = {"collocation": ("SC", "s"), "quadrature": ("SRK", "^"), "L_d": ("SCVI", "o")}
+    look = {"collocation": ("SC", "s"), "quadrature": ("exact", "^"), "L_d": ("SCVI", "o")}
     parts, degrees = _parts(name, label), CASES[label]
     fits = {part: rate(degrees, values) for part, values in parts.items()}
     series = [
@@ -182,9 +182,6 @@ def _bound_panel(name: str, label: str) -> Panel:
         )
         for part, (scheme, marker) in look.items()
     ]
-    constant, base = max(fits["collocation"], fits["quadrature"], key=lambda fit: fit[1])
-    bound = [constant * base**s for s in degrees]
-    series.append(Series(x=degrees, y=bound, scheme="exact", marker="", line=":", label="$C\\,K^s$ of the slower"))
     return Panel(title=f"{label}, {TITLES[name]}, h = {STEP[name]:g}", series=tuple(series))
 
 

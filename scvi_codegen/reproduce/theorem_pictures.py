@@ -56,6 +56,8 @@ def draw_panels(figure: Figure, *, rows: int, columns: int, content: tuple[Panel
         bottom, top = axes.get_ylim()
         axes.set_ylim(max(bottom, floor / 100), min(top, 10.0))
         axes.axhspan(floor / 1e9, floor, color=COLORS["exact"], alpha=0.15, linewidth=0)
+        if axes.get_ylim()[0] < floor / 10:
+            axes.text(0.02, 0.02, "round-off", transform=axes.transAxes, fontsize=7, color=COLORS["exact"])
         if panel.steps:
             axes.set_xscale("log")
             left, right = axes.get_xlim()
@@ -65,7 +67,7 @@ def draw_panels(figure: Figure, *, rows: int, columns: int, content: tuple[Panel
         if index % columns == 0:
             axes.set_ylabel("error")
         if any(series.label for series in panel.series):
-            axes.legend()
+            axes.legend(fontsize=7)
 
 
 def _draw(axes: Axes, series: Series) -> None:
