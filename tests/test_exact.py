@@ -19,6 +19,7 @@ from scvi_codegen.system import LagrangianSystem
 OSCILLATOR = problem("harmonic-oscillator").system
 PENDULUM = problem("planar-pendulum").system
 KEPLER = problem("kepler").system
+RELATIVISTIC = problem("relativistic-particle").system
 
 
 def largest_difference(left, right):
@@ -181,6 +182,9 @@ def test_equilibrium_stays():
         (lambda: exact_map(KEPLER, [1, 0], [0, 1], 1, digits=60), "digits must be a whole number from 1 to 50"),
         (lambda: exact_discrete_lagrangian(KEPLER, [1, 0], [-0.7, -0.8], 5, digits=5), "give guess"),
         (lambda: exact_map(KEPLER, [1, 0], [0, 0], 2, digits=5), "take a smaller step"),
+        (lambda: exact_map(KEPLER, [0, 0], [0, 1], 2, digits=5), "take a smaller step"),
+        (lambda: exact_discrete_lagrangian(RELATIVISTIC, [0], [3], 2, digits=5), "give guess"),
+        (lambda: exact_discrete_lagrangian(RELATIVISTIC, [0], [0.1], 0.2, guess=[2], digits=5), "give guess"),
     ],
 )
 def test_errors_say_what_to_do(call, words):

@@ -124,7 +124,7 @@ def _checks(orders: list[Order]) -> tuple[Check, ...]:
 
 def _panel(name: str, key: str) -> Panel:
     def curves(label: str, degrees: tuple[int, ...], scheme: str, line: str, steps: tuple[float, ...]) -> list[Series]:
-        first = f"{label}, s = {', '.join(map(str, degrees))}" if key == "map" else ""
+        first = label.removeprefix("SCVI ") if key == "map" else ""
         return [
             Series(
                 x=steps,

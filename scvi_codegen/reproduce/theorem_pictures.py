@@ -57,7 +57,8 @@ def draw_panels(figure: Figure, *, rows: int, columns: int, content: tuple[Panel
         axes.set_ylim(max(bottom, floor / 100), min(top, 10.0))
         axes.axhspan(floor / 1e9, floor, color=COLORS["exact"], alpha=0.15, linewidth=0)
         if axes.get_ylim()[0] < floor / 10:
-            axes.text(0.02, 0.02, "round-off", transform=axes.transAxes, fontsize=7, color=COLORS["exact"])
+            place = {"x": 0.98, "ha": "right"} if panel.steps else {"x": 0.02}
+            axes.text(y=0.02, s="round-off", transform=axes.transAxes, fontsize=7, color=COLORS["exact"], **place)
         if panel.steps:
             axes.set_xscale("log")
             left, right = axes.get_xlim()
@@ -67,7 +68,7 @@ def draw_panels(figure: Figure, *, rows: int, columns: int, content: tuple[Panel
         if index % columns == 0:
             axes.set_ylabel("error")
         if any(series.label for series in panel.series):
-            axes.legend(fontsize=7)
+            axes.legend(fontsize=7, **({"loc": "lower right", "bbox_to_anchor": (1, 0.06)} if panel.steps else {}))
 
 
 def _draw(axes: Axes, series: Series) -> None:

@@ -5,88 +5,29 @@ z = h (acceleration) at every point; velocities and positions follow by integrat
 
     V = v0 + A z,    Q = q0 + h A V,    E(Q, V, z / h, t) = 0 at every point.
 
-At the ends and for the action the error falls like rho^(-2n), rho > 1 the larger the smoother the solution. Newton's
-iteration evaluates the residual in 60 digits and the Jacobian in double precision: each refinement adds some ten
-digits.
+At the ends and for the action the error falls like rho^(-2n), rho > 1 the larger the smoother the solution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, TypeAlias
 
 import numpy as np
-import sympy
-from numpy.typing import NDArray
 
 from scvi_codegen.basis import cardinal_integrals
-from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import StateError
-from scvi_codegen.expression_text import evaluate
-from scvi_codegen.mechanics import accelerations, euler_lagrange, mass_entries, momentum
+from scvi_codegen.exact.mechanics import Mechanics
+from scvi_codegen.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
 from scvi_codegen.precision import Number, mp
 from scvi_codegen.quadrature import gauss_legendre
-from scvi_codegen.system import LagrangianSystem
 
-__all__ = ["Array", "Curve", "Grid", "Mechanics", "NotConvergedError", "largest"]
-
-Array: TypeAlias = NDArray[Any]
-"""Of mpmath numbers."""
-Floats: TypeAlias = NDArray[np.float64]
-Solve: TypeAlias = Callable[[Array], Array]
+__all__ = ["Curve", "Grid"]
 
 BITS = 240
 """Of numbers in fixed point: 72 digits."""
-MOST_ITERATIONS = 30
-STALE = 1e-3
-"""A Jacobian is computed anew where an iteration with the old one gains less than this factor."""
-LEAST_FRACTION = 1e-4
 CONJUGATE = 1e-11
 """Singular values of dq1/dv0, divided by h, below which the ends count as conjugate."""
-
-
-class NotConvergedError(ArithmeticError):
-    """Newton's iteration found no solution."""
-
-
-def largest(values: Array) -> Number:
-    """The largest absolute value."""
-    return max(map(abs, values.ravel()), default=mp.zero)
-
-
-def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digits: int) -> Array:
-    """The zero of ``residual`` near x: damped, with a double-precision Jacobian kept as long as it serves."""
-    scale, value, solve = largest(x), residual(x), linearised(x)
-    update = solve(value)
-    for _ in range(MOST_ITERATIONS):
-        size = largest(update)
-        scale = max(scale, largest(x), size)
-        if size <= scale * mp.mpf(10) ** -(digits + 2):
-            return x - update
-        x, value, update = damped(residual, solve, x, update)
-        if largest(update) > STALE * size:
-            solve = linearised(x)
-            update = solve(value)
-    raise NotConvergedError(f"no convergence in {MOST_ITERATIONS} iterations")
-
-
-def damped(residual: Solve, solve: Solve, x: Array, update: Array) -> tuple[Array, Array, Array]:
-    """The longest of the steps 1, 1/2, 1/4 ... of the update that shortens the next update of the same Jacobian."""
-    fraction, size = 1.0, largest(update)
-    while fraction > LEAST_FRACTION:
-        moved = x - update * mp.mpf(fraction)
-        try:
-            value = residual(moved)
-        except ArithmeticError:
-            fraction /= 2
-            continue
-        following = solve(value)
-        if largest(following) <= (1 - fraction / 4) * size:
-            return moved, value, following
-        fraction /= 2
-    raise NotConvergedError("Newton's iteration stalls")
 
 
 def fixed(values: Array, exponent: int) -> Array:
@@ -162,89 +103,6 @@ def _gauss_tables(points: int) -> tuple[Array, Array, Array]:
     return np.array(c, dtype=object), np.array(rule.unit_weights, dtype=object), np.array(A, dtype=object)
 
 
-Entries: TypeAlias = Mapping[tuple[int, int], sympy.Expr]
-
-
-@lru_cache(maxsize=32)
-def _formulas(system: LagrangianSystem) -> tuple[tuple[sympy.Expr, ...], tuple[Entries, Entries, Entries]]:
-    """E and its derivatives by position, velocity and acceleration."""
-    residual = euler_lagrange(system)
-    by = (system.coordinates, system.velocities, accelerations(system))
-    return residual, tuple(jacobian(residual, symbols) for symbols in by)  # type: ignore[return-value]
-
-
-class Mechanics:
-    """L, its derivatives and the Euler-Lagrange residual at a point, with given parameters."""
-
-    def __init__(self, system: LagrangianSystem, parameters: Mapping[str, Number]) -> None:
-        self.system, self.dimension = system, system.dimension
-        self.constants = {symbol: parameters[symbol.name] for symbol in system.parameters}
-        self.E, self.slopes_of_E = _formulas(system)
-        self.p, self.mass = momentum(system), mass_entries(system)
-
-    def _point(self, q: Array, v: Array, t: Number, a: Array | None = None) -> dict[sympy.Symbol, Number]:
-        system = self.system
-        values = dict(zip((*system.coordinates, *system.velocities), (*q, *v), strict=True))
-        if a is not None:
-            values |= dict(zip(accelerations(system), a, strict=True))
-        return values | self.constants | {system.time: t}
-
-    def lagrangian(self, q: Array, v: Array, t: Number) -> Number:
-        """L."""
-        return evaluate(self.system.lagrangian, self._point(q, v, t))
-
-    def momentum(self, q: Array, v: Array, t: Number) -> Array:
-        """(m,) dL/dv."""
-        return _values(self.p, self._point(q, v, t))
-
-    def velocity(self, q: Array, p: Array, t: Number, digits: int) -> Array:
-        """(m,) velocities of momentum p, found from rest."""
-
-        def linearised(v: Array) -> Solve:
-            return _solver(_matrix(self.mass, self._point(q, v, t), {}, self.dimension))
-
-        rest = np.array([mp.zero] * self.dimension, dtype=object)
-        return newton(lambda v: self.momentum(q, v, t) - p, linearised, rest, digits)
-
-    def residual(self, q: Array, v: Array, t: Number, a: Array) -> Array:
-        """(m,) Euler-Lagrange residual."""
-        return _values(self.E, self._point(q, v, t, a))
-
-    def slopes(self, q: Array, v: Array, t: Number, a: Array) -> Floats:
-        """(3, m, m) derivatives of the residual by position, velocity and acceleration."""
-        point, known = self._point(q, v, t, a), dict[Any, Any]()
-        return np.array([_matrix(entries, point, known, self.dimension) for entries in self.slopes_of_E])
-
-
-def _values(expressions: tuple[sympy.Expr, ...], point: dict[sympy.Symbol, Number]) -> Array:
-    known: dict[sympy.Expr, Number] = {}
-    return np.array([evaluate(expression, point, known) for expression in expressions], dtype=object)
-
-
-def _matrix(entries: Entries, point: dict[sympy.Symbol, Number], known: dict[Any, Any], size: int) -> Floats:
-    matrix = np.zeros((size, size))
-    for place, entry in entries.items():
-        matrix[place] = float(evaluate(entry, point, known))
-    return matrix
-
-
-def _solver(matrix: Floats) -> Solve:
-    """Solves with this matrix; right sides are scaled to size 1, so that small ones do not underflow."""
-    try:
-        inverse = np.linalg.inv(matrix)
-    except np.linalg.LinAlgError as failure:
-        raise NotConvergedError("the mass matrix d2L/dv2 is singular on the way") from failure
-    return lambda right: _scaled(lambda floats: inverse @ floats, right)
-
-
-def _scaled(solve: Callable[[Floats], Floats], right: Array) -> Array:
-    size = largest(right)
-    if size == 0:
-        return right
-    found = [mp.mpf(float(value)) * size for value in solve((right / size).astype(float).ravel())]
-    return np.array(found, dtype=object).reshape(right.shape)
-
-
 @dataclass(frozen=True, slots=True)
 class Curve:
     """A curve from q0 at t over a step h, given by its velocity at the start and z = h (acceleration) at the points."""
@@ -279,14 +137,14 @@ class Curve:
     def _uniformly_accelerated(self) -> Curve:
         rest = np.array([mp.zero] * len(self.position), dtype=object)
         at = (self.position, self.velocity, self.t, rest)
-        acceleration = -_solver(self.mechanics.slopes(*at)[2])(self.mechanics.residual(*at))
+        acceleration = -solver(self.mechanics.slopes(*at)[2])(self.mechanics.residual(*at))
         return replace(self, z=np.array([acceleration * self.h] * len(self.grid.abscissae), dtype=object))
 
     def _solved(self, digits: int) -> Curve:
         """The solution from the same position and velocity."""
 
         def linearised(z: Array) -> Solve:
-            return _solver(replace(self, z=z)._slopes()[0])
+            return solver(replace(self, z=z)._slopes()[0])
 
         return replace(self, z=newton(lambda z: replace(self, z=z)._residual(), linearised, self.z, digits))
 
@@ -330,11 +188,8 @@ class Curve:
         """Solves for (v0, z) by elimination of z; what is left is dq1/dv0, the Jacobi field."""
         by_z, by_v0 = self._slopes()
         m = len(self.position)
-        try:
-            inverse = np.linalg.inv(by_z)
-        except np.linalg.LinAlgError as failure:
-            raise NotConvergedError("the mass matrix d2L/dv2 is singular on the way") from failure
-        response, border = inverse @ by_v0, np.kron(self.grid.row @ self.grid.matrix, np.eye(m))
+        inverted = inverse(by_z)
+        response, border = inverted @ by_v0, np.kron(self.grid.row @ self.grid.matrix, np.eye(m))
         field = np.eye(m) - border @ response
         if np.linalg.svd(field, compute_uv=False)[-1] < CONJUGATE:
             raise StateError(
@@ -343,11 +198,11 @@ class Curve:
             )
 
         def solve(floats: Floats) -> Floats:
-            inner = inverse @ floats[m:]
+            inner = inverted @ floats[m:]
             start = np.linalg.solve(field, floats[:m] - border @ inner)
             return np.concatenate([start, inner - response @ start])
 
-        return lambda right: _scaled(solve, right)
+        return lambda right: scaled(solve, right)
 
     def ends(self) -> tuple[Array, Array]:
         """Positions at both ends."""

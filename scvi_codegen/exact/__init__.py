@@ -3,7 +3,7 @@
     L_d^E(q0, q1) = integral of L(q(t), q'(t), t) from t to t + h, q the solution of (2) with q(t) = q0, q(t + h) = q1.
 
 Its derivatives are the momenta of that solution at its ends, p0 = -D_1 L_d^E and p1 = D_2 L_d^E, so the exact discrete
-Legendre transforms and the exact flow come with it. The solution is found by :mod:`scvi_codegen.exact_curve` on finer
+Legendre transforms and the exact flow come with it. The solution is found by :mod:`scvi_codegen.exact.curve` on finer
 and finer grids, until two in a row agree to the digits asked for.
 """
 
@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact_curve import Array, Curve, Grid, Mechanics, NotConvergedError, largest
+from scvi_codegen.exact.curve import Curve, Grid
+from scvi_codegen.exact.mechanics import Mechanics
+from scvi_codegen.exact.newton import Array, NotConvergedError, largest
 from scvi_codegen.expression_text import closest
 from scvi_codegen.precision import Number, Vector, mp
 from scvi_codegen.system import LagrangianSystem
@@ -133,7 +135,7 @@ def exact_map(
     origin = f"the trajectory from q0 = {_shown(start)}, p0 = {_shown(momenta)}"
     try:
         velocity = problem.mechanics.velocity(start, momenta, problem.t, digits)
-    except NotConvergedError as failure:
+    except ArithmeticError as failure:
         raise StateError(f"{origin}: no velocity has this momentum ({failure})") from failure
 
     def solve(grid: Grid) -> Curve:
@@ -169,10 +171,10 @@ class _Problem:
             for points in POINTS if coarse is None else POINTS[-1:]:
                 try:
                     fine = solve(Grid.of(points, pieces))
-                except NotConvergedError as failure:
+                    error = mp.inf if coarse is None else _difference(coarse, fine)
+                except ArithmeticError as failure:
                     reason = str(failure)
                     break
-                error = mp.inf if coarse is None else _difference(coarse, fine)
                 if error <= mp.mpf(10) ** -self.digits:
                     return _step(fine, error)
                 coarse, reason = fine, f"{points} points in each of {pieces} pieces give only {mp.nstr(error, 2)}"
