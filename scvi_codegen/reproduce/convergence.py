@@ -63,8 +63,12 @@ SHOWN = QUANTITIES | {"action": "$L_d$"}
 """As set in pictures."""
 TITLES = {"planar-pendulum": "pendulum", "kepler": "Kepler"}
 START = (
-    "The theorem names no problem: the pendulum and Kepler's problem, each from three states without symmetry; errors "
-    "are the largest of the three trajectories."
+    "The theorem names no problem: the pendulum and Kepler's problem, each from three states (q; q') without symmetry: "
+    + "; ".join(
+        f"{TITLES[name]} " + ", ".join(f"({', '.join(map(str, q))}; {', '.join(map(str, v))})" for q, v in starts)
+        for name, starts in STARTS.items()
+    )
+    + ". Errors are the largest of the three trajectories."
 )
 EXACT = "The exact discrete Lagrangian (6), its Legendre transforms and the exact flow are computed with 18 digits."
 GALERKIN, FULL, FEW, PRINTED = "SVI", "SCVI", "SCVI, few points", "SCVI as printed"
