@@ -173,8 +173,8 @@ def _run(_: Mapping[str, Result]) -> Result:
             f"with errors above {PLATEAU:.0e}; successive steps differ by a factor sqrt(2).",
             "Chebyshev-Lobatto nodes, s Gauss points; few points: max(1, s // 2) Gauss points, whose order q decides; "
             "Clenshaw-Curtis: s + 1 points. p is the order of spectral collocation of degree s.",
-            "The compiled integrator of the printed form has no discrete Lagrangian; its map is measured. Numbers at curves "
-            "are degrees.",
+            "The compiled integrator of the printed form has no discrete Lagrangian; its map is measured.",
+            "Numbers at the curves of the picture are degrees.",
         ),
         checks=_checks(orders),
         tables=(Table(columns=columns, rows=rows, formats=dict.fromkeys(columns[7:], ".2f")),),
