@@ -1,0 +1,233 @@
+"""Collocation of the Euler-Lagrange equations (2) at many Gauss points in 60 digits, for :mod:`scvi_codegen.exact`.
+
+A step is divided into equal pieces with n Gauss points each. The unknowns are the velocity v0 at the start and
+z = h (acceleration) at every point; velocities and positions follow by integration of the interpolating polynomials,
+
+    V = v0 + A z,    Q = q0 + h A V,    E(Q, V, z / h, t) = 0 at every point.
+
+At the ends and for the action the error falls like rho^(-2n), rho > 1 the larger the smoother the solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from scvi_codegen.basis import cardinal_integrals
+from scvi_codegen.errors import StateError
+from scvi_codegen.exact.mechanics import Mechanics
+from scvi_codegen.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
+from scvi_codegen.precision import Number, mp
+from scvi_codegen.quadrature import gauss_legendre
+
+__all__ = ["Curve", "Grid"]
+
+BITS = 240
+"""Of numbers in fixed point: 72 digits."""
+CONJUGATE = 1e-11
+"""Singular values of dq1/dv0, divided by h, below which the ends count as conjugate."""
+
+
+def fixed(values: Array, exponent: int) -> Array:
+    """Numbers times 2^(BITS - exponent) as integers: products of matrices of integers are ten times faster."""
+    shifted = [int(mp.ldexp(value, BITS - exponent)) for value in values.ravel()]
+    return np.array(shifted, dtype=object).reshape(values.shape)
+
+
+def fixed_product(matrix: Array, values: Array) -> Array:
+    """``matrix``, in integers, times numbers; accurate relative to the largest of them."""
+    exponent = int(mp.mag(largest(values) or mp.one))
+    products = matrix @ fixed(values, exponent)
+    numbers = [mp.ldexp(mp.mpf(product), exponent - 2 * BITS) for product in products.ravel()]
+    return np.array(numbers, dtype=object).reshape(products.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """n Gauss points in each of some equal pieces of [0, 1].
+
+    Attributes:
+        pieces: how many.
+        abscissae: (pieces * n,) all points.
+        weights: (n,) of a piece of length 1.
+        integrals: (n + 1, n) integrals from 0 to each point of a piece of length 1 and to its end, as integers.
+        matrix: the Runge-Kutta matrix of all points together, in double precision.
+        row: its weights, likewise.
+    """
+
+    pieces: int
+    abscissae: Array
+    weights: Array
+    integrals: Array
+    matrix: Floats
+    row: Floats
+
+    @classmethod
+    @lru_cache(maxsize=64)
+    def of(cls, points: int, pieces: int) -> Grid:
+        """The grid of so many points a piece."""
+        c, b, A = _gauss_tables(points)
+        below, ones = np.tril(np.ones((pieces, pieces)), -1), np.ones(points)
+        floats = b.astype(float)
+        return cls(
+            pieces=pieces,
+            abscissae=np.concatenate([(piece + c) / pieces for piece in range(pieces)]),
+            weights=b,
+            integrals=fixed(np.vstack([A, b]), 0),
+            matrix=(np.kron(np.eye(pieces), A.astype(float)) + np.kron(below, np.outer(ones, floats))) / pieces,
+            row=np.tile(floats, pieces) / pieces,
+        )
+
+    @property
+    def piece(self) -> Grid:
+        """One of the pieces, as a grid."""
+        return Grid.of(len(self.weights), 1)
+
+    def integrate(self, rates: Array, start: Array) -> tuple[Array, Array]:
+        """From ``start``, the values at the points and at the end of what has these rates at the points."""
+        values = []
+        for piece in np.split(rates, self.pieces):
+            moved = start + fixed_product(self.integrals, piece) / self.pieces
+            values.append(moved[:-1])
+            start = moved[-1]
+        return np.concatenate(values), start
+
+
+@lru_cache(maxsize=16)
+def _gauss_tables(points: int) -> tuple[Array, Array, Array]:
+    rule = gauss_legendre(points)
+    c = rule.abscissae
+    A = cardinal_integrals(c, c, 0)
+    return np.array(c, dtype=object), np.array(rule.unit_weights, dtype=object), np.array(A, dtype=object)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A curve from q0 at t over a step h, given by its velocity at the start and z = h (acceleration) at the points."""
+
+    mechanics: Mechanics
+    grid: Grid
+    t: Number
+    h: Number
+    position: Array
+    velocity: Array
+    z: Array
+
+    @classmethod
+    def straight(cls, mechanics: Mechanics, grid: Grid, t: Number, h: Number, start: Array, end: Array) -> Curve:
+        """The uniform motion from ``start`` to ``end``."""
+        rest = np.full((len(grid.abscissae), len(start)), mp.zero, dtype=object)
+        return cls(mechanics, grid, t, h, start, (end - start) / h, rest)
+
+    @classmethod
+    def launched(
+        cls, mechanics: Mechanics, grid: Grid, t: Number, h: Number, start: Array, velocity: Array, digits: int
+    ) -> Curve:
+        """The solution of (2) with this start and velocity, piece after piece."""
+        position, speed, found, length = start, velocity, [], h / grid.pieces
+        for index in range(grid.pieces):
+            first = cls(mechanics, grid.piece, t + index * length, length, position, speed, np.empty((0,)))
+            curve = first._uniformly_accelerated()._solved(digits)
+            found.append(curve.z * grid.pieces)
+            position, speed = curve.ends()[1], curve.end_velocities()[1]
+        return cls(mechanics, grid, t, h, start, velocity, np.concatenate(found))
+
+    def _uniformly_accelerated(self) -> Curve:
+        rest = np.array([mp.zero] * len(self.position), dtype=object)
+        at = (self.position, self.velocity, self.t, rest)
+        acceleration = -solver(self.mechanics.slopes(*at)[2])(self.mechanics.residual(*at))
+        return replace(self, z=np.array([acceleration * self.h] * len(self.grid.abscissae), dtype=object))
+
+    def _solved(self, digits: int) -> Curve:
+        """The solution from the same position and velocity."""
+
+        def linearised(z: Array) -> Solve:
+            return solver(replace(self, z=z)._slopes()[0])
+
+        return replace(self, z=newton(lambda z: replace(self, z=z)._residual(), linearised, self.z, digits))
+
+    def joined_to(self, end: Array, digits: int) -> Curve:
+        """The solution that ends at ``end``: v0 is an unknown too, and q(h) = ``end`` is its equation."""
+
+        def moved(unknown: Array) -> Curve:
+            return replace(self, velocity=unknown[0], z=unknown[1:])
+
+        def residual(unknown: Array) -> Array:
+            curve = moved(unknown)
+            return np.vstack([((curve.ends()[1] - end) / self.h)[None], curve._residual()])
+
+        x = newton(
+            residual, lambda unknown: moved(unknown)._bordered(), np.vstack([self.velocity[None], self.z]), digits
+        )
+        return moved(x)
+
+    def _states(self) -> tuple[Array, Array]:
+        velocities, _ = self.grid.integrate(self.z, self.velocity)
+        return self.grid.integrate(velocities * self.h, self.position)[0], velocities
+
+    def _points(self) -> list[tuple[Array, Array, Number, Array]]:
+        times = self.t + self.grid.abscissae * self.h
+        return list(zip(*self._states(), times, self.z / self.h, strict=True))
+
+    def _residual(self) -> Array:
+        return np.array([self.mechanics.residual(*point) for point in self._points()], dtype=object)
+
+    def _slopes(self) -> tuple[Floats, Floats]:
+        """Derivatives of all residuals by z, square, and by v0."""
+        by_q, by_v, by_a = np.array([self.mechanics.slopes(*point) for point in self._points()]).swapaxes(0, 1)
+        h, A, c = float(self.h), self.grid.matrix, self.grid.abscissae.astype(float)
+        blocks = np.einsum("ij,iab->iajb", A, by_v) + h * np.einsum("ij,iab->iajb", A @ A, by_q)
+        size = np.arange(len(c))
+        blocks[size, :, size, :] += by_a / h
+        count = by_a.shape[0] * by_a.shape[1]
+        return blocks.reshape(count, count), (by_v + h * c[:, None, None] * by_q).reshape(count, -1)
+
+    def _bordered(self) -> Solve:
+        """Solves for (v0, z) by elimination of z; what is left is dq1/dv0, the Jacobi field."""
+        by_z, by_v0 = self._slopes()
+        m = len(self.position)
+        inverted = inverse(by_z)
+        response, border = inverted @ by_v0, np.kron(self.grid.row @ self.grid.matrix, np.eye(m))
+        field = np.eye(m) - border @ response
+        if np.linalg.svd(field, compute_uv=False)[-1] < CONJUGATE:
+            raise StateError(
+                "the trajectories that leave q0 meet again at the end of the step (conjugate points): the discrete "
+                "Lagrangian is not defined there. Take a smaller step, or give guess to reach another trajectory"
+            )
+
+        def solve(floats: Floats) -> Floats:
+            inner = inverted @ floats[m:]
+            start = np.linalg.solve(field, floats[:m] - border @ inner)
+            return np.concatenate([start, inner - response @ start])
+
+        return lambda right: scaled(solve, right)
+
+    def ends(self) -> tuple[Array, Array]:
+        """Positions at both ends."""
+        velocities, _ = self.grid.integrate(self.z, self.velocity)
+        return self.position, self.grid.integrate(velocities * self.h, self.position)[1]
+
+    def end_velocities(self) -> tuple[Array, Array]:
+        """Velocities at both ends."""
+        return self.velocity, self.grid.integrate(self.z, self.velocity)[1]
+
+    def end_momenta(self) -> tuple[Array, Array]:
+        """Momenta at both ends."""
+        (q0, q1), (v0, v1) = self.ends(), self.end_velocities()
+        return self.mechanics.momentum(q0, v0, self.t), self.mechanics.momentum(q1, v1, self.t + self.h)
+
+    def action(self) -> Number:
+        """The integral of L over the step."""
+        return self._integral([self.mechanics.lagrangian(q, v, t) for q, v, t, _ in self._points()]) * self.h
+
+    def sizes(self) -> tuple[Number, Number, Number]:
+        """The integral of ``|L|``, the largest position and the largest momentum."""
+        points, mechanics = self._points(), self.mechanics
+        action = self._integral([abs(mechanics.lagrangian(q, v, t)) for q, v, t, _ in points]) * abs(self.h)
+        momenta = np.array([mechanics.momentum(q, v, t) for q, v, t, _ in points])
+        return action, largest(np.array(self.ends())), largest(momenta)
+
+    def _integral(self, values: list[Number]) -> Number:
+        return mp.fdot(np.tile(self.grid.weights, self.grid.pieces), values) / self.grid.pieces
