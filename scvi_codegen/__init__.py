@@ -23,6 +23,7 @@ _HOMES = {
     "advice": ("Advice", "advise"),
     "compiler": ("compile_stepper", "generate_source"),
     "ensemble": ("EnsembleTrajectory",),
+    "exact": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
     "hamiltonian": ("HamiltonianSystem", "hamiltonian_of", "lagrangian_of"),
     "equations": ("StepEquations", "derive"),
     "errors": (

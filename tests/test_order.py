@@ -64,6 +64,8 @@ METHODS = (
     SVI(3, "clenshaw-curtis:4"),
     SVI(3, "clenshaw-curtis:5"),
     SVI(3, "fejer:4"),
+    SVI(4, "clenshaw-curtis:4"),
+    SVI(5, "clenshaw-curtis:5"),
     SVI(3, "gauss-radau-left:3"),
     SVI(2, "gauss-radau-right:2"),
     *(SCVI(s) for s in (1, 2, 3, 4, 5)),

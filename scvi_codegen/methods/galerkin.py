@@ -58,8 +58,9 @@ EXTRAPOLATION_DEGREE = 8
 class SVI(Method):
     """Galerkin spectral variational integrator of a polynomial degree, with any quadrature.
 
-    Symplectic, conserves the momentum maps of affine symmetries to round-off, order min(2 degree, order of the
-    quadrature), reversible if the quadrature is symmetric. Paper: section 3, (25)-(30), Table 5.
+    Symplectic, conserves the momentum maps of affine symmetries to round-off, of order 2s by default and
+    min(2s, q, 2 (q - s + 1)) with a quadrature of order q, reversible if the quadrature is symmetric. Paper: section 3,
+    (25)-(30), Table 5.
 
     Args:
         degree: degree s of the trial curve, at least 1.
@@ -132,11 +133,16 @@ class SVI(Method):
 
     @property
     def order(self) -> int | None:
-        """min(2 degree, order of the quadrature); ``None`` with too few points, and for trigonometric curves."""
-        best = self.curves.order(self.degree)
+        """min(2s, q, 2 (q - s + 1)), q the order of the quadrature; ``None`` with too few points, and for trigonometric
+        curves.
+
+        The last bound is felt by rules whose order is hardly their number of points (Clenshaw-Curtis, Fejer): the
+        stationarity conditions integrate products with variations of degree s, which do not get smoother with h.
+        """  # noqa: D205
+        best, q = self.curves.order(self.degree), self.rule.order
         if best is None or self.rule.conditions < self.curves.dimension(self.degree):
             return None
-        return min(best, self.rule.order)
+        return min(best, q, 2 * (q - self.degree + 1))
 
     @property
     def symmetric(self) -> bool:

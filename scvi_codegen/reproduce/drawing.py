@@ -54,7 +54,8 @@ def thinned(*series: ArrayLike, most: int = MOST_POINTS) -> tuple[Array, ...]:
 def largest_in_bins(t: ArrayLike, error: ArrayLike, *, bins: int = BINS) -> tuple[Array, Array]:
     """Times and the largest |error| from each to the next; zeros, which a log axis cannot show, become NaN."""
     times, values = np.asarray(t, dtype=float), np.abs(np.asarray(error, dtype=float))
-    starts = np.arange(0, len(times), max(1, len(times) // bins))
+    size = max(1, len(times) // bins)
+    starts = np.arange(0, max(1, len(times) - size + 1), size)  # what is left over belongs to the last bin
     largest: Any = np.maximum.reduceat(values, starts)
     return times[starts], np.where(largest > 0.0, largest, np.nan)
 
