@@ -104,7 +104,9 @@ class Errors:
 @lru_cache(maxsize=8)
 def system_named(name: str) -> LagrangianSystem:
     """The problem's system, one object a process."""
-    return problem(name).system
+    system = problem(name).system
+    assert isinstance(system, LagrangianSystem)
+    return system
 
 
 @lru_cache(maxsize=512)
