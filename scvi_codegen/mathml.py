@@ -5,7 +5,7 @@
     '<math><mfrac><msub><mover accent="true"><mi>θ</mi><mo>˙</mo></mover>...</math>'
 
 Fractions keep what is short; wide factors stand behind them, and nothing is rewritten: signs and factors are those of
-the expression. Browsers do not break lines within ``<math>``, so :func:`mathml_pieces` gives a long equation in pieces
+the expression. Browsers do not break lines within ``<math>``, so :func:`mathml_terms` gives a long equation in pieces
 between which a line may end.
 """
 
@@ -15,7 +15,7 @@ import html
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import takewhile
+from itertools import chain, takewhile
 from typing import Any, TypeAlias
 from xml.dom.minidom import Element, Node
 
@@ -23,10 +23,10 @@ import sympy
 from mpmath.libmp import to_str
 from sympy.core.function import AppliedUndef
 from sympy.printing.mathml import MathMLPresentationPrinter
-from sympy.printing.precedence import PRECEDENCE
+from sympy.printing.precedence import PRECEDENCE, precedence_traditional
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
-__all__ = ["mathml", "mathml_pieces"]
+__all__ = ["mathml", "mathml_terms"]
 
 DIGITS = 6
 """Significant digits of floating-point numbers."""
@@ -49,7 +49,11 @@ SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
 """Functions whose power is written at their name."""
 TYPESET = str.maketrans({"-": "\N{MINUS SIGN}", "ⅆ": "d", "ⅇ": "e", "ⅈ": "i"})
 
+TALL_TAGS = ("mfrac", "mtable", "munderover")
+
 Child: TypeAlias = Element | str
+Piece: TypeAlias = list[Element]
+"""What becomes one ``<math>`` element."""
 
 
 def mathml(expression: sympy.Basic, *, display: bool = False) -> str:
@@ -63,24 +67,25 @@ def mathml(expression: sympy.Basic, *, display: bool = False) -> str:
     return printer.text([printer.printed(expression)], display=display)
 
 
-def mathml_pieces(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[str, ...]:
-    """An equation in ``<math>`` elements that are set one after the other; a line may end between them.
+def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[tuple[str, ...], ...]:
+    """An equation as terms, and each of them as ``<math>`` elements, to be set one after the other.
 
-    The first is ``left =`` where there is a left side and the equation is too long for one piece. Sums are broken
-    before a sign, long products before a factor.
+    A line may end between terms, and between the pieces of a term that is longer than a line: before a factor, and
+    before a sign within the brackets of a long factor. A short equation is one piece.
 
     Args:
-        right: an expression, or a relation if ``left`` is ``None``.
-        left: what it equals.
+        right: an expression, or an equation if ``left`` is ``None``.
+        left: what it equals; ``left =`` is the first piece.
     """
     if left is None and isinstance(right, sympy.Eq):
         left, right = right.lhs, right.rhs
     printer = _Printer()
-    lead = [] if left is None else [[printer.printed(left), printer.operator("=")]]
-    pieces = list(printer.pieces(right))
+    terms = list(printer.terms(right))
+    if left is not None:
+        terms[0].insert(0, [printer.printed(left), printer.operator("=")])
     if _length(right) + (0 if left is None else _length(left)) <= ONE_LINE:
-        return (printer.text([element for piece in (*lead, *pieces) for element in piece], display=True),)
-    return tuple(printer.text(piece, display=True) for piece in (*lead, *pieces))
+        terms = [[[element for term in terms for piece in term for element in piece]]]
+    return tuple(tuple(printer.text(piece, display=True) for piece in term) for term in terms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +109,8 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         return str(root.toxml())
 
     def printed(self, expression: Any) -> Element:
-        return self._print(expression)  # type: ignore[no-any-return]
+        element: Element = self._print(expression)
+        return element
 
     def operator(self, sign: str, **attributes: str) -> Element:
         element = self._element("mo", sign)
@@ -112,34 +118,39 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
             element.setAttribute(name, value)
         return element
 
-    def pieces(self, expression: sympy.Basic) -> Iterator[list[Element]]:
-        """The parts of an expression between which a line may end."""
+    def terms(self, expression: sympy.Basic) -> Iterator[list[Piece]]:
+        """The terms of a sum with their signs, in pieces between which a line may end."""
         if not isinstance(expression, sympy.Add | sympy.Mul):
-            yield [self.printed(expression)]
+            yield [[self.printed(expression)]]
             return
-        terms = self._as_ordered_terms(expression) if expression.is_Add else [expression]
-        for number, term in enumerate(terms):
+        for number, term in enumerate(self._as_ordered_terms(expression) if expression.is_Add else [expression]):
             negative, size = _sign_and_size(term)
-            sign = "-" if negative else "+" if number else ""
-            first, *others = self._product_pieces(size) if _length(term) > ONE_LINE else [[self._operand(size)]]
-            form = "infix" if number else "prefix"
-            yield [*([self.operator(sign, form=form)] if sign else []), *first]
-            yield from others
+            pieces = list(self._product_pieces(size)) if _length(term) > ONE_LINE else [[self._operand(size)]]
+            if negative or number:
+                form = "infix" if number else "prefix"
+                pieces[0].insert(0, self.operator("-" if negative else "+", form=form))
+            yield pieces
 
-    def _product_pieces(self, product: sympy.Expr) -> Iterator[list[Element]]:
+    def _product_pieces(self, product: sympy.Expr) -> Iterator[Piece]:
         """A fraction or narrow factors, then one wide factor after the other, those in brackets in pieces too."""
-        fraction, factors = self._fraction(product)
+        fraction, factors = self._fraction(product, longest=WIDE)
         narrow = list(takewhile(_is_narrow, factors))
         if fraction is not None or narrow:
             yield [*([] if fraction is None else [fraction]), *self._factors(narrow)]
         for factor in factors[len(narrow) :]:
-            if factor.is_Add and _length(factor) > WIDE:
-                inner = list(self.pieces(factor))
-                inner[0].insert(0, self.operator("(", minsize=TALL))
-                inner[-1].append(self.operator(")", minsize=TALL))
-                yield from inner
+            base, exponent = factor.args if factor.is_Pow else (factor, sympy.S.One)
+            if base.is_Add and _length(base) > WIDE:
+                yield from self._bracketed_pieces(base, exponent)
             else:
                 yield self._factors([factor])
+
+    def _bracketed_pieces(self, base: sympy.Expr, exponent: sympy.Expr) -> list[Piece]:
+        pieces = [piece for term in self.terms(base) for piece in term]
+        shape = {"minsize": TALL} if any(map(_is_tall, chain.from_iterable(pieces))) else {"stretchy": "false"}
+        end = self.operator(")", **shape)
+        pieces[0].insert(0, self.operator("(", **shape))
+        pieces[-1].append(end if exponent == 1 else self._element("msup", end, self._exponent(exponent)))
+        return pieces
 
     def _element(self, tag: str, *children: Child) -> Element:
         element = self.dom.createElement(tag)
@@ -150,8 +161,22 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
     def _row(self, *children: Element) -> Element:
         return children[0] if len(children) == 1 else self._element("mrow", *children)
 
+    def _fenced(self, *contents: Element) -> Element:
+        """In brackets, which grow with fractions and matrices only."""
+        shape = {} if any(map(_is_tall, contents)) else {"stretchy": "false"}
+        return self._row(self.operator("(", **shape), *contents, self.operator(")", **shape))
+
     def _bracketed(self, expression: Any) -> Element:
-        return self._row(self._l_paren(), self.printed(expression), self._r_paren())
+        return self._fenced(self.printed(expression))
+
+    def _paren_comma_separated(self, *args: Any) -> Element:
+        elements = [element for arg in args for element in (self._comma(), self.printed(arg))]
+        return self._fenced(*elements[1:])
+
+    def parenthesize(self, item: Any, level: int, strict: bool = False) -> Element:
+        """``item``, in brackets where it binds less than its surroundings."""
+        binding = precedence_traditional(item)
+        return self._bracketed(item) if binding < level or (not strict and binding == level) else self.printed(item)
 
     def _print_Add(self, expr: sympy.Expr, order: Any = None) -> Element:
         children = []
@@ -176,15 +201,22 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         fraction, factors = self._fraction(expr)
         return [*([] if fraction is None else [fraction]), *self._factors(factors)]
 
-    def _fraction(self, expr: sympy.Expr) -> tuple[Element | None, list[sympy.Expr]]:
-        """A fraction of what is short, and the wide factors that stand behind it."""
+    def _fraction(self, expr: sympy.Expr, *, longest: int | None = None) -> tuple[Element | None, list[sympy.Expr]]:
+        """A fraction of what is short, and the wide factors that stand behind it.
+
+        A denominator of more than ``longest`` characters is one of these, as a negative power.
+        """
         top, bottom = _numerator_and_denominator(expr)
-        if not bottom:
-            return None, top
         wide = [] if _length(sympy.Mul(*top, evaluate=False)) <= SHORT else [x for x in top if not _is_narrow(x)]
-        if not all(map(_is_narrow, bottom)):
+        deep = [factor for factor in bottom if not _is_narrow(factor)]
+        if deep and longest is not None and _length(sympy.Mul(*deep, evaluate=False)) > longest:
+            bottom = [factor for factor in bottom if factor not in deep]
+            wide += [sympy.Pow(*_inverted(factor), evaluate=False) for factor in deep]
+        elif deep:
             wide = []
         narrow = [factor for factor in top if factor not in wide]
+        if not bottom:
+            return None, [*narrow, *wide] if wide and deep else top
         return self._element("mfrac", self._whole(narrow), self._whole(bottom)), wide
 
     def _whole(self, factors: Sequence[sympy.Expr]) -> Element:
@@ -266,11 +298,10 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
                 self._typeset(_Name("tau", below=(indices[0],))),
                 _Name("l", CARDINAL[prefix], (indices[1],)),
             )
-            return self._row(self._typeset(function), self._l_paren(), point, self._r_paren())
+            return self._row(self._typeset(function), self._fenced(point))
         if prefix in PRODUCTS and indices and all(map(str.isdigit, indices)):
             matrices = [self._typeset(_parsed(matrix)) for matrix in PRODUCTS[prefix]]
-            product = self._row(self._l_paren(), *matrices, self._r_paren())
-            return self._element("msub", product, self._indices(indices))
+            return self._element("msub", self._fenced(*matrices), self._indices(indices))
         return self._typeset(_parsed(name))
 
     def _typeset(self, name: _Name) -> Element:
@@ -346,6 +377,12 @@ def _numerator_and_denominator(product: sympy.Expr) -> tuple[list[sympy.Expr], l
     return top, bottom
 
 
+def _inverted(factor: sympy.Expr) -> tuple[sympy.Expr, sympy.Expr]:
+    """Base and exponent of 1 / factor."""
+    base, exponent = factor.args if factor.is_Pow else (factor, sympy.S.One)
+    return base, -exponent
+
+
 def _is_narrow(factor: sympy.Expr) -> bool:
     """Numbers, symbols and their powers and roots."""
     return bool(factor.is_Atom or (factor.is_Pow and factor.base.is_Atom and factor.exp.is_Atom))
@@ -360,6 +397,11 @@ def _starts_with_digit(factor: sympy.Expr) -> bool:
 def _length(expression: sympy.Basic) -> int:
     """About the width of an expression, in characters."""
     return len(str(expression))
+
+
+def _is_tall(element: Element) -> bool:
+    """Whether brackets around it should grow."""
+    return element.tagName in TALL_TAGS or any(_is_tall(child) for child in element.childNodes if child.nodeType == 1)
 
 
 def _escape(node: Node) -> None:

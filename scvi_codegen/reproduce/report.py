@@ -1,0 +1,157 @@
+"""All results as one page of HTML that needs nothing else: pictures inline, formulas as MathML, no script, no network.
+
+It adapts to light and dark, to narrow screens and to paper. The page is ``templates/report.html.jinja`` with
+``templates/report.css``; here is what turns results into text for it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from scvi_codegen import __version__
+from scvi_codegen.mathml import mathml_terms
+from scvi_codegen.rendering import template_folder
+from scvi_codegen.reproduce.experiment import Cell, Formula, Listing, Result, Table, Verdict
+from scvi_codegen.reproduce.svg import color_variables, inline_svg
+from scvi_codegen.reproduce.writing import draw
+
+__all__ = ["report_html"]
+
+TITLE = "The paper, run again"
+PLURALS = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS: "do not hold", Verdict.SHOWN: "shown"}
+FORMAT = ".3g"
+MINUS = "\N{MINUS SIGN}"
+SCIENTIFIC = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?!\w)")
+RAISED = re.compile(r"\^(?:\{([^}]*)\}|\(([^)]*)\)|(-?\w+))")
+NEGATIVE = re.compile(r"(?<![\w)\]>-])-(?=\d)")
+
+
+def report_html(results: Sequence[Result]) -> str:
+    """The page: a table of all verdicts, then one section a result; a single result is a page of its own.
+
+    Needs Matplotlib where a result has a picture.
+    """
+    pictures = {result.name: _picture(result) for result in results}
+    alone = len(results) == 1
+    counts = Counter(result.verdict for result in results)
+    return (
+        _environment()
+        .get_template("report.html.jinja")
+        .render(
+            title=_heading(results[0]) if alone else TITLE,
+            alone=alone,
+            results=results,
+            counts=[(verdict, counts[verdict]) for verdict in Verdict if counts[verdict]],
+            pictures=pictures,
+            css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
+            colors=_color_rules([*pictures.values()]),
+            version=__version__,
+        )
+    )
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(template_folder()),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=True,
+    )
+    environment.filters |= {
+        "label": _label,
+        "heading": _heading,
+        "caption": _caption,
+        "prose": _prose,
+        "cell": _cell,
+        "column": _column,
+        "equation": _equation,
+        "plural": lambda verdict, count: verdict.value if count == 1 else PLURALS[verdict],
+    }
+    environment.tests |= {
+        "formula": lambda block: isinstance(block, Formula),
+        "listing": lambda block: isinstance(block, Listing),
+    }
+    return environment
+
+
+def _picture(result: Result) -> Markup:
+    if result.picture is None:
+        return Markup()
+    label = f"{_label(result.name)}. {_heading(result)}"
+    return Markup(inline_svg(draw(result.picture, "svg"), prefix=result.name, label=label))
+
+
+def _color_rules(pictures: Sequence[str]) -> Markup:
+    """CSS for the colours of the pictures; paper is always light."""
+
+    def rule(dark: bool) -> str:
+        return (
+            ":root{" + ";".join(f"{name}:{value}" for name, value in color_variables(pictures, dark=dark).items()) + "}"
+        )
+
+    return Markup(f"{rule(False)}\n@media screen and (prefers-color-scheme:dark){{{rule(True)}}}")
+
+
+def _label(name: str) -> str:
+    """``figure-4`` as ``Figure 4``, ``tables-6-7`` as ``Tables 6-7``."""
+    first, *rest = name.split("-", 1)
+    return " ".join([first.capitalize(), *rest])
+
+
+def _heading(result: Result) -> str:
+    """The title, without the name where it begins with that."""
+    label = _label(result.name)
+    shorter = result.title.removeprefix(label).lstrip(" .:,")
+    return shorter[:1].upper() + shorter[1:] if shorter else result.title
+
+
+def _caption(result: Result, table: Table) -> str:
+    return f"{_label(result.name)}: {table.name.replace('-', ' ') or 'numbers'}"
+
+
+def _prose(text: str) -> Markup:
+    """Text with its numbers and powers typeset: 1e-9, h^2, -3."""
+    typeset = SCIENTIFIC.sub(_scientific, str(escape(text)))
+    typeset = NEGATIVE.sub(MINUS, RAISED.sub(_raised, typeset))
+    return Markup(typeset)
+
+
+def _raised(match: re.Match[str]) -> str:
+    return f"<sup>{(match[1] or match[2] or match[3]).replace('-', MINUS)}</sup>"
+
+
+def _scientific(match: re.Match[str]) -> str:
+    digits, sign, exponent = match.groups()
+    power = f"10<sup>{MINUS if sign == '-' else ''}{exponent}</sup>"
+    return power if digits == "1" else f"{digits}\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}{power}"
+
+
+def _cell(value: Cell, specification: str | None = None) -> Markup:
+    match value:
+        case None:
+            return Markup("\N{EN DASH}")
+        case str():
+            return _prose(value)
+        case float():
+            return _prose(format(value, specification or FORMAT))
+    return _prose(format(value, specification or ""))
+
+
+def _column(table: Table, index: int) -> Markup:
+    """The class of a column's cells: numbers are set to the right."""
+    numeric = not any(isinstance(row[index], str) for row in table.rows)
+    return Markup(' class="number"') if numeric else Markup()
+
+
+def _equation(formula: Formula) -> Markup:
+    """Terms that stay together where they fit a line."""
+    terms = mathml_terms(formula.right, formula.left)
+    return Markup(" ".join(f'<span class="term">{" ".join(pieces)}</span>' for pieces in terms))
