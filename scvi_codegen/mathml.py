@@ -146,14 +146,14 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
 
     def _bracketed_pieces(self, base: sympy.Expr, exponent: sympy.Expr) -> list[Piece]:
         pieces = [piece for term in self.terms(base) for piece in term]
-        shape = {"minsize": TALL} if any(map(_is_tall, chain.from_iterable(pieces))) else {"stretchy": "false"}
-        end = self.operator(")", **shape)
-        pieces[0].insert(0, self.operator("(", **shape))
+        tall = any(map(_is_tall, chain.from_iterable(pieces)))
+        begin, end = self._brackets(tall=tall, **({"minsize": TALL} if tall else {}))
+        pieces[0].insert(0, begin)
         pieces[-1].append(end if exponent == 1 else self._element("msup", end, self._exponent(exponent)))
         return pieces
 
     def _element(self, tag: str, *children: Child) -> Element:
-        element = self.dom.createElement(tag)
+        element: Element = self.dom.createElement(tag)
         for child in children:
             element.appendChild(self.dom.createTextNode(child) if isinstance(child, str) else child)
         return element
@@ -163,8 +163,13 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
 
     def _fenced(self, *contents: Element) -> Element:
         """In brackets, which grow with fractions and matrices only."""
-        shape = {} if any(map(_is_tall, contents)) else {"stretchy": "false"}
-        return self._row(self.operator("(", **shape), *contents, self.operator(")", **shape))
+        begin, end = self._brackets(tall=any(map(_is_tall, contents)))
+        return self._row(begin, *contents, end)
+
+    def _brackets(self, *, tall: bool, **shape: str) -> list[Element]:
+        """Not symmetric about the fraction line: fonts without a table for mathematics do not say where that is."""
+        shape |= {"symmetric": "false"} if tall else {"stretchy": "false"}
+        return [self.operator(sign, **shape) for sign in "()"]
 
     def _bracketed(self, expression: Any) -> Element:
         return self._fenced(self.printed(expression))
@@ -246,7 +251,12 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
             name = self._element("msup", self._element("mi", self.mathml_tag(base)), self.printed(exponent))
             return self._row(name, self._paren_comma_separated(*base.args))
         plain = (base.is_Symbol and not _parsed(base.name).above) or (base.is_Integer and base.is_nonnegative)
-        return self._element("msup", self.printed(base) if plain else self._bracketed(base), self._exponent(exponent))
+        below = self.printed(base) if plain else self._bracketed(base)
+        if below.tagName == "msub" and plain:
+            below.tagName = "msubsup"
+            below.appendChild(self._exponent(exponent))
+            return below
+        return self._element("msup", below, self._exponent(exponent))
 
     def _exponent(self, exponent: sympy.Expr) -> Element:
         if exponent.is_Rational and not exponent.is_Integer:
@@ -294,11 +304,8 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         """A symbol: letter, accent, indices; an entry of a derived table as the function or matrix it comes from."""
         prefix, *indices = name.lstrip("_").split("_")
         if prefix in CARDINAL and len(indices) == 2 and all(map(str.isdigit, indices)):
-            point, function = (
-                self._typeset(_Name("tau", below=(indices[0],))),
-                _Name("l", CARDINAL[prefix], (indices[1],)),
-            )
-            return self._row(self._typeset(function), self._fenced(point))
+            function = self._typeset(_Name("l", CARDINAL[prefix], below=(indices[1],)))
+            return self._row(function, self._fenced(self._typeset(_Name("tau", below=(indices[0],)))))
         if prefix in PRODUCTS and indices and all(map(str.isdigit, indices)):
             matrices = [self._typeset(_parsed(matrix)) for matrix in PRODUCTS[prefix]]
             return self._element("msub", self._fenced(*matrices), self._indices(indices))

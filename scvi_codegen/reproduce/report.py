@@ -21,7 +21,7 @@ from scvi_codegen.reproduce.experiment import Cell, Formula, Listing, Result, Ta
 from scvi_codegen.reproduce.svg import color_variables, inline_svg
 from scvi_codegen.reproduce.writing import draw
 
-__all__ = ["report_html"]
+__all__ = ["report_html", "tally"]
 
 TITLE = "The paper, run again"
 PLURALS = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS: "do not hold", Verdict.SHOWN: "shown"}
@@ -39,7 +39,6 @@ def report_html(results: Sequence[Result]) -> str:
     """
     pictures = {result.name: _picture(result) for result in results}
     alone = len(results) == 1
-    counts = Counter(result.verdict for result in results)
     return (
         _environment()
         .get_template("report.html.jinja")
@@ -47,13 +46,23 @@ def report_html(results: Sequence[Result]) -> str:
             title=_heading(results[0]) if alone else TITLE,
             alone=alone,
             results=results,
-            counts=[(verdict, counts[verdict]) for verdict in Verdict if counts[verdict]],
+            counts=tally(results),
             pictures=pictures,
             css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
             colors=_color_rules([*pictures.values()]),
             version=__version__,
         )
     )
+
+
+def tally(results: Sequence[Result]) -> list[tuple[Verdict, str]]:
+    """How often each verdict was found: ``"3 hold"``, ``"1 does not hold"``."""
+    counts = Counter(result.verdict for result in results)
+    return [
+        (verdict, f"{counts[verdict]} {verdict.value if counts[verdict] == 1 else PLURALS[verdict]}")
+        for verdict in Verdict
+        if counts[verdict]
+    ]
 
 
 @cache
@@ -73,7 +82,6 @@ def _environment() -> Environment:
         "cell": _cell,
         "column": _column,
         "equation": _equation,
-        "plural": lambda verdict, count: verdict.value if count == 1 else PLURALS[verdict],
     }
     environment.tests |= {
         "formula": lambda block: isinstance(block, Formula),
