@@ -29,6 +29,7 @@ FORMAT = ".3g"
 MINUS = "\N{MINUS SIGN}"
 SCIENTIFIC = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?!\w)")
 RAISED = re.compile(r"\^(?:\{([^}]*)\}|\(([^)]*)\)|(-?\w+))")
+EQUALITY = re.compile(r"(?<=\w) = (?=[-\d])")
 NEGATIVE = re.compile(r"(?<![\w)\]>-])-(?=\d)")
 
 
@@ -126,10 +127,10 @@ def _caption(result: Result, table: Table) -> str:
 
 
 def _prose(text: str) -> Markup:
-    """Text with its numbers and powers typeset: 1e-9, h^2, -3."""
+    """Text with its numbers and powers typeset: 1e-9, h^2, -3; ``h = 0.1`` stays on one line."""
     typeset = SCIENTIFIC.sub(_scientific, str(escape(text)))
-    typeset = NEGATIVE.sub(MINUS, RAISED.sub(_raised, typeset))
-    return Markup(typeset)
+    typeset = EQUALITY.sub("\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}", RAISED.sub(_raised, typeset))
+    return Markup(NEGATIVE.sub(MINUS, typeset))
 
 
 def _raised(match: re.Match[str]) -> str:

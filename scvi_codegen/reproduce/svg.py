@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 __all__ = ["color_variables", "contrast", "inline_svg"]
 
 DARK_PAPER, LIGHT_PAPER = "#16181c", "#ffffff"
-TEXT_CONTRAST, LINE_CONTRAST = 4.6, 4.0
+TEXT_CONTRAST, LINE_CONTRAST = 4.6, 5.0
 """Least contrast with the paper, of letters (WCAG AA asks for 4.5) and, on dark paper, of lines."""
 GREY = 16
 """Largest difference of the channels of a grey."""
