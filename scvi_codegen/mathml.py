@@ -39,6 +39,7 @@ WIDE = 80
 TALL = "2.2em"
 """Height of brackets whose contents are in other pieces."""
 ACCENTS = {"dot": "˙", "ddot": "¨", "hat": "^", "tilde": "~", "bar": "¯"}
+LATEX_ACCENT = re.compile(r"\\(dot|ddot|hat|tilde|bar)\{?(\w+?)\}?(?=[_^]|$)")
 RAISED = ("Q", "V", "P")
 """Letters whose first index counts nodes: Q_1_x is component x of Q at node 1, as the paper has it."""
 CARDINAL = {"l": "", "dl": "dot"}
@@ -234,7 +235,8 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         """Factors with the invisible sign of a product between them, or a dot before a digit."""
         elements = []
         for number, factor in enumerate(factors):
-            element = self.parenthesize(factor, PRECEDENCE["Mul"])
+            last = number == len(factors) - 1 and isinstance(factor, sympy.Sum | sympy.Integral | sympy.Derivative)
+            element = self.parenthesize(factor, PRECEDENCE["Mul"], strict=last)
             if number:
                 element = self._row(self.operator("·" if _starts_with_digit(factor) else "\u2062"), element)
             elements.append(element)
@@ -262,6 +264,14 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         if exponent.is_Rational and not exponent.is_Integer:
             return self._row(self.printed(exponent.p), self.operator("/"), self.printed(exponent.q))
         return self.printed(exponent)
+
+    def _print_Sum(self, e: sympy.Sum) -> Element:
+        (index, low, high), *others = e.limits
+        if others:
+            return self._print_Sum(sympy.Sum(sympy.Sum(e.function, *e.limits[:-1]), e.limits[-1]))
+        begin = self._row(self.printed(index), self.operator("="), self.printed(low))
+        sign = self._element("munderover", self.operator("∑"), begin, self.printed(high))
+        return self._row(sign, self._operand(e.function))
 
     def _print_Integer(self, expr: sympy.Integer) -> Element:
         return self._print_int(int(expr))
@@ -329,13 +339,13 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
                 if token[0].isalpha():
                     elements.append(self._typeset(_parsed(token)))
                 else:
-                    elements.append(self._element("mn" if token.isdigit() else "mo", token))
+                    elements.append(self._element("mn" if token.isdigit() else "mo", token.replace("'", "′")))
         return self._row(*elements)
 
 
 def _parsed(name: str) -> _Name:
     """Names as the package makes them (q_dot, p_q1_k, Q_2_x) and as SymPy knows them (Q__2_x, theta1)."""
-    plain = name.strip("_") or name
+    plain = LATEX_ACCENT.sub(r"\2_\1", name.strip("_") or name)
     head, *raised = re.split(r"__|\^", plain)
     above: list[str] = []
     letter, *below = head.split("_")

@@ -27,6 +27,7 @@ from scvi_codegen.reproduce.experiment import Result
 from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import Failure, run_experiments, with_needs
 from scvi_codegen.reproduce.svg import DARK_PAPER, color_variables, contrast, inline_svg
+from scvi_codegen.reproduce.typesetting import cell, prose
 from scvi_codegen.reproduce.writing import draw
 
 TOYS = toy_experiments.__name__
@@ -121,6 +122,39 @@ class TestSvg:
         assert grid[0] == pytest.approx(grid[1], rel=0.05)
 
 
+M, T, N = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
+
+
+@pytest.mark.parametrize(
+    ("text", "typeset"),
+    [
+        ("1.5e-09 and 1e-14, 2e+05", f"1.5{N}{T}{N}10<sup>{M}9</sup> and 10<sup>{M}14</sup>, 2{N}{T}{N}10<sup>5</sup>"),
+        ("2.1e+00", "2.1"),
+        ("h = -0.1, degree 2-5, e=.5", f"h{N}={N}{M}0.1, degree 2-5, e=.5"),
+        ("h^2, Q^{s-1}, x^(k+1), dq ^ dp", f"h<sup>2</sup>, Q<sup>s{M}1</sup>, x<sup>k+1</sup>, dq ^ dp"),
+        ("L_d, a_34, q_(k+1), lambda_1", "L<sub>d</sub>, a<sub>34</sub>, q<sub>k+1</sub>, λ<sub>1</sub>"),
+        ("q_dot, add_boundary, x_max", "q_dot, add_boundary, x_max"),
+        ("1 - e <= 2 >= x -> y, 0, .., +-1", f"1 {M} e ≤ 2 ≥ x → y, 0, …, ±1"),
+        ("<b> & SC-like, p0e-3x", "&lt;b&gt; &amp; SC-like, p0e-3x"),
+        ("q'' = -q", f"q&#39;&#39; = {M}q"),
+    ],
+)
+def test_prose_is_typeset(text, typeset):
+    assert str(prose(text)) == typeset
+
+
+def test_cells_are_formatted():
+    given = [(None, None), (1520, None), (0.25, None), (1.24e-11, ".2g"), (float("inf"), None), ("a_1", ".3g")]
+    assert [str(cell(*pair)) for pair in given] == [
+        "\N{EN DASH}",
+        "1520",
+        "0.25",
+        f"1.2{N}{T}{N}10<sup>{M}11</sup>",
+        "inf",
+        "a<sub>1</sub>",
+    ]
+
+
 class Page(HTMLParser):
     """Elements with their attributes; fails where a tag is not closed."""
 
@@ -185,7 +219,7 @@ class TestPage:
         assert "Q<sup>1</sup>" in page
 
     def test_tables_show_what_is_to_be_shown(self, page):
-        assert "<td>SVI</td>" in page
+        assert '<td class="word">SVI</td>' in page
         assert '<td class="number">500</td>' in page
         assert '<td class="number">\N{EN DASH}</td>' in page
         assert "series" not in page

@@ -6,31 +6,25 @@ It adapts to light and dark, to narrow screens and to paper. The page is ``templ
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from scvi_codegen import __version__
 from scvi_codegen.mathml import mathml_terms
 from scvi_codegen.rendering import template_folder
-from scvi_codegen.reproduce.experiment import Cell, Formula, Listing, Result, Table, Verdict
+from scvi_codegen.reproduce.experiment import Formula, Listing, Result, Table, Verdict
 from scvi_codegen.reproduce.svg import color_variables, inline_svg
+from scvi_codegen.reproduce.typesetting import cell, column_class, prose
 from scvi_codegen.reproduce.writing import draw
 
 __all__ = ["report_html", "tally"]
 
 TITLE = "The paper, run again"
 PLURALS = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS: "do not hold", Verdict.SHOWN: "shown"}
-FORMAT = ".3g"
-MINUS = "\N{MINUS SIGN}"
-SCIENTIFIC = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?!\w)")
-RAISED = re.compile(r"\^(?:\{([^}]*)\}|\(([^)]*)\)|(-?\w+))")
-EQUALITY = re.compile(r"(?<=\w) = (?=[-\d])")
-NEGATIVE = re.compile(r"(?<![\w)\]>-])-(?=\d)")
 
 
 def report_html(results: Sequence[Result]) -> str:
@@ -79,9 +73,9 @@ def _environment() -> Environment:
         "label": _label,
         "heading": _heading,
         "caption": _caption,
-        "prose": _prose,
-        "cell": _cell,
-        "column": _column,
+        "prose": prose,
+        "cell": cell,
+        "column": column_class,
         "equation": _equation,
     }
     environment.tests |= {
@@ -124,40 +118,6 @@ def _heading(result: Result) -> str:
 
 def _caption(result: Result, table: Table) -> str:
     return f"{_label(result.name)}: {table.name.replace('-', ' ') or 'numbers'}"
-
-
-def _prose(text: str) -> Markup:
-    """Text with its numbers and powers typeset: 1e-9, h^2, -3; ``h = 0.1`` stays on one line."""
-    typeset = SCIENTIFIC.sub(_scientific, str(escape(text)))
-    typeset = EQUALITY.sub("\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}", RAISED.sub(_raised, typeset))
-    return Markup(NEGATIVE.sub(MINUS, typeset))
-
-
-def _raised(match: re.Match[str]) -> str:
-    return f"<sup>{(match[1] or match[2] or match[3]).replace('-', MINUS)}</sup>"
-
-
-def _scientific(match: re.Match[str]) -> str:
-    digits, sign, exponent = match.groups()
-    power = f"10<sup>{MINUS if sign == '-' else ''}{exponent}</sup>"
-    return power if digits == "1" else f"{digits}\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}{power}"
-
-
-def _cell(value: Cell, specification: str | None = None) -> Markup:
-    match value:
-        case None:
-            return Markup("\N{EN DASH}")
-        case str():
-            return _prose(value)
-        case float():
-            return _prose(format(value, specification or FORMAT))
-    return _prose(format(value, specification or ""))
-
-
-def _column(table: Table, index: int) -> Markup:
-    """The class of a column's cells: numbers are set to the right."""
-    numeric = not any(isinstance(row[index], str) for row in table.rows)
-    return Markup(' class="number"') if numeric else Markup()
 
 
 def _equation(formula: Formula) -> Markup:
