@@ -61,7 +61,7 @@ A folder stands here by its own name where its rooms have no floors of their own
 FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for room in floor.split()}
 
 OWNERS = {
-    "jinja2": ["rendering"],
+    "jinja2": ["rendering", "reproduce"],
     "cffi": ["building"],
     "platformdirs": ["building"],
     "matplotlib": ["plotting", "benchmark", "reproduce"],

@@ -37,6 +37,7 @@ Examples:
   scvi-codegen run mine.toml --span 1000 --every 10 -o orbit.csv
   scvi-codegen derive planar-pendulum --method svi --degree 2 --quadrature gauss-legendre:2
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
+  scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
 
 Exit status: 0; 2 if the command line or a model is at fault; 1 if a step failed, there is no C compiler or a file
 cannot be written; 130 after Ctrl-C.
@@ -266,6 +267,51 @@ def bench(
     click.echo(report.text())
     if report.interrupted:
         raise _Failure(f"interrupted in '{report.interrupted}'; what was measured before is above", INTERRUPTED)
+
+
+@main.command(short_help="Run the paper's experiments again, with a verdict on each claim.")
+@click.argument("names", nargs=-1, metavar="[WHAT ...]")
+@click.option(
+    "-o", "--output", default="reproduced", show_default=True, type=click.Path(), metavar="DIR", help="Folder of files."
+)
+@click.option("--html", type=click.Path(), metavar="FILE", help="All results on one page that needs no network.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Experiments at a time [as many as processors].")
+@click.option("--list", "listing", is_flag=True, help="Print the names, and run nothing.")
+def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int | None, listing: bool) -> None:
+    """Run figures, tables and claims of the paper again, and judge them by what is measured (needs matplotlib).
+
+    WHAT is 'all' or names of experiments ('--list' prints them); what they need is run too. Each result is written to
+    the folder when it is there: NAME.txt with the verdicts, NAME.svg and NAME.png, NAME.csv with all numbers, and
+    NAME.html where there are formulas.
+
+    That a claim of the paper does not hold is a finding, not a failure: the exit status is 0 when everything ran, 1 if
+    an experiment failed to run, 130 after Ctrl-C, which leaves what was written.
+
+    \b
+    Examples:
+      scvi-codegen reproduce --list
+      scvi-codegen reproduce all --html paper.html
+      scvi-codegen reproduce figure-4 figure-5 -o figures --jobs 1
+    """  # noqa: D301  (click wants the character \b)
+    from scvi_codegen.cli.reproducing import experiments_table, reproduce_experiments
+
+    if listing:
+        click.echo(experiments_table(names or ("all",)))
+        return
+    if not names:
+        raise click.UsageError("say what to reproduce: 'all', or names that 'scvi-codegen reproduce --list' prints")
+    folder = Path(output)
+    if folder.exists() and not folder.is_dir():
+        raise click.BadParameter(f"'{folder}' is not a folder", param_hint="'-o'")
+    if html is not None:
+        _check_writable(Path(html), "'--html'")
+    done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs)
+    if done.files:
+        click.echo(f"\n{done.summary()}")
+    if done.interrupted:
+        raise _Failure("interrupted; what was written before is kept", INTERRUPTED)
+    if done.failures:
+        raise _Failure(done.failed(), FAILURE)
 
 
 @contextmanager

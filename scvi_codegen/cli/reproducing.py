@@ -1,0 +1,144 @@
+"""``scvi-codegen reproduce``: run experiments of the paper, write their files, say what was found."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import click
+
+from scvi_codegen.cli.running import counted
+from scvi_codegen.plotting import check_plot_path
+from scvi_codegen.reproduce.experiment import Experiment, Result
+from scvi_codegen.reproduce.report import report_html, tally
+from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_experiments, with_needs
+from scvi_codegen.reproduce.writing import write_result
+from scvi_codegen.trajectory import write_atomically
+
+__all__ = ["EVERYTHING", "Reproduction", "experiments_table", "reproduce_experiments"]
+
+EVERYTHING = "all"
+SHOWN_NAMES = 40
+"""Characters of the names beside the progress bar."""
+
+
+@dataclass(kw_only=True)
+class Reproduction:
+    """What came of it.
+
+    Attributes:
+        results: in the order they came.
+        failures: experiments that gave none.
+        files: written, the page of all results last.
+        interrupted: whether the user ended it.
+    """
+
+    results: list[Result] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    interrupted: bool = False
+
+    def summary(self) -> str:
+        """The verdicts counted, and what was written."""
+        counts = [counted(len(self.results), "result"), *(text for _, text in tally(self.results))]
+        folders = sorted({str(path.parent) for path in self.files})
+        return f"{', '.join(counts)}\nwrote {counted(len(self.files), 'file')} to {' and '.join(folders)}"
+
+    def failed(self) -> str:
+        """A line for each failure."""
+        lines = [f"  {failure.name}: {failure.message}" for failure in self.failures]
+        return "\n".join([f"{counted(len(lines), 'experiment')} failed to run", *lines])
+
+
+def experiments_table(names: Sequence[str] = (EVERYTHING,), *, module: str = CATALOGUE) -> str:
+    """A line for each experiment that is to be run: its name and what it is."""
+    experiments = catalogue(module)
+    chosen = _chosen(names, experiments)
+    width = max(map(len, chosen), default=0)
+    return "\n".join(f"{name:{width}}  {experiments[name].title}" for name in chosen)
+
+
+def reproduce_experiments(
+    names: Sequence[str], folder: Path, html: Path | None, jobs: int | None, *, module: str = CATALOGUE
+) -> Reproduction:
+    """Run experiments and what they need; write files of each result when it is there, and the page at the end.
+
+    A line a result is printed. Ctrl-C ends it; what was written stays.
+
+    Raises:
+        StateError: for an unknown name.
+        PlotError: without Matplotlib.
+        OSError: if a file cannot be written.
+    """
+    experiments = catalogue(module)
+    chosen = _chosen(names, experiments)
+    check_plot_path(folder / "picture.svg")
+    folder.mkdir(parents=True, exist_ok=True)
+    done, width = Reproduction(), max(map(len, chosen), default=0)
+    try:
+        with (
+            _progress(len(chosen)) as progress,
+            closing(run_experiments(chosen, jobs, module=module, watch=progress.show)) as outcomes,
+        ):
+            for outcome in outcomes:
+                progress.say(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
+        if html is not None:
+            done.files.append(_write_page(sorted(done.results, key=lambda r: list(experiments).index(r.name)), html))
+    except KeyboardInterrupt:
+        done.interrupted = True
+    return done
+
+
+def _chosen(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
+    return with_needs(list(experiments) if EVERYTHING in names else names, experiments)
+
+
+def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
+    """Keep and write an outcome; what to say of it."""
+    if isinstance(outcome, Failure):
+        done.failures.append(outcome)
+        return f"failed: {outcome.message}"
+    done.files += write_result(outcome, folder)
+    if outcome.body:
+        done.files.append(_write_page([outcome], folder / f"{outcome.name}.html"))
+    done.results.append(outcome)
+    return f"{outcome.verdict.value:13}  {outcome.title}"
+
+
+def _write_page(results: Sequence[Result], path: Path) -> Path:
+    page = report_html(results).encode()
+    write_atomically(path, lambda file: file.write(page))
+    return path
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """``show`` names the running experiments, ``say`` prints a line and counts one as done."""
+
+    show: Callable[[Sequence[str]], None]
+    say: Callable[[str], None]
+
+
+@contextmanager
+def _progress(length: int) -> Iterator[_Progress]:
+    """A bar on stderr if that is a terminal, with the lines printed above it."""
+    if not sys.stderr.isatty() or not length:
+        yield _Progress(lambda names: None, click.echo)
+        return
+
+    def show(names: Sequence[str]) -> None:
+        text = ", ".join(names)
+        bar.update(0, text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + "..")
+
+    def say(line: str) -> None:
+        click.echo("\r\x1b[K", nl=False, err=True)
+        click.echo(line)
+        bar.update(1)
+
+    with click.progressbar(
+        length=length, label="reproducing", show_eta=False, item_show_func=lambda item: item, file=sys.stderr
+    ) as bar:
+        yield _Progress(show, say)

@@ -1,0 +1,126 @@
+"""All results as one page of HTML that needs nothing else: pictures inline, formulas as MathML, no script, no network.
+
+It adapts to light and dark, to narrow screens and to paper. The page is ``templates/report.html.jinja`` with
+``templates/report.css``; here is what turns results into text for it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from scvi_codegen import __version__
+from scvi_codegen.mathml import mathml_terms
+from scvi_codegen.rendering import template_folder
+from scvi_codegen.reproduce.experiment import Formula, Listing, Result, Table, Verdict
+from scvi_codegen.reproduce.svg import color_variables, inline_svg
+from scvi_codegen.reproduce.typesetting import cell, column_class, prose
+from scvi_codegen.reproduce.writing import draw
+
+__all__ = ["report_html", "tally"]
+
+TITLE = "The paper, run again"
+PLURALS = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS: "do not hold", Verdict.SHOWN: "shown"}
+
+
+def report_html(results: Sequence[Result]) -> str:
+    """The page: a table of all verdicts, then one section a result; a single result is a page of its own.
+
+    Needs Matplotlib where a result has a picture.
+    """
+    pictures = {result.name: _picture(result) for result in results}
+    alone = len(results) == 1
+    return (
+        _environment()
+        .get_template("report.html.jinja")
+        .render(
+            title=_heading(results[0]) if alone else TITLE,
+            alone=alone,
+            results=results,
+            counts=tally(results),
+            pictures=pictures,
+            css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
+            colors=_color_rules([*pictures.values()]),
+            version=__version__,
+        )
+    )
+
+
+def tally(results: Sequence[Result]) -> list[tuple[Verdict, str]]:
+    """How often each verdict was found: ``"3 hold"``, ``"1 does not hold"``."""
+    counts = Counter(result.verdict for result in results)
+    return [
+        (verdict, f"{counts[verdict]} {verdict.value if counts[verdict] == 1 else PLURALS[verdict]}")
+        for verdict in Verdict
+        if counts[verdict]
+    ]
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(template_folder()),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=True,
+    )
+    environment.filters |= {
+        "label": _label,
+        "heading": _heading,
+        "caption": _caption,
+        "prose": prose,
+        "cell": cell,
+        "column": column_class,
+        "equation": _equation,
+    }
+    environment.tests |= {
+        "formula": lambda block: isinstance(block, Formula),
+        "listing": lambda block: isinstance(block, Listing),
+    }
+    return environment
+
+
+def _picture(result: Result) -> Markup:
+    if result.picture is None:
+        return Markup()
+    label = f"{_label(result.name)}. {_heading(result)}"
+    return Markup(inline_svg(draw(result.picture, "svg"), prefix=result.name, label=label))
+
+
+def _color_rules(pictures: Sequence[str]) -> Markup:
+    """CSS for the colours of the pictures; paper is always light."""
+
+    def rule(dark: bool) -> str:
+        return (
+            ":root{" + ";".join(f"{name}:{value}" for name, value in color_variables(pictures, dark=dark).items()) + "}"
+        )
+
+    return Markup(f"{rule(False)}\n@media screen and (prefers-color-scheme:dark){{{rule(True)}}}")
+
+
+def _label(name: str) -> str:
+    """``figure-4`` as ``Figure 4``, ``tables-6-7`` as ``Tables 6-7``."""
+    first, *rest = name.split("-", 1)
+    return " ".join([first.capitalize(), *rest])
+
+
+def _heading(result: Result) -> str:
+    """The title, without the name where it begins with that."""
+    label = _label(result.name)
+    shorter = result.title.removeprefix(label).lstrip(" .:,")
+    return shorter[:1].upper() + shorter[1:] if shorter else result.title
+
+
+def _caption(result: Result, table: Table) -> str:
+    return f"{_label(result.name)}: {table.name.replace('-', ' ') or 'numbers'}"
+
+
+def _equation(formula: Formula) -> Markup:
+    """Terms that stay together where they fit a line."""
+    terms = mathml_terms(formula.right, formula.left)
+    return Markup(" ".join(f'<span class="term">{" ".join(pieces)}</span>' for pieces in terms))

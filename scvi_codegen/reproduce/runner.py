@@ -1,0 +1,241 @@
+"""Experiments run one after the other, or several at a time in processes of their own; one that fails stops no other.
+
+The scheduler gives a free process an experiment whose needs are there, if it can one of the module that the process ran
+last: what experiments of a module measure together is cached within a process.
+"""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import signal
+import traceback
+import warnings
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import TypeAlias
+
+from scvi_codegen.errors import MethodWarning, StateError
+from scvi_codegen.expression_text import closest
+from scvi_codegen.reproduce.experiment import Experiment, Result
+
+__all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]
+
+CATALOGUE = "scvi_codegen.reproduce.catalogue"
+PATIENCE = 2.0
+"""Seconds that a process is given to end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """An experiment that gave no result.
+
+    Attributes:
+        name: of the experiment.
+        message: what went wrong, one line.
+        details: the traceback, or nothing.
+    """
+
+    name: str
+    message: str
+    details: str = ""
+
+
+Outcome: TypeAlias = Result | Failure
+Watch: TypeAlias = Callable[[Sequence[str]], None]
+
+
+def catalogue(module: str = CATALOGUE) -> Mapping[str, Experiment]:
+    """The experiments by name: ``EXPERIMENTS`` of a module."""
+    experiments: Mapping[str, Experiment] = importlib.import_module(module).EXPERIMENTS
+    return experiments
+
+
+def with_needs(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
+    """The experiments called ``names`` and all that they need, each after its needs.
+
+    Raises:
+        StateError: for a name that is not among the experiments.
+    """
+    ordered: dict[str, None] = {}
+
+    def add(name: str) -> None:
+        if name not in experiments:
+            raise StateError(f"there is no experiment called '{name}'{closest(name, experiments)}")
+        if name not in ordered:
+            for need in experiments[name].needs:
+                add(need)
+            ordered[name] = None
+
+    for name in names:
+        add(name)
+    return list(ordered)
+
+
+def run_experiments(
+    names: Sequence[str], workers: int | None = None, *, module: str = CATALOGUE, watch: Watch = lambda names: None
+) -> Generator[Outcome, None, None]:
+    """Run experiments and what they need, and give each outcome as soon as it is there.
+
+    What needs an experiment that failed fails too. To close the generator, or to interrupt it, ends all processes.
+
+    Args:
+        names: of the experiments.
+        workers: processes, by default as many as processors; with one, everything is run in this process.
+        module: where ``EXPERIMENTS`` is; processes import it by this name.
+        watch: told the names of what is running whenever that changes.
+
+    Raises:
+        StateError: for an unknown name.
+    """
+    experiments = catalogue(module)
+    plan = _Plan(pending={name: experiments[name] for name in with_needs(names, experiments)})
+    count = min(workers or os.cpu_count() or 1, len(plan.pending))
+    return _in_this_process(plan, watch) if count <= 1 else _in_processes(plan, count, module, watch)
+
+
+@dataclass(kw_only=True)
+class _Plan:
+    """What is still to be started, and what is there."""
+
+    pending: dict[str, Experiment]
+    results: dict[str, Result] = field(default_factory=dict)
+
+    def next(self, last_module: str = "") -> Experiment | None:
+        """Take an experiment whose needs are there, of the module last run if possible."""
+        ready = [e for e in self.pending.values() if all(need in self.results for need in e.needs)]
+        ready.sort(key=lambda experiment: _module_of(experiment) != last_module)
+        return self.pending.pop(ready[0].name) if ready else None
+
+    def needs(self, experiment: Experiment) -> dict[str, Result]:
+        return {need: self.results[need] for need in experiment.needs}
+
+    def note(self, outcome: Outcome) -> Iterator[Outcome]:
+        """The outcome, and the failures of what needed it."""
+        yield outcome
+        if isinstance(outcome, Result):
+            self.results[outcome.name] = outcome
+            return
+        for experiment in [e for e in self.pending.values() if outcome.name in e.needs]:
+            if self.pending.pop(experiment.name, None):
+                yield from self.note(Failure(name=experiment.name, message=f"it needs '{outcome.name}', which failed"))
+
+
+def _module_of(experiment: Experiment) -> str:
+    run = getattr(experiment.run, "func", experiment.run)
+    return getattr(run, "__module__", "")
+
+
+def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
+    """Run one experiment; whatever goes wrong in it is its failure."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MethodWarning)  # what the paper does, whatever we would advise
+            result = experiment.run(needs)
+    except Exception as error:  # noqa: BLE001  (others go on)
+        return Failure(name=experiment.name, message=_described(error), details=traceback.format_exc())
+    if result.name != experiment.name:
+        return Failure(name=experiment.name, message=f"its result is called '{result.name}'")
+    return result
+
+
+def _described(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _in_this_process(plan: _Plan, watch: Watch) -> Generator[Outcome, None, None]:
+    while (experiment := plan.next()) is not None:
+        watch([experiment.name])
+        yield from plan.note(_outcome(experiment, plan.needs(experiment)))
+
+
+@dataclass(kw_only=True)
+class _Worker:
+    """A process that runs experiments by name, and what it is at."""
+
+    process: SpawnProcess
+    connection: Connection
+    module: str = ""
+    running: str = ""
+
+    @classmethod
+    def start(cls, module: str) -> _Worker:
+        context = multiprocessing.get_context("spawn")
+        here, there = context.Pipe()
+        process = context.Process(target=_work, args=(there, module), daemon=True)
+        process.start()
+        there.close()
+        return cls(process=process, connection=here)
+
+    def give(self, experiment: Experiment, needs: Mapping[str, Result]) -> None:
+        self.module, self.running = _module_of(experiment), experiment.name
+        with suppress(OSError):  # it died; so says take
+            self.connection.send((experiment.name, needs))
+
+    def take(self) -> Outcome:
+        """What it sent, or that it died."""
+        name, self.running = self.running, ""
+        try:
+            outcome: Outcome = self.connection.recv()
+        except (EOFError, OSError):
+            self.process.join(PATIENCE)
+            return Failure(name=name, message=f"its process ended with exit status {self.process.exitcode}")
+        return outcome
+
+
+def _work(connection: Connection, module: str) -> None:
+    """The life of a process: names in, outcomes out. Ctrl-C is the parent's to handle."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    experiments = catalogue(module)
+    while True:
+        try:
+            name, needs = connection.recv()
+        except (EOFError, OSError):
+            return
+        outcome = _outcome(experiments[name], needs)
+        try:
+            connection.send(outcome)
+        except OSError:  # the parent is gone
+            return
+        except Exception as error:  # noqa: BLE001  (what does not travel between processes)
+            connection.send(Failure(name=name, message=_described(error), details=traceback.format_exc()))
+
+
+def _in_processes(plan: _Plan, count: int, module: str, watch: Watch) -> Generator[Outcome, None, None]:
+    with _crew(count, module) as crew:
+        while True:
+            _assign(plan, crew, watch)
+            busy = {worker.connection: worker for worker in crew if worker.running}
+            if not busy:
+                return
+            for connection in wait(list(busy)):
+                worker = busy[connection]  # type: ignore[index]  # these are the connections waited for
+                outcome = worker.take()
+                if not worker.process.is_alive():
+                    crew[crew.index(worker)] = _Worker.start(module)
+                yield from plan.note(outcome)
+
+
+def _assign(plan: _Plan, crew: Sequence[_Worker], watch: Watch) -> None:
+    """Give work to all that have none."""
+    for worker in crew:
+        if not worker.running and (experiment := plan.next(worker.module)) is not None:
+            worker.give(experiment, plan.needs(experiment))
+    watch([worker.running for worker in crew if worker.running])
+
+
+@contextmanager
+def _crew(count: int, module: str) -> Iterator[list[_Worker]]:
+    crew = [_Worker.start(module) for _ in range(count)]
+    try:
+        yield crew
+    finally:
+        for worker in crew:
+            worker.process.terminate()
+        for worker in crew:
+            worker.process.join(PATIENCE)
+            worker.connection.close()
