@@ -46,7 +46,7 @@ FLOORS = """
     problems pilot
     model_file
     package plotting advice distributed ensemble_file
-    exact
+    exact mathml
     __init__
     benchmark
     reproduce
