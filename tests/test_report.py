@@ -136,7 +136,7 @@ M, T, N = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
         ("q_dot, add_boundary, x_max", "q_dot, add_boundary, x_max"),
         ("1 - e <= 2 >= x -> y, 0, .., +-1", f"1 {M} e ≤ 2 ≥ x → y, 0, …, ±1"),
         ("<b> & SC-like, p0e-3x", "&lt;b&gt; &amp; SC-like, p0e-3x"),
-        ("q'' = -q", f"q&#39;&#39; = {M}q"),
+        ("q'' = -q is -J_0, not -o", f"q&#39;&#39; = {M}q is {M}J<sub>0</sub>, not -o"),
     ],
 )
 def test_prose_is_typeset(text, typeset):
@@ -217,6 +217,9 @@ class TestPage:
         assert "h<sup>2</sup> &lt; 1 &amp; \N{MINUS SIGN}1 &gt; \N{MINUS SIGN}2." in page
         assert "2.10\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10<sup>\N{MINUS SIGN}9</sup>" in page
         assert "Q<sup>1</sup>" in page
+
+    def test_names_of_results_are_links(self, page):
+        assert f'See <a href="#figure-4">Figure{N}4</a>, not figure-40.' in page
 
     def test_tables_show_what_is_to_be_shown(self, page):
         assert '<td class="word">SVI</td>' in page
