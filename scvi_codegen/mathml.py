@@ -76,14 +76,17 @@ def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[t
 
     Args:
         right: an expression, or an equation if ``left`` is ``None``.
-        left: what it equals; ``left =`` is the first piece.
+        left: what it equals; ``left =`` is the first piece where it is short.
     """
     if left is None and isinstance(right, sympy.Eq):
         left, right = right.lhs, right.rhs
     printer = _Printer()
     terms = list(printer.terms(right))
-    if left is not None:
+    if left is not None and _length(left) <= ONE_LINE:
         terms[0].insert(0, [printer.printed(left), printer.operator("=")])
+    elif left is not None:
+        terms[0][0].insert(0, printer.operator("=", form="infix"))
+        terms = [*printer.terms(left), *terms]
     if _length(right) + (0 if left is None else _length(left)) <= ONE_LINE:
         terms = [[[element for term in terms for piece in term for element in piece]]]
     return tuple(tuple(printer.text(piece, display=True) for piece in term) for term in terms)

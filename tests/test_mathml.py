@@ -257,6 +257,12 @@ class TestTerms:
         assert len(others) == 12
         assert all('<mo form="infix">' in term[0] and len(term) == 1 for term in others)
 
+    def test_a_long_left_side_is_broken_like_a_right_one(self):
+        total = sympy.Add(*(Symbol(f"x_{n}") * Symbol(f"y_{n}") for n in range(12)))
+        terms = mathml_terms(sympy.S.Zero, total)
+        assert len(terms) == 13
+        assert '<mo form="infix">=</mo><mn>0</mn>' in terms[-1][0]
+
     def test_a_long_product_is_broken_before_its_wide_factors(self):
         product = x * (x + y + 111111) * (x - y + 222222) * sin(x + 333333 * y) * cos(y + 444444 * x)
         (term,) = mathml_terms(product)

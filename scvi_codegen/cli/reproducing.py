@@ -131,7 +131,8 @@ def _progress(length: int) -> Iterator[_Progress]:
 
     def show(names: Sequence[str]) -> None:
         text = ", ".join(names)
-        bar.update(0, text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + "..")
+        bar.current_item = text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + ".."
+        bar.render_progress()
 
     def say(line: str) -> None:
         click.echo("\r\x1b[K", nl=False, err=True)

@@ -18,7 +18,7 @@ from scvi_codegen.mathml import mathml_terms
 from scvi_codegen.rendering import template_folder
 from scvi_codegen.reproduce.experiment import Formula, Listing, Result, Table, Verdict
 from scvi_codegen.reproduce.svg import color_variables, inline_svg
-from scvi_codegen.reproduce.typesetting import cell, column_class, prose
+from scvi_codegen.reproduce.typesetting import cell, column_class, label, linked, prose
 from scvi_codegen.reproduce.writing import draw
 
 __all__ = ["report_html", "tally"]
@@ -34,19 +34,17 @@ def report_html(results: Sequence[Result]) -> str:
     """
     pictures = {result.name: _picture(result) for result in results}
     alone = len(results) == 1
-    return (
-        _environment()
-        .get_template("report.html.jinja")
-        .render(
-            title=_heading(results[0]) if alone else TITLE,
-            alone=alone,
-            results=results,
-            counts=tally(results),
-            pictures=pictures,
-            css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
-            colors=_color_rules([*pictures.values()]),
-            version=__version__,
-        )
+    page = _environment().get_template("report.html.jinja")
+    return page.render(
+        title=_heading(results[0]) if alone else TITLE,
+        alone=alone,
+        results=results,
+        names=[] if alone else list(pictures),
+        counts=tally(results),
+        pictures=pictures,
+        css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
+        colors=_color_rules([*pictures.values()]),
+        version=__version__,
     )
 
 
@@ -70,10 +68,11 @@ def _environment() -> Environment:
         autoescape=True,
     )
     environment.filters |= {
-        "label": _label,
+        "label": label,
         "heading": _heading,
         "caption": _caption,
         "prose": prose,
+        "linked": linked,
         "cell": cell,
         "column": column_class,
         "equation": _equation,
@@ -88,36 +87,29 @@ def _environment() -> Environment:
 def _picture(result: Result) -> Markup:
     if result.picture is None:
         return Markup()
-    label = f"{_label(result.name)}. {_heading(result)}"
-    return Markup(inline_svg(draw(result.picture, "svg"), prefix=result.name, label=label))
+    text = f"{label(result.name)}. {_heading(result)}"
+    return Markup(inline_svg(draw(result.picture, "svg"), prefix=result.name, label=text))
 
 
 def _color_rules(pictures: Sequence[str]) -> Markup:
     """CSS for the colours of the pictures; paper is always light."""
 
     def rule(dark: bool) -> str:
-        return (
-            ":root{" + ";".join(f"{name}:{value}" for name, value in color_variables(pictures, dark=dark).items()) + "}"
-        )
+        variables = color_variables(pictures, dark=dark)
+        return f":root{{{';'.join(f'{name}:{value}' for name, value in variables.items())}}}"
 
     return Markup(f"{rule(False)}\n@media screen and (prefers-color-scheme:dark){{{rule(True)}}}")
 
 
-def _label(name: str) -> str:
-    """``figure-4`` as ``Figure 4``, ``tables-6-7`` as ``Tables 6-7``."""
-    first, *rest = name.split("-", 1)
-    return " ".join([first.capitalize(), *rest])
-
-
 def _heading(result: Result) -> str:
     """The title, without the name where it begins with that."""
-    label = _label(result.name)
-    shorter = result.title.removeprefix(label).lstrip(" .:,")
+    name = label(result.name)
+    shorter = result.title.removeprefix(name).lstrip(" .:,")
     return shorter[:1].upper() + shorter[1:] if shorter else result.title
 
 
 def _caption(result: Result, table: Table) -> str:
-    return f"{_label(result.name)}: {table.name.replace('-', ' ') or 'numbers'}"
+    return f"Data of {label(result.name)}{table.name and ': '}{table.name.replace('-', ' ')}"
 
 
 def _equation(formula: Formula) -> Markup:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 
 from markupsafe import Markup, escape
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
 from scvi_codegen.reproduce.experiment import Cell, Table
 
-__all__ = ["cell", "column_class", "prose"]
+__all__ = ["cell", "column_class", "label", "linked", "prose"]
 
 FORMAT = ".3g"
 LONGEST_LINE = 32
@@ -29,7 +30,7 @@ SCIENTIFIC = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?!\w)")
 RAISED = re.compile(r"\^(?:\{([^}]*)\}|\(([^)]*)\)|(-?\w+))")
 LOWERED = re.compile(r"(?<![\w.])(d?[A-Za-z]|lambda|tau|theta)_(?:(\d+|[a-z]{1,2}\d?)(?!\w)|\((\w\+1)\)|\{([^}]*)\})")
 EQUALITY = re.compile(r"(?<=\w) = (?=[-\d])")
-NEGATIVE = re.compile(r"(?<![\w)\]>;-])-(?=\d)|(?<== )-(?=\w)|(?<= )-(?= )")
+NEGATIVE = re.compile(r"(?<![\w)\]>;-])-(?=\d)|(?<== )-(?=\w)|(?<= )-(?= |[A-Za-z](?:<su|\())")
 
 
 def prose(text: str) -> Markup:
@@ -38,6 +39,21 @@ def prose(text: str) -> Markup:
     typeset = LOWERED.sub(_lowered, SCIENTIFIC.sub(_scientific, typeset))
     typeset = EQUALITY.sub(f"{SPACE}={SPACE}", RAISED.sub(_raised, typeset))
     return Markup(NEGATIVE.sub(MINUS, typeset))
+
+
+def label(name: str) -> str:
+    """The name of an experiment as the paper writes it: ``figure-4`` as Figure 4, ``tables-6-7`` as Tables 6-7."""
+    first, *rest = name.split("-", 1)
+    return " ".join([first.capitalize(), *rest])
+
+
+def linked(text: Markup, names: Collection[str]) -> Markup:
+    """Text with links to the sections of the experiments that it names; names without a digit are just words."""
+    numbered = sorted((re.escape(name) for name in names if re.search(r"\d", name)), key=len, reverse=True)
+    if not numbered:
+        return text
+    pattern = re.compile(rf"(?<![\w-])({'|'.join(numbered)})(?![\w-]|\.\d)")
+    return Markup(pattern.sub(lambda match: f'<a href="#{match[0]}">{label(match[0]).replace(" ", SPACE)}</a>', text))
 
 
 def cell(value: Cell, specification: str | None = None) -> Markup:
