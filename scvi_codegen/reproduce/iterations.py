@@ -272,7 +272,10 @@ def _draw_tiles(axes: Axes, found: Counts, norm: LogNorm) -> None:
             colors[y, x] = colormaps["YlOrRd"](shade)
         lost = count.converged and count.energy >= 1.0
         axes.annotate(
-            f"({_text(count)})" if lost else _text(count), (x, y), color="white" if shade > 0.65 else "black", **CENTRED
+            f"({_text(count)})" if lost else _text(count),
+            (x, y),
+            color="#fefefe" if shade > 0.65 else "#111111",
+            **CENTRED,
         )
     axes.imshow(colors, aspect="auto")
     axes.set_xticks(range(len(columns)), [f"{scheme}\nN = {degree}" for degree, scheme in columns], fontsize=7)

@@ -132,16 +132,16 @@ def section_4_3(results: Mapping[str, Result]) -> Result:
                     "q_k",
                     "p_k",
                     "h",
-                    "q_k+1",
-                    "p_k+1",
+                    "q_(k+1)",
+                    "p_(k+1)",
                     "v_k",
                     "residual of (37)",
-                    "error of p_k+1",
+                    "error of p_(k+1)",
                     "SVI - SCVI",
                 ),
                 rows=tuple(rows),
-                formats={"q_k+1": ".15f", "p_k+1": ".15f", "v_k": ".15f", "residual of (37)": ".1e"}
-                | {"error of p_k+1": ".1e", "SVI - SCVI": ".1e"},
+                formats={"q_(k+1)": ".15f", "p_(k+1)": ".15f", "v_k": ".15f", "residual of (37)": ".1e"}
+                | {"error of p_(k+1)": ".1e", "SVI - SCVI": ".1e"},
             ),
         ),
         body=tuple(_derivation(scheme)),
@@ -248,10 +248,10 @@ def _derivation(scheme: Scheme) -> Iterator[Block]:
     yield Formula(sympy.ImmutableMatrix([exact_points(chebyshev_lobatto(1))]), Symbol("x"))
     yield Formula(sympy.ImmutableMatrix([points]), tau)
     yield Formula(sympy.ImmutableMatrix([weights]), Symbol("w"))
-    yield Paragraph("The curve at the quadrature points, q(d_i) = l_0,1(tau_i) q_k + l_1,1(tau_i) q_(k+1):")
+    yield Paragraph("The curve at the quadrature points, q(d_i) = l_{0,1}(tau_i) q_k + l_{1,1}(tau_i) q_(k+1):")
     for i, point in enumerate(points, start=1):
         values = [sympy.together(cardinal.subs(tau, point)) for cardinal in cardinals()]
-        yield Formula(values[0] * q + values[1] * new, Symbol(f"q(d_{i})"))
+        yield Formula(values[0] * q + values[1] * new, sympy.Function("q")(Symbol(f"d_{i}")))
     yield Paragraph("The differentiation matrix (11) on [-1, 1], and its lower row scaled to [kh, (k + 1)h]:")
     yield Formula(sympy.ImmutableMatrix(printed_differentiation()), Symbol("D__(1)"))
     yield Formula(_scaled_row(), sympy.ImmutableMatrix([[Symbol("a_0"), Symbol("A")]]))
