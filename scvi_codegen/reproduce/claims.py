@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from scvi_codegen.reproduce.experiment import Block, Check, Experiment, Paragraph, Result, Table, Verdict
+from scvi_codegen.reproduce.experiment import (
+    Block,
+    Check,
+    Experiment,
+    Paragraph,
+    Result,
+    Table,
+    Verdict,
+    common_verdict,
+)
 
 __all__ = ["CLAIMS", "EVIDENCE", "EXPERIMENTS", "Claim"]
 
@@ -123,22 +132,19 @@ def _evidence(key: str, results: Mapping[str, Result]) -> Iterator[tuple[str, Ch
             yield from ((name, check) for check in results[name].checks if key in check.bears_on)
 
 
-def verdict_of(checks: tuple[tuple[str, Check], ...]) -> Verdict:
-    """Of a claim, from those of its checks; checks that only show decide nothing."""
-    found = {check.verdict for _, check in checks} - {Verdict.SHOWN}
-    if not found:
-        return Verdict.SHOWN
-    return found.pop() if len(found) == 1 else Verdict.PARTLY
-
-
 def _check(claim: Claim, evidence: tuple[tuple[str, Check], ...]) -> Check:
     counted = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
-    parts = [f"{len(names)} {verdict.value} ({_unique(names)})" for verdict, names in counted.items() if names]
+    parts = [f"{_counted(len(names), verdict)} ({_unique(names)})" for verdict, names in counted.items() if names]
     return Check(
         claim=f"{claim.text} ({claim.place})",
         measured=f"Of {len(evidence)} checks {'; '.join(parts)}." if parts else "No check bears on it.",
-        verdict=verdict_of(evidence),
+        verdict=common_verdict(check for _, check in evidence),
     )
+
+
+def _counted(count: int, verdict: Verdict) -> str:
+    several = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS: "do not hold"}
+    return f"{count} {several.get(verdict, verdict.value) if count > 1 else verdict.value}"
 
 
 def _unique(names: list[str]) -> str:
@@ -154,7 +160,7 @@ def _summary(found: Mapping[str, tuple[tuple[str, Check], ...]]) -> Table:
                 CLAIMS[key].place,
                 len(evidence),
                 *(sum(check.verdict is verdict for _, check in evidence) for verdict in Verdict),
-                verdict_of(evidence).value,
+                common_verdict(check for _, check in evidence).value,
             )
             for key, evidence in found.items()
         ),
@@ -176,7 +182,7 @@ def _details(found: Mapping[str, tuple[tuple[str, Check], ...]]) -> Table:
 
 
 def _blocks(claim: Claim, evidence: tuple[tuple[str, Check], ...]) -> Iterator[Block]:
-    yield Paragraph(f'"{claim.text}" ({claim.place}): {verdict_of(evidence).value}.')
+    yield Paragraph(f'"{claim.text}" ({claim.place}): {common_verdict(check for _, check in evidence).value}.')
     for name, check in evidence:
         yield Paragraph(f"{name}, {check.verdict.value}: {check.claim} {check.measured}")
 

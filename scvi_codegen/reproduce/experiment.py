@@ -6,7 +6,7 @@ Everything is plain data that travels between processes: a picture is a module-l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, TypeAlias
@@ -27,6 +27,7 @@ __all__ = [
     "Result",
     "Table",
     "Verdict",
+    "common_verdict",
     "holds",
 ]
 
@@ -63,6 +64,14 @@ class Check:
     measured: str
     verdict: Verdict
     bears_on: tuple[str, ...] = ()
+
+
+def common_verdict(checks: Iterable[Check]) -> Verdict:
+    """Of several checks: ``PARTLY`` where they differ, ``SHOWN`` where none decides anything."""
+    found = {check.verdict for check in checks} - {Verdict.SHOWN}
+    if not found:
+        return Verdict.SHOWN
+    return found.pop() if len(found) == 1 else Verdict.PARTLY
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,10 +159,7 @@ class Result:
     @property
     def verdict(self) -> Verdict:
         """The common verdict of all checks; ``PARTLY`` where they differ, ``SHOWN`` where there is none."""
-        found = {check.verdict for check in self.checks} - {Verdict.SHOWN}
-        if not found:
-            return Verdict.SHOWN
-        return found.pop() if len(found) == 1 else Verdict.PARTLY
+        return common_verdict(self.checks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
