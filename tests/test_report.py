@@ -10,11 +10,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 import toy_experiments
 from click.testing import CliRunner
@@ -23,12 +24,15 @@ from toy_experiments import EXPERIMENTS, GOOD
 from scvi_codegen.cli import main
 from scvi_codegen.cli.reproducing import Reproduction, experiments_table
 from scvi_codegen.errors import StateError
-from scvi_codegen.reproduce.experiment import Result
+from scvi_codegen.reproduce.experiment import Picture, Result
 from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import Failure, run_experiments, with_needs
 from scvi_codegen.reproduce.svg import DARK_PAPER, color_variables, contrast, inline_svg
 from scvi_codegen.reproduce.typesetting import cell, prose
 from scvi_codegen.reproduce.writing import draw
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TOYS = toy_experiments.__name__
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -95,6 +99,11 @@ class TestRunner:
         assert time.perf_counter() - began < 10.0
 
 
+def an_svg(draw_on: Callable[[Axes], object]) -> str:
+    picture = Picture(draw=lambda figure: draw_on(figure.add_subplot()))
+    return inline_svg(draw(picture, "svg"), prefix="one", label="")
+
+
 class TestSvg:
     def test_it_is_small_and_in_the_colours_of_the_page(self, results):
         drawn = draw(results["figure-4"].picture, "svg")
@@ -120,6 +129,19 @@ class TestSvg:
         assert contrast(light["--text-888888"], "#ffffff") >= 4.5
         grid = contrast(light["--line-b0b0b0"], "#ffffff"), contrast(dark["--line-b0b0b0"], DARK_PAPER)
         assert grid[0] == pytest.approx(grid[1], rel=0.05)
+
+    def test_a_pale_area_stays_pale(self):
+        text = an_svg(lambda axes: axes.axhspan(0.0, 1.0, color="#ffffcc"))
+        dark = color_variables([text], dark=True)
+        assert contrast(dark["--line-ffffcc"], DARK_PAPER) == pytest.approx(contrast("#ffffcc", "#ffffff"), abs=0.05)
+
+    def test_images_and_colour_scales_keep_their_colours(self):
+        image = an_svg(lambda axes: axes.imshow([[0.0, 1.0], [2.0, 3.0]]))
+        scale = an_svg(lambda axes: axes.pcolormesh(np.arange(36.0).reshape(6, 6)))
+        for text in (image, scale):
+            assert 'class="light"' in text
+            assert "var(--line" not in text
+            assert "var(--paper)" not in text
 
 
 M, T, N = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
