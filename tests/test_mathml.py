@@ -13,7 +13,8 @@ import sympy
 from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
 
 from scvi_codegen.equations import derive
-from scvi_codegen.mathml import ONE_LINE, mathml, mathml_terms
+from scvi_codegen.mathml import mathml, mathml_terms
+from scvi_codegen.mathml.printer import ONE_LINE
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.problems import problem
 

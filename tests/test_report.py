@@ -5,16 +5,16 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 import toy_experiments
 from click.testing import CliRunner
@@ -23,15 +23,17 @@ from toy_experiments import EXPERIMENTS, GOOD
 from scvi_codegen.cli import main
 from scvi_codegen.cli.reproducing import Reproduction, experiments_table
 from scvi_codegen.errors import StateError
-from scvi_codegen.reproduce.experiment import Result
+from scvi_codegen.reproduce.experiment import Picture, Result
 from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import Failure, run_experiments, with_needs
 from scvi_codegen.reproduce.svg import DARK_PAPER, color_variables, contrast, inline_svg
 from scvi_codegen.reproduce.typesetting import cell, prose
 from scvi_codegen.reproduce.writing import draw
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 TOYS = toy_experiments.__name__
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 VOID = {"meta", "link", "br", "hr", "img", "input"}
 
 
@@ -95,6 +97,11 @@ class TestRunner:
         assert time.perf_counter() - began < 10.0
 
 
+def an_svg(draw_on: Callable[[Axes], object]) -> str:
+    picture = Picture(draw=lambda figure: draw_on(figure.add_subplot()))
+    return inline_svg(draw(picture, "svg"), prefix="one", label="")
+
+
 class TestSvg:
     def test_it_is_small_and_in_the_colours_of_the_page(self, results):
         drawn = draw(results["figure-4"].picture, "svg")
@@ -120,6 +127,19 @@ class TestSvg:
         assert contrast(light["--text-888888"], "#ffffff") >= 4.5
         grid = contrast(light["--line-b0b0b0"], "#ffffff"), contrast(dark["--line-b0b0b0"], DARK_PAPER)
         assert grid[0] == pytest.approx(grid[1], rel=0.05)
+
+    def test_a_pale_area_stays_pale(self):
+        text = an_svg(lambda axes: axes.axhspan(0.0, 1.0, color="#ffffcc"))
+        dark = color_variables([text], dark=True)
+        assert contrast(dark["--line-ffffcc"], DARK_PAPER) == pytest.approx(contrast("#ffffcc", "#ffffff"), abs=0.05)
+
+    def test_images_and_colour_scales_keep_their_colours(self):
+        image = an_svg(lambda axes: axes.imshow([[0.0, 1.0], [2.0, 3.0]]))
+        scale = an_svg(lambda axes: axes.pcolormesh(np.arange(36.0).reshape(6, 6)))
+        for text in (image, scale):
+            assert 'class="light"' in text
+            assert "var(--line" not in text
+            assert "var(--paper)" not in text
 
 
 M, T, N = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
@@ -360,115 +380,3 @@ def test_ctrl_c_ends_everything_at_once_and_keeps_what_was_written(tmp_path):
 def interrupt_group(child: subprocess.Popen[str]) -> None:
     """What a terminal does on Ctrl-C: the signal goes to all processes."""
     os.killpg(child.pid, signal.SIGINT)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A headless Chromium."""
-    if importlib.util.find_spec("playwright") is None:
-        pytest.skip("playwright is not installed: pip install 'scvi-codegen[test]'")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        own = playwright.chromium.executable_path
-        path = next(filter(None, map(shutil.which, (*BROWSERS, own))), None)
-        if path is None:
-            pytest.skip(f"there is no browser: none of {', '.join(BROWSERS)} is installed")
-        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield started
-        started.close()
-
-
-WIDTHS = {"phone": 390, "desk": 1200}
-STICKING_OUT = """width => [...document.querySelectorAll('body *')].filter(element => {
-    const box = element.getBoundingClientRect();
-    return !element.parentElement.closest('.scroll, svg, math') && !element.closest('.unseen')
-        && (box.right > width + 0.5 || box.left < -0.5);
-}).map(element => element.outerHTML.slice(0, 100))"""
-UNREADABLE = """() => {
-    const channels = color => color.match(/[\\d.]+/g).map(Number);
-    const light = c => { c /= 255; return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4; };
-    const luminance = ([r, g, b]) => 0.2126 * light(r) + 0.7152 * light(g) + 0.0722 * light(b);
-    const behind = element => {
-        for (let e = element; e; e = e.parentElement) {
-            const c = channels(getComputedStyle(e).backgroundColor);
-            if (c.length === 3 || c[3] === 1) return c;
-        }
-    };
-    const found = [];
-    for (const element of document.querySelectorAll('body *')) {
-        if (![...element.childNodes].some(node => node.nodeType === 3 && node.data.trim())) continue;
-        const style = getComputedStyle(element);
-        const color = channels(element.closest('svg') ? style.fill : style.color);
-        const [low, high] = [luminance(color), luminance(behind(element))].sort((a, b) => a - b);
-        const contrast = (high + 0.05) / (low + 0.05);
-        if (!(contrast >= 4.5)) found.push([contrast, element.outerHTML.slice(0, 100)]);
-    }
-    return found;
-}"""
-FORMULAS = """() => [...document.querySelectorAll('math')].map(math => {
-    const {width, height} = math.getBoundingClientRect();
-    return [width, height];
-})"""
-FRACTIONS = """() => [...document.querySelectorAll('mfrac')].map(fraction => {
-    const [above, below] = [...fraction.children].map(child => child.getBoundingClientRect());
-    return [fraction.getBoundingClientRect().height, above.bottom, below.top];
-})"""
-
-
-class TestInABrowser:
-    @pytest.fixture(params=[(size, scheme) for size in WIDTHS for scheme in ("light", "dark")], ids="-".join)
-    def view(self, request: pytest.FixtureRequest, browser: Any, page: str, tmp_path: Path) -> Iterator[Any]:
-        """The page on a phone or a desk, by day or by night; ``view.asked`` is what it asked for."""
-        size, scheme = request.param
-        path = tmp_path / "report.html"
-        path.write_text(page, encoding="utf-8")
-        view = browser.new_page(color_scheme=scheme)
-        phone = {"width": WIDTHS[size], "height": 844, "deviceScaleFactor": 2, "mobile": size == "phone"}
-        view.context.new_cdp_session(view).send("Emulation.setDeviceMetricsOverride", phone)
-        view.asked, view.said = [], []
-        view.on("request", lambda request: view.asked.append(request.url))
-        view.on("console", lambda message: view.said.append(message.text))
-        view.goto(path.as_uri())
-        view.wait_for_load_state("networkidle")
-        view.own, view.width = path.as_uri(), WIDTHS[size]
-        yield view
-        view.close()
-
-    def test_it_asks_for_nothing_and_complains_of_nothing(self, view):
-        assert [url for url in view.asked if not url.startswith("data:")] == [view.own]
-        assert view.said == []
-
-    def test_nothing_sticks_out(self, view):
-        assert view.evaluate(STICKING_OUT, view.width) == []
-        assert view.evaluate("document.documentElement.scrollWidth") <= view.width
-        assert view.evaluate("innerWidth") == view.width
-        boxes = "[...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth, e.clientWidth])"
-        assert view.width > 390 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
-
-    def test_formulas_are_set_by_the_browser(self, view):
-        boxes = view.evaluate(FORMULAS)
-        assert len(boxes) > 10
-        assert all(width > 5.0 and height > 8.0 for width, height in boxes)
-        fractions = view.evaluate(FRACTIONS)
-        assert len(fractions) > 50
-        assert all(height > 12.0 and above <= below + 0.5 for height, above, below in fractions)
-
-    def test_all_text_is_readable(self, view):
-        assert view.evaluate(UNREADABLE) == []
-
-    def test_on_paper_it_is_light_and_figures_stay_whole(self, view):
-        view.emulate_media(media="print")
-        style = "e => getComputedStyle(document.querySelector(e))"
-        assert view.evaluate(f"({style})('body').backgroundColor") == "rgb(255, 255, 255)"
-        assert view.evaluate(f"({style})('figure').breakInside") == "avoid"
-        assert view.evaluate(f"({style})('.back').display") == "none"
-        assert view.evaluate(UNREADABLE) == []
-
-
-def test_dark_is_dark(browser, page):
-    view = browser.new_page(color_scheme="dark")
-    view.set_content(page)
-    assert view.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 28)"
-    assert view.evaluate("getComputedStyle(document.querySelector('svg text')).fill") == "rgb(227, 228, 230)"
-    view.close()

@@ -1,15 +1,14 @@
 """Matplotlib's SVG made part of a page: small, with identifiers of its own, in the colours of the page.
 
 Black becomes the colour of the page's text, white that of its paper. Every other colour becomes a CSS variable, so that
-:func:`color_variables` can give it another value on dark paper, where it stays as readable as it was.
+:func:`color_variables` can give it another value on dark paper, where it stays as readable as it was. A picture with
+an image in it, or with the many colours of a scale, cannot follow: it keeps its colours, on light paper.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Iterator
-from functools import partial
 from xml.etree import ElementTree
 
 __all__ = ["color_variables", "contrast", "inline_svg"]
@@ -17,8 +16,9 @@ __all__ = ["color_variables", "contrast", "inline_svg"]
 DARK_PAPER, LIGHT_PAPER = "#16181c", "#ffffff"
 TEXT_CONTRAST, LINE_CONTRAST = 4.6, 5.0
 """Least contrast with the paper, of letters (WCAG AA asks for 4.5) and, on dark paper, of lines."""
-GREY = 16
-"""Largest difference of the channels of a grey."""
+GREY, PALE = 16, 2.0
+"""Largest difference of the channels of a grey; largest contrast of a pale area with light paper."""
+MOST_COLORS = 16
 DROPPED = {"metadata", "style", "title"}
 COLOR = re.compile(r"#([0-9a-f]{6})\b")
 VARIABLE = re.compile(r"var\(--(line|text)-([0-9a-f]{6})\)")
@@ -42,8 +42,11 @@ def inline_svg(svg: bytes, *, prefix: str, label: str) -> str:
     root.attrib.clear()
     root.attrib |= {"viewBox": f"0 0 {width} {height}", "role": "img", "aria-label": label}
     root.attrib["style"] = f"--width: {width}pt"
+    fixed = _keeps_colors(root)
+    if fixed:
+        root.attrib["class"] = "light"
     for element in root.iter():
-        _simplify(element, references, prefix)
+        _simplify(element, references, prefix, fixed=fixed)
     _prune(root)
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -60,25 +63,30 @@ def contrast(one: str, other: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
+def _keeps_colors(root: ElementTree.Element) -> bool:
+    colors = {color for element in root.iter() for color in COLOR.findall(element.get("style", ""))}
+    return len(colors) > MOST_COLORS or any(_local(element.tag) == "image" for element in root.iter())
+
+
 def _adapted(color: str, kind: str, *, dark: bool) -> str:
-    """A colour mixed with white, or with black, as little as gives enough contrast; grey lines keep theirs."""
+    """A colour that is as readable on dark paper as on light, and letters on both readable enough."""
     if not dark and kind == "line":
         return color
-    if kind == "line" and max(_channels(color)) - min(_channels(color)) < GREY:
-        return min(
-            (f"#{c:02x}{c:02x}{c:02x}" for c in range(256)), key=partial(_difference, contrast(color, LIGHT_PAPER))
-        )
-    paper, end = (DARK_PAPER, 255) if dark else (LIGHT_PAPER, 0)
+    as_given = contrast(color, LIGHT_PAPER)
+    grey = max(_channels(color)) - min(_channels(color)) < GREY
+    if kind == "line" and (grey or as_given < PALE):
+        mixtures = _mixtures("#ffffff" if grey else color, DARK_PAPER)
+        return min(mixtures, key=lambda mixed: abs(contrast(mixed, DARK_PAPER) - as_given))
+    paper, end = (DARK_PAPER, "#ffffff") if dark else (LIGHT_PAPER, "#000000")
     wanted = TEXT_CONTRAST if kind == "text" else LINE_CONTRAST
-    mixtures = (
-        "#" + "".join(f"{round(c + (end - c) * part / 100):02x}" for c in _channels(color)) for part in range(101)
-    )
-    return next(mixed for mixed in mixtures if contrast(mixed, paper) >= wanted)
+    return next(mixed for mixed in _mixtures(color, end) if contrast(mixed, paper) >= wanted)
 
 
-def _difference(wanted: float, color: str) -> float:
-    """From a wanted contrast on dark paper."""
-    return (contrast(color, DARK_PAPER) - wanted) ** 2 if _luminance(color) > _luminance(DARK_PAPER) else math.inf
+def _mixtures(color: str, other: str) -> Iterator[str]:
+    """From one colour to another, a hundredth at a time."""
+    pairs = list(zip(_channels(color), _channels(other), strict=True))
+    for part in range(101):
+        yield "#" + "".join(f"{round(c + (end - c) * part / 100):02x}" for c, end in pairs)
 
 
 def _luminance(color: str) -> float:
@@ -103,10 +111,10 @@ def _referenced(element: ElementTree.Element) -> Iterator[str]:
             yield from REFERENCE.findall(value)
 
 
-def _simplify(element: ElementTree.Element, references: set[str], prefix: str) -> None:
+def _simplify(element: ElementTree.Element, references: set[str], prefix: str, *, fixed: bool) -> None:
     """Rewrite one element's attributes: no namespaces, short numbers, own identifiers, variables for colours."""
     element.tag = _local(element.tag)
-    kind = "text" if element.tag in ("text", "tspan") else "line"
+    kind = None if fixed else "text" if element.tag in ("text", "tspan") else "line"
     attributes = {_local(name): value for name, value in element.attrib.items()}
     element.attrib.clear()
     for name, value in attributes.items():
@@ -120,11 +128,14 @@ def _simplify(element: ElementTree.Element, references: set[str], prefix: str) -
             element.set(name, _value(name, value, kind, prefix))
 
 
-def _value(name: str, value: str, kind: str, prefix: str) -> str:
+def _value(name: str, value: str, kind: str | None, prefix: str) -> str:
+    if name == "style":
+        value = FONT_FAMILY.sub("", value)
+        if kind is not None:
+            value = value.replace("#000000", "currentColor").replace("#ffffff", "var(--paper)")
+            value = COLOR.sub(rf"var(--{kind}-\1)", value)
     value = value.replace("url(#", f"url(#{prefix}-")
     if name == "style":
-        value = FONT_FAMILY.sub("", value).replace("#000000", "currentColor").replace("#ffffff", "var(--paper)")
-        value = COLOR.sub(rf"var(--{kind}-\1)", value)
         return value.replace(": ", ":").replace("; ", ";")
     if name in ("d", "points", "x", "y"):
         value = LONG_NUMBER.sub(lambda match: f"{float(match[0]):.2f}".rstrip("0").rstrip("."), value)

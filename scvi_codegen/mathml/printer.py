@@ -1,20 +1,10 @@
-"""SymPy as presentation MathML, which browsers typeset by themselves.
-
-    >>> from sympy import Symbol
-    >>> mathml(Symbol("theta_1_dot") / 2)  # doctest: +ELLIPSIS
-    '<math><mfrac><msub><mover accent="true"><mi>θ</mi><mo>˙</mo></mover>...</math>'
-
-Fractions keep what is short; wide factors stand behind them, and nothing is rewritten: signs and factors are those of
-the expression. Browsers do not break lines within ``<math>``, so :func:`mathml_terms` gives a long equation in pieces
-between which a line may end.
-"""
+"""SymPy's presentation printer with our fractions, signs, names and numbers, and with long products in pieces."""
 
 from __future__ import annotations
 
 import html
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from itertools import chain, takewhile
 from typing import Any, TypeAlias
 from xml.dom.minidom import Element, Node
@@ -24,9 +14,10 @@ from mpmath.libmp import to_str
 from sympy.core.function import AppliedUndef
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.precedence import PRECEDENCE, precedence_traditional
-from sympy.printing.pretty.pretty_symbology import greek_unicode
 
-__all__ = ["mathml", "mathml_terms"]
+from scvi_codegen.mathml.names import ACCENTS, Name, parsed
+
+__all__ = ["ONE_LINE", "Printer", "length"]
 
 DIGITS = 6
 """Significant digits of floating-point numbers."""
@@ -38,10 +29,6 @@ WIDE = 80
 """Characters of a factor that is broken within its brackets."""
 TALL = "2.2em"
 """Height of brackets whose contents are in other pieces."""
-ACCENTS = {"dot": "˙", "ddot": "¨", "hat": "^", "tilde": "~", "bar": "¯"}
-LATEX_ACCENT = re.compile(r"\\(dot|ddot|hat|tilde|bar)\{?(\w+?)\}?(?=[_^]|$)")
-RAISED = ("Q", "V", "P")
-"""Letters whose first index counts nodes: Q_1_x is component x of Q at node 1, as the paper has it."""
 CARDINAL = {"l": "", "dl": "dot"}
 """Tables of cardinal functions at points, with their accent: l_1_0 is l_0(tau_1)."""
 PRODUCTS = {"DD": ("D_hat", "D_tilde"), "aa": ("A__2",), "bA": ("b", "A")}
@@ -49,7 +36,6 @@ PRODUCTS = {"DD": ("D_hat", "D_tilde"), "aa": ("A__2",), "bA": ("b", "A")}
 SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
 """Functions whose power is written at their name."""
 TYPESET = str.maketrans({"-": "\N{MINUS SIGN}", "ⅆ": "d", "ⅇ": "e", "ⅈ": "i"})
-
 TALL_TAGS = ("mfrac", "mtable", "munderover")
 
 Child: TypeAlias = Element | str
@@ -57,55 +43,11 @@ Piece: TypeAlias = list[Element]
 """What becomes one ``<math>`` element."""
 
 
-def mathml(expression: sympy.Basic, *, display: bool = False) -> str:
-    """One ``<math>`` element; well-formed XML and HTML.
-
-    Args:
-        expression: an expression, a matrix or a relation.
-        display: whether it stands on a line of its own, with full-size fractions and limits above and below.
-    """
-    printer = _Printer()
-    return printer.text([printer.printed(expression)], display=display)
-
-
-def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[tuple[str, ...], ...]:
-    """An equation as terms, and each of them as ``<math>`` elements, to be set one after the other.
-
-    A line may end between terms, and between the pieces of a term that is longer than a line: before a factor, and
-    before a sign within the brackets of a long factor. A short equation is one piece.
-
-    Args:
-        right: an expression, or an equation if ``left`` is ``None``.
-        left: what it equals; ``left =`` is the first piece where it is short.
-    """
-    if left is None and isinstance(right, sympy.Eq):
-        left, right = right.lhs, right.rhs
-    printer = _Printer()
-    terms = list(printer.terms(right))
-    if left is not None and _length(left) <= ONE_LINE:
-        terms[0].insert(0, [printer.printed(left), printer.operator("=")])
-    elif left is not None:
-        terms[0][0].insert(0, printer.operator("=", form="infix"))
-        terms = [*printer.terms(left), *terms]
-    if _length(right) + (0 if left is None else _length(left)) <= ONE_LINE:
-        terms = [[[element for term in terms for piece in term for element in piece]]]
-    return tuple(tuple(printer.text(piece, display=True) for piece in term) for term in terms)
-
-
-@dataclass(frozen=True, slots=True)
-class _Name:
-    """What a symbol's name is made of: ``theta_1_dot`` is theta with an accent and one index."""
-
-    letter: str
-    accent: str = ""
-    below: tuple[str, ...] = field(default=())
-    above: tuple[str, ...] = field(default=())
-
-
-class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no stubs
+class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no stubs
     """SymPy's printer with our fractions, signs, names and numbers."""
 
     def text(self, elements: Sequence[Element], *, display: bool) -> str:
+        """``<math>`` around elements."""
         root = self._element("math", *elements)
         if display:
             root.setAttribute("displaystyle", "true")
@@ -113,10 +55,12 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         return str(root.toxml())
 
     def printed(self, expression: Any) -> Element:
+        """An expression as one element."""
         element: Element = self._print(expression)
         return element
 
     def operator(self, sign: str, **attributes: str) -> Element:
+        """A sign with attributes of its own."""
         element = self._element("mo", sign)
         for name, value in attributes.items():
             element.setAttribute(name, value)
@@ -129,7 +73,7 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
             return
         for number, term in enumerate(self._as_ordered_terms(expression) if expression.is_Add else [expression]):
             negative, size = _sign_and_size(term)
-            pieces = list(self._product_pieces(size)) if _length(term) > ONE_LINE else [[self._operand(size)]]
+            pieces = list(self._product_pieces(size)) if length(term) > ONE_LINE else [[self._operand(size)]]
             if negative or number:
                 form = "infix" if number else "prefix"
                 pieces[0].insert(0, self.operator("-" if negative else "+", form=form))
@@ -143,7 +87,7 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
             yield [*([] if fraction is None else [fraction]), *self._factors(narrow)]
         for factor in factors[len(narrow) :]:
             base, exponent = factor.args if factor.is_Pow else (factor, sympy.S.One)
-            if base.is_Add and _length(base) > WIDE:
+            if base.is_Add and length(base) > WIDE:
                 yield from self._bracketed_pieces(base, exponent)
             else:
                 yield self._factors([factor])
@@ -216,9 +160,9 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         A denominator of more than ``longest`` characters is one of these, as a negative power.
         """
         top, bottom = _numerator_and_denominator(expr)
-        wide = [] if _length(sympy.Mul(*top, evaluate=False)) <= SHORT else [x for x in top if not _is_narrow(x)]
+        wide = [] if length(sympy.Mul(*top, evaluate=False)) <= SHORT else [x for x in top if not _is_narrow(x)]
         deep = [factor for factor in bottom if not _is_narrow(factor)]
-        if deep and longest is not None and _length(sympy.Mul(*deep, evaluate=False)) > longest:
+        if deep and longest is not None and length(sympy.Mul(*deep, evaluate=False)) > longest:
             bottom = [factor for factor in bottom if factor not in deep]
             wide += [sympy.Pow(*_inverted(factor), evaluate=False) for factor in deep]
         elif deep:
@@ -255,7 +199,7 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         if exponent.is_Integer and type(base).__name__ in SQUARED:
             name = self._element("msup", self._element("mi", self.mathml_tag(base)), self.printed(exponent))
             return self._row(name, self._paren_comma_separated(*base.args))
-        plain = (base.is_Symbol and not _parsed(base.name).above) or (base.is_Integer and base.is_nonnegative)
+        plain = (base.is_Symbol and not parsed(base.name).above) or (base.is_Integer and base.is_nonnegative)
         below = self.printed(base) if plain else self._bracketed(base)
         if below.tagName == "msub" and plain:
             below.tagName = "msubsup"
@@ -317,15 +261,15 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
         """A symbol: letter, accent, indices; an entry of a derived table as the function or matrix it comes from."""
         prefix, *indices = name.lstrip("_").split("_")
         if prefix in CARDINAL and len(indices) == 2 and all(map(str.isdigit, indices)):
-            function = self._typeset(_Name("l", CARDINAL[prefix], below=(indices[1],)))
-            return self._row(function, self._fenced(self._typeset(_Name("tau", below=(indices[0],)))))
+            function = self._typeset(Name("l", CARDINAL[prefix], below=(indices[1],)))
+            return self._row(function, self._fenced(self._typeset(Name("τ", below=(indices[0],)))))
         if prefix in PRODUCTS and indices and all(map(str.isdigit, indices)):
-            matrices = [self._typeset(_parsed(matrix)) for matrix in PRODUCTS[prefix]]
+            matrices = [self._typeset(parsed(matrix)) for matrix in PRODUCTS[prefix]]
             return self._element("msub", self._fenced(*matrices), self._indices(indices))
-        return self._typeset(_parsed(name))
+        return self._typeset(parsed(name))
 
-    def _typeset(self, name: _Name) -> Element:
-        letter = self._element("mi", _letter(name.letter))
+    def _typeset(self, name: Name) -> Element:
+        letter = self._element("mi", name.letter)
         if name.accent:
             letter = self._element("mover", letter, self.operator(ACCENTS[name.accent]))
             letter.setAttribute("accent", "true")
@@ -340,34 +284,10 @@ class _Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no
             elements += [self._comma()] if number else []
             for token in re.findall(r"[^\W\d]+\d*|\d+|\S", part.strip("{}()")):
                 if token[0].isalpha():
-                    elements.append(self._typeset(_parsed(token)))
+                    elements.append(self._typeset(parsed(token)))
                 else:
                     elements.append(self._element("mn" if token.isdigit() else "mo", token.replace("'", "′")))
         return self._row(*elements)
-
-
-def _parsed(name: str) -> _Name:
-    """Names as the package makes them (q_dot, p_q1_k, Q_2_x) and as SymPy knows them (Q__2_x, theta1)."""
-    plain = LATEX_ACCENT.sub(r"\2_\1", name.strip("_") or name)
-    head, *raised = re.split(r"__|\^", plain)
-    above: list[str] = []
-    letter, *below = head.split("_")
-    for part in raised:
-        first, *rest = part.split("_")
-        above.append(first)
-        below += rest
-    accent = next((part for part in below if part in ACCENTS), "")
-    if accent:
-        below.remove(accent)
-    if letter in RAISED and not above and below and below[0].isdigit():
-        above.append(below.pop(0))
-    if match := re.fullmatch(r"([^\W\d]+)(\d+)", letter):
-        letter, below = match[1], [match[2], *below]
-    return _Name(letter, accent, tuple(filter(None, below)), tuple(above))
-
-
-def _letter(name: str) -> str:
-    return str(greek_unicode.get(name, name))
 
 
 def _sign_and_size(term: sympy.Expr) -> tuple[bool, sympy.Expr]:
@@ -414,7 +334,7 @@ def _starts_with_digit(factor: sympy.Expr) -> bool:
     return bool(factor.is_Number)
 
 
-def _length(expression: sympy.Basic) -> int:
+def length(expression: sympy.Basic) -> int:
     """About the width of an expression, in characters."""
     return len(str(expression))
 
