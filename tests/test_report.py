@@ -249,7 +249,10 @@ class TestPage:
         assert '<td class="number">0.50</td>' in page
 
     def test_verdicts_are_summed_up(self, page, results):
-        assert [text for _, text in tally(list(results.values()))] == ["2 hold in part", "2 shown"]
+        assert [text for _, text in tally([result.verdict for result in results.values()])] == [
+            "2 hold in part",
+            "2 shown",
+        ]
         assert page.count('<span class="verdict partly">') == 5
         assert "The equations of one step</span>" in page
 

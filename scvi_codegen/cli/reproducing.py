@@ -43,7 +43,10 @@ class Reproduction:
 
     def summary(self) -> str:
         """The verdicts counted, and what was written."""
-        counts = [counted(len(self.results), "result"), *(text for _, text in tally(self.results))]
+        counts = [
+            counted(len(self.results), "result"),
+            *(text for _, text in tally([result.verdict for result in self.results])),
+        ]
         folders = sorted({str(path.parent) for path in self.files})
         return f"{', '.join(counts)}\nwrote {counted(len(self.files), 'file')} to {' and '.join(folders)}"
 

@@ -40,7 +40,8 @@ def report_html(results: Sequence[Result]) -> str:
         alone=alone,
         results=results,
         names=[] if alone else list(pictures),
-        counts=tally(results),
+        counts=tally([result.verdict for result in results]),
+        check_counts=tally([check.verdict for result in results for check in result.checks]),
         pictures=pictures,
         css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
         colors=_color_rules([*pictures.values()]),
@@ -48,9 +49,9 @@ def report_html(results: Sequence[Result]) -> str:
     )
 
 
-def tally(results: Sequence[Result]) -> list[tuple[Verdict, str]]:
+def tally(verdicts: Sequence[Verdict]) -> list[tuple[Verdict, str]]:
     """How often each verdict was found: ``"3 hold"``, ``"1 does not hold"``."""
-    counts = Counter(result.verdict for result in results)
+    counts = Counter(verdicts)
     return [
         (verdict, f"{counts[verdict]} {verdict.value if counts[verdict] == 1 else PLURALS[verdict]}")
         for verdict in Verdict
