@@ -398,7 +398,7 @@ class TestListings:
         text = output_of("methods")
         for name in METHODS:
             assert re.search(rf"^{name} ", text, re.MULTILINE)
-        assert re.search(r"^svi +degree, quadrature, nodes +\S+ +8 +yes +yes$", text, re.MULTILINE)
+        assert re.search(r"^svi +degree, quadrature, nodes, space +\S+ +8 +yes +yes$", text, re.MULTILINE)
         assert re.search(r"^ +scvi-printed-\S+ +none claimed +no +no$", text, re.MULTILINE)
 
     def test_tableaux_in_radicals_and_in_decimals(self):
