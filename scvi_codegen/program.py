@@ -20,11 +20,13 @@ __all__ = [
     "Family",
     "GatherLoop",
     "GuessTables",
+    "HamiltonianSweep",
     "Kernel",
     "LaneTable",
     "Load",
     "NodeTables",
     "Operation",
+    "PointSweep",
     "PointTables",
     "PrintedEnds",
     "Program",
@@ -281,29 +283,24 @@ class SeparableSweep:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CoupledSweep:
-    """A fixed-point iteration on velocities for any regular Lagrangian; points are lanes, tables padded to ``lanes``.
-
-    With V the velocities and F = L_q at the points, V += L_vv^-1 (P - L_v) until nothing moves, where
+class PointSweep:
+    """What the two iterations on velocities at the points have in common; tables padded to ``lanes``.
 
         q_n = q0 + sum_j position[n][j] (h position_weights[j] V_j),    q1 = q0 + sum_j end_position[j] (h .. V_j),
-        P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j).
+        P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j),
+
+    F being L_q (-H_q) at the points.
 
     Attributes:
         points: real points g; lanes beyond repeat the last one and have weight 0.
-        blocks: velocities s that give the curve, g unless the method is an SVI with other points.
         lanes: a power of two.
         abscissae: (lanes,) c_n, where time stands.
-        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, with other points than
-            blocks; else empty.
-        guess: from z of former steps to z.
-        kernel: F, L_v and the mass at (q, V, t).
+        guess: from the velocities of former steps to those of the next.
+        kernel: what gives the velocities.
         force: F alone.
-        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
     """
 
     points: int
-    blocks: int
     lanes: int
     abscissae: tuple[float, ...]
     position: LaneTable
@@ -312,19 +309,40 @@ class CoupledSweep:
     momentum_weights: tuple[float, ...]
     end_position: tuple[float, ...]
     end_momentum: tuple[float, ...]
-    velocity: LaneTable
-    projection: LaneTable
     guess: GuessTables
     kernel: Kernel
     force: Kernel
-    mass_entries: tuple[tuple[int, int], ...]
-
-    kind: ClassVar[str] = "coupled"
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those with lanes."""
         return (self.kernel, self.force)
+
+    @property
+    def uses_time(self) -> bool:
+        """Whether time occurs in a kernel with lanes."""
+        return any(kernel.uses_time for kernel in self.kernels)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoupledSweep(PointSweep):
+    """A fixed-point iteration on velocities for any regular Lagrangian: V += L_vv^-1 (P - L_v) until nothing moves.
+
+    The kernel: F, L_v and the mass at (q, V, t).
+
+    Attributes:
+        blocks: velocities s that give the curve, g unless the method is an SVI with other points.
+        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, with other points than
+            blocks; else empty.
+        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+    """
+
+    blocks: int
+    velocity: LaneTable
+    projection: LaneTable
+    mass_entries: tuple[tuple[int, int], ...]
+
+    kind: ClassVar[str] = "coupled"
 
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
@@ -339,6 +357,23 @@ class CoupledSweep:
     def diagonal(self) -> bool:
         """Whether the mass matrix is diagonal."""
         return all(i == j for i, j in self.mass_entries)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HamiltonianSweep(PointSweep):
+    """A fixed-point iteration for any Hamiltonian: F = -H_q(q, P), P, V = H_p(q, P), q in turn until nothing moves.
+
+    The kernel: H_p at (q, P, t).
+    """
+
+    kind: ClassVar[str] = "hamiltonian"
+    projected: ClassVar[bool] = False
+    diagonal: ClassVar[bool] = True
+    mass_entries: ClassVar[tuple[tuple[int, int], ...]] = ()
+
+    def memory(self, dimension: int) -> int:
+        """Velocities and forces of the last two steps."""
+        return 4 * dimension * self.lanes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -481,7 +516,7 @@ class CollocationSweep(CurveSweep):
         return dimension * (2 * self.lanes + 1)
 
 
-Sweep: TypeAlias = SeparableSweep | CoupledSweep | ShootingSweep | CollocationSweep
+Sweep: TypeAlias = SeparableSweep | CoupledSweep | HamiltonianSweep | ShootingSweep | CollocationSweep
 """A fixed-point iteration; ``kind`` says which."""
 
 

@@ -156,13 +156,18 @@ def _purposes(program: Program) -> dict[str, str]:
         "derivative_3_action": "d^3L/dt^3 at u = (q, v, a, j, s).",
         "hamiltonian": "H at u = (q, p).",
         "force_lanes": "L_q at all points.",
+        "velocity_lanes": "H_p at all points, u = (q, p).",
         "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
         "action_lanes": "L_q and L_v at all points, u = (q, v).",
         "applied_force_lanes": "L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
         "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
     }
     if program.hamiltonian:
-        purposes |= {"legendre": "H_p and H_pp at u = (q, p).", "lagrangian": "p . v - H at u = (q, v, p)."}
+        purposes |= {
+            "force_lanes": "-H_q at all points, u = (q, p).",
+            "legendre": "H_p and H_pp at u = (q, p).",
+            "lagrangian": "p . v - H at u = (q, v, p).",
+        }
     for family in program.families:
         arguments = f"({', '.join(family.arguments)})"
         purposes[family.value.name] = f"{_results(family)} at u = {arguments}."

@@ -36,6 +36,7 @@ FLOORS = """
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
     solvers.separable solvers.coupled solvers.collocation solvers.shooting
+    solvers.hamiltonian
     solvers.choice
     solvers
     trajectory

@@ -2,8 +2,8 @@
 
 All of them iterate on kernels at points that are the lanes of one vector, without a Newton matrix:
 :mod:`~scvi_codegen.solvers.separable` on positions, :mod:`~scvi_codegen.solvers.coupled` on velocities,
-:mod:`~scvi_codegen.solvers.collocation` on accelerations, :mod:`~scvi_codegen.solvers.shooting` on accelerations and
-multipliers.
+:mod:`~scvi_codegen.solvers.hamiltonian` on momenta and velocities, :mod:`~scvi_codegen.solvers.collocation` on
+accelerations, :mod:`~scvi_codegen.solvers.shooting` on accelerations and multipliers.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.program import Splitting, Sweep
 from scvi_codegen.solvers.collocation import position_sweep, printed_sweep
 from scvi_codegen.solvers.coupled import coupled_sweep
+from scvi_codegen.solvers.hamiltonian import hamiltonian_sweep
 from scvi_codegen.solvers.separable import separable_sweep
 from scvi_codegen.solvers.shooting import shooting_sweep
 from scvi_codegen.solvers.velocity_tables import velocity_tables
@@ -31,9 +32,15 @@ __all__ = ["check_solver", "sweep_of"]
 def sweep_of(system: MechanicalSystem, method: Method) -> Sweep | None:
     """The fixed-point iteration of a method for a system, or ``None`` where there is none.
 
-    Of a Hamiltonian that has a Lagrangian it is the one of the Lagrangian: the step is the same (35f).
+    Of a Hamiltonian its own, but for separable ones and where the method has none for it: then the one of its
+    Lagrangian, if there is one. The step is the same (35f).
     """
     twin = lagrangian_twin(system)
+    if system.auxiliaries and not (twin and is_separable(twin)):
+        tables = velocity_tables(system, method)
+        own = hamiltonian_sweep(system, tables) if tables else None
+        if own is not None:
+            return own
     return None if twin is None else _lagrangian_sweep(twin, method)
 
 

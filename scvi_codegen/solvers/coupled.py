@@ -21,7 +21,7 @@ from scvi_codegen.program import CoupledSweep, Kernel
 from scvi_codegen.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.solvers.velocity_tables import VelocityTables
 
-__all__ = ["coupled_sweep"]
+__all__ = ["coupled_sweep", "over", "weighted_tables"]
 
 FRACTION_BITS = 51
 
@@ -32,7 +32,7 @@ def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSw
     lanes = lane_count(max(points, blocks))
     if lanes > MOST_LANES:
         return None
-    position, position_weights, momenta, momentum_weights = _weighted_tables(tables)
+    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
     guess = guess_tables(tables.blocks, lanes)
     kernel, entries = _point_kernel(system)
     return CoupledSweep(
@@ -44,8 +44,8 @@ def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSw
         position_weights=pad_vector(position_weights, lanes),
         momentum=pad_matrix(momenta, lanes),
         momentum_weights=pad_vector(momentum_weights, lanes),
-        end_position=pad_vector(_over(tables.end_position, position_weights), lanes),
-        end_momentum=pad_vector(_over(tables.end_momentum, momentum_weights), lanes),
+        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
+        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
         velocity=pad_matrix(tables.velocity, lanes) if tables.velocity else (),
         projection=pad_matrix(tables.projection, lanes) if tables.projection else (),
         guess=guess,
@@ -55,20 +55,21 @@ def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSw
     )
 
 
-def _weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
+def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
     """Position table and weights, momentum table and weights, whose products are the method's own tables."""
     beta, weights = tables.end_position, tables.end_momentum
     if not tables.variational:
         ones = (mp.one,) * len(beta)
         return tables.position, ones, tables.momentum, ones
     unit = mp.ldexp(1, FRACTION_BITS)
-    mu = tuple(tuple(mp.nint(x * unit) / unit for x in _over(line, beta)) for line in tables.position)
+    mu = tuple(tuple(mp.nint(x * unit) / unit for x in over(line, beta)) for line in tables.position)
     if tables.projection:
-        return mu, beta, tuple(_over(line, weights) for line in tables.momentum), weights
+        return mu, beta, tuple(over(line, weights) for line in tables.momentum), weights
     return mu, beta, transpose(tuple(tuple(1 - x for x in line) for line in mu)), weights
 
 
-def _over(numbers: Vector, divisors: Vector) -> Vector:
+def over(numbers: Vector, divisors: Vector) -> Vector:
+    """Quotients, entry by entry."""
     return tuple(x / y for x, y in zip(numbers, divisors, strict=True))
 
 
