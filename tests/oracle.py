@@ -263,10 +263,36 @@ def scvi(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any, c: 
         state["unknown"] = unknown = newton(boundary_value_problem, state["unknown"])
         return action(system, t, np.vstack([start[None], unknown[1:], end[None]]), h, nodes, c, w)
 
+    return generated_map(discrete_lagrangian, q0, p0, q0 + h * v_start)
+
+
+def scvi_abscissae(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, stages: Any, c: Any, w: Any) -> State:
+    """The same with collocation at any abscissae: V = v0 + h A a, Q = q0 + h A V, q1 = q0 + h b V."""
+    A, b = table(stages, stages, integral), weights(stages)
+    values, integrals = table(stages, c), table(stages, c, integral)
+    v_start = system.velocity(t, q0, p0)
+    state = {"unknown": np.vstack([v_start[None], numbers(np.zeros((len(stages), len(q0))))])}
+
+    def discrete_lagrangian(start: np.ndarray, end: np.ndarray) -> Any:
+        def boundary_value_problem(unknown: np.ndarray) -> np.ndarray:
+            V = unknown[0] + h * (A @ unknown[1:])
+            E = system.residual(t + stages * h, start + h * (A @ V), V, unknown[1:])
+            return np.vstack([(start + h * (b @ V) - end)[None], E])
+
+        state["unknown"] = unknown = newton(boundary_value_problem, state["unknown"])
+        V = unknown[0] + h * (A @ unknown[1:])
+        return h * (w @ system.lagrangian(t + c * h, start + h * (integrals @ V), values @ V))
+
+    return generated_map(discrete_lagrangian, q0, p0, q0 + h * v_start)
+
+
+def generated_map(discrete_lagrangian: Callable[[Any, Any], Any], q0: Any, p0: Any, guess: Any) -> State:
+    """(5): q1 from p0 = -D1 L_d(q0, q1), then p1 = D2 L_d(q0, q1)."""
+
     def mismatch(end: np.ndarray) -> np.ndarray:
         return p0 + central(lambda start: discrete_lagrangian(start, end), q0, "1e-12")
 
-    q1 = newton(mismatch, q0 + h * v_start, digits=20, width="1e-9")
+    q1 = newton(mismatch, guess, digits=20, width="1e-9")
     return q1, central(lambda end: discrete_lagrangian(q0, end), q1, "1e-12")
 
 
@@ -408,6 +434,10 @@ def stepper_of(what: Mapping[str, Any]) -> tuple[Callable[..., State], dict[str,
     position = what.get("form") == "position"
     if kind in ("svi", "scvi"):
         c, w = rule(what["quadrature"])
+        if "abscissae" in what:
+            given = what["abscissae"]
+            named = STAGES[given](what["degree"])["c"] if isinstance(given, str) else numbers(given)
+            return scvi_abscissae, {"stages": named, "c": c, "w": w}
         curve = {"nodes": points(FAMILY_OF_NAME[what["nodes"]], what["degree"] + 1), "c": c, "w": w}
         return (svi if kind == "svi" else scvi if what["variational"] else scvi_printed), curve
     if kind == "sc":

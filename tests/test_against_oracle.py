@@ -32,7 +32,14 @@ SYSTEMS = (
     "pumped-cart-pole",
     "relativistic-particle",
 )
-FEW = (SVI(2, "gauss-legendre:3"), SCVI(3), SCVI(2, variational=False), SpectralCollocation(2), RadauIIA(2))
+FEW = (
+    SVI(2, "gauss-legendre:3"),
+    SCVI(3),
+    SCVI(2, abscissae="chebyshev-gauss"),
+    SCVI(2, variational=False),
+    SpectralCollocation(2),
+    RadauIIA(2),
+)
 MANY = (
     SVI(1, "gauss-lobatto:2"),
     *(SVI(s) for s in (1, 2, 3, 4, 5)),
@@ -46,6 +53,10 @@ MANY = (
     SCVI(3, "gauss-lobatto:6"),
     SCVI(3, nodes="legendre-lobatto"),
     SCVI(2, "gauss-legendre:1"),
+    SCVI(2, abscissae="gauss"),
+    SCVI(3, abscissae="radau-iia"),
+    SCVI(3, abscissae="lobatto-iiia"),
+    SCVI(2, "gauss-lobatto:4", abscissae=(0.125, 0.75)),
     SCVI(4, "gauss-legendre:3", variational=False),
     SCVI(1, "gauss-lobatto:2", variational=False),
     *(SpectralCollocation(s, form=form) for s in (1, 3, 5) for form in ("position", "phase-space")),

@@ -9,6 +9,7 @@ import numpy as np
 import oracle
 import pytest
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -222,9 +223,58 @@ def test_svi_with_a_symmetric_quadrature_is_reversible(sample, compiled, name, q
 
 
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
+@pytest.mark.parametrize("family", ["gauss", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto"])
+def test_scvi_on_symmetric_abscissae_is_reversible(sample, compiled, name, family):
+    method = SCVI(3, abscissae=family)
+    assert method.symmetric
+    assert reversal_defect(sample, compiled, name, method) < ROUND_OFF
+
+
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
 def test_others_are_not(sample, compiled, name):
     for method in (SVI(2, "gauss-radau-left:2"), SCVI(2), SpectralCollocation(2), SCVI(2, variational=False)):
         assert reversal_defect(sample, compiled, name, method) > 1e-8
+
+
+# 9. SCVI on abscissae.
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_the_abscissae_of_nodes_give_the_scvi_on_those_nodes(sample, compiled, name):
+    nodes = SCVI(3)
+    abscissae = SCVI(3, abscissae=[(1 + x) / 2 for x in nodes.node_set.points[1:]])
+    maps = [compiled_map(sample, compiled, name, method) for method in (nodes, abscissae)]
+    assert distance(*maps) < 1e-15
+
+
+@pytest.mark.parametrize("s", [2, 3, 4])
+@pytest.mark.parametrize("name", CONSTANT_MASS)
+def test_for_constant_mass_scvi_on_gauss_points_is_svi(sample, compiled, name, s):
+    maps = [compiled_map(sample, compiled, name, method) for method in (SCVI(s, abscissae="gauss"), SVI(s))]
+    assert distance(*maps) < ROUND_OFF
+
+
+def test_otherwise_it_is_not(sample, compiled):
+    """It collocates the equations of second order, Gauss's method those of first order."""
+    maps = [
+        compiled_map(sample, compiled, "double-pendulum", method) for method in (SCVI(2, abscissae="gauss"), SVI(2))
+    ]
+    assert distance(*maps) > 1e-7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"abscissae": "gauss", "nodes": "chebyshev-lobatto"}, "not both"),
+        ({"abscissae": "gauss", "variational": False}, "needs nodes at both ends"),
+        ({"abscissae": "radau-ia"}, "there are no abscissae called 'radau-ia'"),
+        ({"abscissae": [0.2, 0.8]}, "a curve of degree 3 has 3 abscissae, not 2"),
+        ({"abscissae": [0.2, 0.2, 0.8]}, "not above the one before"),
+    ],
+)
+def test_refused_abscissae(arguments, message):
+    with pytest.raises(MethodError, match=message):
+        SCVI(3, **arguments)
 
 
 # 8. Total time derivatives.
