@@ -16,8 +16,20 @@ from scvi_codegen.cli import main
 from scvi_codegen.model_file import load_model
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SCRIPTS = ("custom_sympy_system", "import_generated_stepper", "inspect_derivation", "kepler_conservation")
-ENERGY_ERRORS = {"outer_solar_system": 1e-13, "pendulum": 1e-8, "kepler": 1e-12, "double_pendulum": 1e-11}
+SCRIPTS = (
+    "curves_and_quadratures",
+    "custom_sympy_system",
+    "import_generated_stepper",
+    "inspect_derivation",
+    "kepler_conservation",
+)
+ENERGY_ERRORS = {
+    "outer_solar_system": 1e-13,
+    "pendulum": 1e-8,
+    "kepler": 1e-12,
+    "double_pendulum": 1e-11,
+    "vortex_pairs": 1e-12,
+}
 
 
 def output_of(name: str, tmp_path: Path) -> str:
@@ -62,6 +74,16 @@ def test_kepler_conservation_tells_the_methods_apart(tmp_path):
     assert max(errors["SVI, degree 4"]) < 1.1 * min(errors["SVI, degree 4"])
     assert errors["spectral collocation, degree 4"][2] > 10 * errors["spectral collocation, degree 4"][0]
     assert min(errors["explicit Euler"]) > 0.1
+
+
+def test_curves_and_quadratures_win_where_they_say(tmp_path):
+    errors = [
+        float(line.split()[-1]) for line in output_of("curves_and_quadratures", tmp_path).splitlines() if "e-" in line
+    ]
+    polynomials, harmonics, smooth, splines, trapezoid, hermite, more = errors
+    assert harmonics < polynomials / 100
+    assert splines < smooth / 1e4
+    assert more < 1e-7 < hermite < trapezoid
 
 
 def test_import_generated_stepper_runs_without_sympy(tmp_path):
