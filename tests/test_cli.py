@@ -128,6 +128,9 @@ class TestChoices:
             ({"method": "gauss", "stages": 3, "form": "position"}, Gauss(3, form="position")),
             ({"method": "collocation", "abscissae": (0.25, 1.0)}, CollocationRK((0.25, 1.0))),
             ({"method": "stoermer-verlet"}, StoermerVerlet()),
+            ({"method": "scvi", "degree": 3, "abscissae": "gauss"}, SCVI(3, abscissae="gauss")),
+            ({"degree": 4, "space": "splines:2"}, SVI(4, space="splines:2")),
+            ({"degree": 3, "quadrature": "hermite:3"}, SVI(3, "hermite:3")),
         ],
     )
     def test_methods(self, choices, method):

@@ -195,4 +195,6 @@ def _chosen_method(method: Method, choices: Choices) -> Method:
         accepted = ARGUMENTS.get(choices.method, ())
         base = {field: value for field, value in base.items() if field in INHERITED and field in accepted}
         base["method"] = choices.method
+    if {"abscissae", "space"} & given.keys():
+        base.pop("nodes", None)  # they say in other words where the curve is given
     return method_from_specification(base | given)
