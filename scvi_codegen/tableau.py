@@ -128,6 +128,7 @@ def is_zero(value: Number) -> bool:
     return bool(abs(value) < CONDITION_TOLERANCE)
 
 
+@lru_cache(maxsize=256)
 def simplifying_conditions(tableau: Tableau) -> tuple[int, int, int]:
     """Return the largest p, q, r (at most 2 s) with B(p), C(q), D(r).
 
@@ -319,6 +320,12 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
             raise MethodError(
                 f"abscissa {index} is {mp.nstr(right, 8)}, not above the one before it; sort them, each once"
             )
+    return tableau_on(c, name)
+
+
+@lru_cache(maxsize=256)
+def tableau_on(c: Vector, name: str) -> Tableau:
+    """Return the same for numbers known to ascend."""
     *A, b = cardinal_integrals(c, (*c, mp.one), 0)
     return Tableau(name=name, A=tuple(A), b=b, c=c)
 
