@@ -69,24 +69,26 @@ Column: TypeAlias = Polynomial | Expr
 """A function phi_c: a polynomial, or any expression in q, p, t and parameters."""
 
 
-def conserved(system: MechanicalSystem, motion: Motion, columns: Sequence[Column]) -> list[dict[int, Expr]]:
+def conserved(
+    system: MechanicalSystem, motion: Motion, columns: Sequence[Column], *, fractions: bool = False
+) -> list[dict[int, Expr]]:
     """A basis of the conserved combinations of ``columns``: the coefficient of each column that occurs, by its index.
 
-    Columns that come first occur in as few of them as possible. A combination with a coefficient that is not recognised
-    is left out.
+    Columns that come first occur in as few of them as possible. Coefficients have denominators if ``fractions`` are
+    allowed and make them shorter. A combination with a coefficient that is not recognised is left out.
     """
     search = _Search(motion, columns)
     (rows,) = search.null_spaces(range(len(columns)), 1)
     if rows is None or not len(rows):
         return []
-    support = [int(c) for c in np.flatnonzero(np.abs(rows).max(axis=0))]
+    support = [int(c) for c in np.flatnonzero(rows.any(axis=0))]
     factors = _factors(system, motion)
     found = search.null_spaces(support, len(factors) + MORE_PARAMETERS if factors else 1)
     spaces = [space for space in found if space is not None and space.shape == (len(rows), len(support))]
     if len(spaces) < len(found):
         return []
     known = [(factor, search.values_of(factor)) for factor in factors]
-    recognised = [_recognised_row(np.array(spaces)[:, k], support, known) for k in range(len(rows))]
+    recognised = [_recognised_row(np.array(spaces)[:, k], support, known, fractions) for k in range(len(rows))]
     return [
         {c: coefficient.xreplace(motion.numbers) for c, coefficient in row.items()}
         for row in recognised
@@ -176,13 +178,15 @@ def _null_space(matrix: Array, sizes: Array) -> Array:
     widths = np.sqrt(((sizes / heights) ** 2).mean(axis=0))
     widths = np.maximum(widths, ROUNDING * (widths.max() or 1.0))
     _, singular, directions = np.linalg.svd(matrix / heights / widths, full_matrices=False)
-    return _reduced(directions[singular <= NULL * math.sqrt(len(matrix))] / widths)
+    rows, pivots = _reduced(directions[singular <= NULL * math.sqrt(len(matrix))])
+    return rows * widths[pivots, None] / widths
 
 
-def _reduced(rows: Array) -> Array:
-    rows = rows / np.abs(rows).max(axis=1, keepdims=True) if len(rows) else rows
-    done = 0
+def _reduced(rows: Array) -> tuple[Array, list[int]]:
+    """Reduced row echelon form of orthonormal rows, and the columns of its leading ones."""
+    pivots: list[int] = []
     for c in range(rows.shape[1]):
+        done = len(pivots)
         if done == len(rows):
             break
         best = done + int(np.abs(rows[done:, c]).argmax())
@@ -191,11 +195,10 @@ def _reduced(rows: Array) -> Array:
             continue
         rows[[done, best]] = rows[[best, done]]
         rows[done] /= rows[done, c]
-        for other in range(len(rows)):
-            if other != done:
-                rows[other] -= rows[other, c] * rows[done]
-        done += 1
-    return np.where(np.abs(rows) > ZERO, rows, 0.0)
+        others = np.arange(len(rows)) != done
+        rows[others] -= rows[others, c, None] * rows[done]
+        pivots.append(c)
+    return np.where(np.abs(rows) > ZERO, rows, 0.0), pivots
 
 
 def _factors(system: MechanicalSystem, motion: Motion) -> list[Expr]:
@@ -214,21 +217,24 @@ def _factors(system: MechanicalSystem, motion: Motion) -> list[Expr]:
 
 
 def _recognised_row(
-    entries: Array, support: Sequence[int], factors: Sequence[tuple[Expr, Array]]
+    entries: Array, support: Sequence[int], factors: Sequence[tuple[Expr, Array]], fractions: bool
 ) -> dict[int, Expr] | None:
-    """Coefficients by column, as few factors in them as possible; ``entries`` are (values of the parameters, columns)."""
+    """Coefficients by column; ``entries`` are (values of the parameters, columns)."""
     powers: dict[int, dict[Expr, Fraction]] = {}
     numbers: dict[int, Expr] = {}
     for k, c in enumerate(support):
-        if np.abs(entries[:, k]).max() <= ZERO:
+        if not entries[:, k].any():
             continue
         found = _recognised(entries[:, k], factors)
         if found is None:
             return None
         numbers[c], powers[c] = found
-    usual = {factor: sorted(own[factor] for own in powers.values())[(len(powers) - 1) // 2] for factor, _ in factors}
+    shifts = {}
+    for factor, _ in factors:
+        own = sorted(power[factor] for power in powers.values())
+        shifts[factor] = own[(len(own) - 1) // 2] if fractions else min(0, own[0])
     return {
-        c: sympy.Mul(number, *(factor ** sympy.Rational(powers[c][factor] - power) for factor, power in usual.items()))
+        c: sympy.Mul(number, *(factor ** sympy.Rational(powers[c][factor] - shift) for factor, shift in shifts.items()))
         for c, number in numbers.items()
     }
 
@@ -237,7 +243,7 @@ def _recognised(
     entries: Array, factors: Sequence[tuple[Expr, Array]]
 ) -> tuple[Expr, dict[Expr, Fraction]] | None:
     """The number and the powers of the factors whose product has these values."""
-    if np.abs(entries).min() <= ZERO:
+    if not entries.all():
         return None
     logs = [np.ones(len(entries)), *(np.log(np.abs(values)) for _, values in factors)]
     solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]

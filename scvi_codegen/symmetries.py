@@ -95,10 +95,7 @@ def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
     >>> print(*symmetries(kepler()))
     angular momentum = p_q2*q1 - p_q1*q2
     """
-    found = _found(system)
-    if _is_curved(system):
-        found = _independent(found)
-    return _distinct([_symmetry(system, terms) for terms in found])
+    return _distinct([_symmetry(system, terms) for terms in _found(system)])
 
 
 def check_symmetry(
@@ -197,15 +194,17 @@ def _curves(method: Method) -> tuple[int, int]:
 
 def _found(system: MechanicalSystem) -> list[Terms]:
     """The momentum maps as polynomials."""
-    motion = motion_of(system)
+    motion, curved = motion_of(system), _is_curved(system)
     if system.dimension <= MOST_COORDINATES:
-        columns = list(_columns(system.dimension, curved=_is_curved(system)))
+        columns = list(_columns(system.dimension, curved=curved))
     else:
         columns = list(_rigid_columns(system))
-        if not conserved(system, motion, columns):
-            return []
+        rows = conserved(system, motion, columns)
+        if not any(_is_shift(columns[min(row)]) for row in rows):
+            return [_combined(row, columns) for row in rows]
         columns += _boost_columns(system, columns)
-    return [_combined(row, columns) for row in conserved(system, motion, columns)]
+    found = [_combined(row, columns) for row in conserved(system, motion, columns, fractions=curved)]
+    return _independent(found) if curved else found
 
 
 def _is_curved(system: MechanicalSystem) -> bool:
@@ -250,9 +249,13 @@ def _rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
     yield {Monomial(1, ()): 1}
 
 
+def _is_shift(column: Mapping[Monomial, int]) -> bool:
+    return all(len(monomial.factors) == 1 for monomial in column)
+
+
 def _boost_columns(system: MechanicalSystem, rigid: Sequence[Mapping[Monomial, int]]) -> list[dict[Monomial, int]]:
     """The translations among the columns times t, positions to go with them, and t^2."""
-    shifts = [column for column in rigid if all(len(monomial.factors) == 1 for monomial in column)]
+    shifts = [column for column in rigid if _is_shift(column)]
     moving = [{Monomial(1, monomial.factors): x for monomial, x in column.items()} for column in shifts]
     positions = [{Monomial(k, (i,)): 1} for k in (0, 1) for i in range(system.dimension)]
     return [*moving, *positions, {Monomial(2, ()): 1}]
@@ -381,9 +384,9 @@ def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
     for plane in _planes(found):
         turn = _turn(m, found, plane)
         axis = f" {AXES[3 - sum(plane)]}" if len(found[0].columns) == 3 else ""
-        for sign in (1, -1):
-            if turning == {monomial: sign * x for monomial, x in turn.items()}:
-                return f"angular momentum{axis}", sign
+        first = turning.get(next(iter(turn)), sympy.S.Zero)
+        if turning == {monomial: first * x for monomial, x in turn.items()}:
+            return f"angular momentum{axis}", -1 if first.could_extract_minus_sign() else 1
     q = [coordinate.name for coordinate in system.coordinates]
     touched = sorted({i % m for a in turning for i in a.factors})
     what = "angular momentum" if all(a.factors[0] != a.factors[1] - m for a in turning) else "scaling"
