@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -142,22 +143,26 @@ class _Search:
         known: dict[Any, Any] = dict(self.drawn)
         return np.asarray(array_value(factor, known), dtype=float)
 
-    def verified(self, row: Mapping[int, Expr]) -> bool:
-        """Whether the combination is conserved to 40 digits wherever it was tried, at one point at least."""
-        tried = 0
+    @cached_property
+    def points(self) -> list[Sample]:
+        """Points in 60 digits, none if the system is defined nowhere."""
         for near in (False, True):
-            parameters = {given: mp.mpf(float(x[0])) for given, x in _drawn(self.motion.constants, 1, near=near).items()}
-            for sample in self.motion.points(parameters, VERIFIED_AT):
-                try:
-                    terms = [sample.value(x) * term for c, x in row.items() for term in self.terms(c, sample)]
-                except ArithmeticError:  # a root of a parameter that may be negative
-                    return False
-                if abs(mp.fsum(terms)) > NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))):
-                    return False
-                tried += 1
-            if tried:
-                return True
-        return False
+            drawn = _drawn(self.motion.constants, 1, near=near)
+            found = list(self.motion.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, VERIFIED_AT))
+            if found:
+                return found
+        return []
+
+    def verified(self, row: Mapping[int, Expr]) -> bool:
+        """Whether the combination is conserved to 40 digits at all these points."""
+        for sample in self.points:
+            try:
+                terms = [sample.value(x) * term for c, x in row.items() for term in self.terms(c, sample)]
+            except ArithmeticError:  # a root of a parameter that may be negative
+                return False
+            if abs(mp.fsum(terms)) > NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))):
+                return False
+        return bool(self.points)
 
 
 def _drawn(constants: Mapping[Symbol, float], count: int, *, near: bool) -> dict[Symbol, Array]:

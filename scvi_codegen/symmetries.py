@@ -45,7 +45,7 @@ from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.sampling import momentum_symbols, motion_of
 from scvi_codegen.spaces import Polynomials
 
-__all__ = ["Symmetry", "check_symmetry", "is_exact", "symmetries"]
+__all__ = ["Symmetry", "all_symmetries", "check_symmetry", "is_exact", "symmetries"]
 
 Terms: TypeAlias = Mapping[Monomial, Expr]
 
@@ -96,6 +96,24 @@ def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
     angular momentum = p_q2*q1 - p_q1*q2
     """
     return _distinct([_symmetry(system, terms) for terms in _found(system)])
+
+
+def all_symmetries(system: MechanicalSystem, given: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
+    """Those that are found and those that are ``given``.
+
+    Raises:
+        SystemDefinitionError: if one given is of another system, or has the name of another one.
+    """
+    found = (*symmetries(system), *given)
+    own = (system.coordinates, momentum_symbols(system))
+    for symmetry in given:
+        if (symmetry.coordinates, symmetry.momenta) != own:
+            raise SystemDefinitionError(f"'{symmetry.name}' is no symmetry of '{system.name}': check it with check_symmetry")
+    names = [symmetry.name for symmetry in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise SystemDefinitionError(f"two symmetries are called '{name}': give yours a name of its own")
+    return found
 
 
 def check_symmetry(

@@ -52,6 +52,17 @@ class Trajectory:
         energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
         return energies
 
+    def momentum_maps(self) -> Array:
+        """(n, k) values of what symmetries conserve, in the order of ``stepper.momentum_map_names``."""
+        return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
+
+    def momentum_errors(self) -> Array:
+        """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
+        scales = sizes.max(axis=0)
+        errors: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+        return errors
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz`` (arrays t, q, p, iterations, h, parameters, names) or ``.csv``, atomically.
 

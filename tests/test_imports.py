@@ -17,7 +17,7 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source ordering
+    errors precision program source ordering bodies
     derivatives expression_text nodes arguments
     symbols regularity quadrature
     mechanical_system translation
@@ -32,6 +32,9 @@ FLOORS = """
     methods.collocation methods.composition
     methods.shooting
     methods
+    sampling
+    invariants
+    symmetries
     equations lowering c_printer
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
