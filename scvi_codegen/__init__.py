@@ -70,7 +70,7 @@ _HOMES = {
     "binding": ("SolverOptions",),
     "run": ("Run",),
     "stepper": ("Stepper",),
-    "symmetries": ("Symmetry", "check_symmetry", "symmetries"),
+    "symmetry": ("Symmetry", "check_symmetry", "symmetries"),
     "system": ("LagrangianSystem",),
     "trajectory": ("Trajectory",),
 }

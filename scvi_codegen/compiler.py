@@ -28,7 +28,7 @@ from scvi_codegen.solvers.choice import check_solver, sweep_of
 from scvi_codegen.solvers.splitting import splitting_of
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
-from scvi_codegen.symmetries import Symmetry, all_symmetries
+from scvi_codegen.symmetry import Symmetry, all_symmetries
 from scvi_codegen.text_cache import Texts, remembered_texts
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
@@ -64,7 +64,7 @@ def compile_stepper(
             where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
-        symmetries: known beside those that are found (:func:`~scvi_codegen.symmetries.check_symmetry`): their momentum
+        symmetries: known beside those that are found (:func:`~scvi_codegen.symmetry.check_symmetry`): their momentum
             maps are tracked, too.
 
     Raises:

@@ -184,7 +184,8 @@ def _null_space(matrix: Array, sizes: Array) -> Array:
     widths = np.maximum(widths, ROUNDING * (widths.max() or 1.0))
     _, singular, directions = np.linalg.svd(matrix / heights / widths, full_matrices=False)
     rows, pivots = _reduced(directions[singular <= NULL * math.sqrt(len(matrix))])
-    return rows * widths[pivots, None] / widths
+    unscaled: Array = rows * widths[pivots, None] / widths
+    return unscaled
 
 
 def _reduced(rows: Array) -> tuple[Array, list[int]]:
@@ -234,19 +235,17 @@ def _recognised_row(
         if found is None:
             return None
         numbers[c], powers[c] = found
-    shifts = {}
+    shifts: dict[Expr, Fraction] = {}
     for factor, _ in factors:
         own = sorted(power[factor] for power in powers.values())
-        shifts[factor] = own[(len(own) - 1) // 2] if fractions else min(0, own[0])
+        shifts[factor] = own[(len(own) - 1) // 2] if fractions else min(Fraction(0), own[0])
     return {
         c: sympy.Mul(number, *(factor ** sympy.Rational(powers[c][factor] - shift) for factor, shift in shifts.items()))
         for c, number in numbers.items()
     }
 
 
-def _recognised(
-    entries: Array, factors: Sequence[tuple[Expr, Array]]
-) -> tuple[Expr, dict[Expr, Fraction]] | None:
+def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[Expr, dict[Expr, Fraction]] | None:
     """The number and the powers of the factors whose product has these values."""
     if not entries.all():
         return None

@@ -23,6 +23,7 @@ import sympy
 from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.exactness import is_exact
 from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import auxiliary_multipliers, curve_rates, legendre_map, multipliers
@@ -45,7 +46,7 @@ from scvi_codegen.program import (
     Sweep,
 )
 from scvi_codegen.stage_system import Gather, PointFamily, StageSystem
-from scvi_codegen.symmetries import Symmetry, is_exact
+from scvi_codegen.symmetry import Symmetry
 
 __all__ = ["lower", "lower_kernel", "lower_matrix", "lower_vector"]
 
@@ -339,7 +340,7 @@ def lower(
         energy=lower_kernel(energy, arguments=state, values=(system.formula,), **common),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(
-            MomentumMap(name=_comment(each.name), formula=_comment(str(each.momentum_map)), exact=is_exact(each, method))
+            MomentumMap(name=_comment(each.name), formula=_comment(each.formula), exact=is_exact(each, method))
             for each in symmetries
         ),
         momentum_kernel=_momentum_kernel(symmetries, common),

@@ -160,7 +160,7 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def array_value(expression: Any, known: dict[Any, Any]) -> Any:
-    """Value of an expression at many points at once, NaN where it has none; ``known`` has its symbols, gets its parts."""
+    """Value of an expression at many points, NaN where it has none; ``known`` has its symbols and gets its parts."""
     if expression not in known:
         known[expression] = _array_node(expression, known)
     return known[expression]

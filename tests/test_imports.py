@@ -24,6 +24,11 @@ FLOORS = """
     system
     hamiltonian
     basis mechanics stage_system
+    sampling
+    invariants
+    symmetry_ansatz
+    symmetry_names
+    symmetry
     spaces
     auxiliaries
     tableau
@@ -32,9 +37,7 @@ FLOORS = """
     methods.collocation methods.composition
     methods.shooting
     methods
-    sampling
-    invariants
-    symmetries
+    exactness
     equations lowering c_printer
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables

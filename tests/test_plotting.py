@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scvi_codegen.bodies import bodies
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.methods import SVI, StoermerVerlet
