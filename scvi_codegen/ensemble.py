@@ -90,6 +90,27 @@ class EnsembleTrajectory:
                 continue
         return energies
 
+    def momentum_maps(self) -> Array:
+        """(n, k, c) values of what symmetries conserve, named ``stepper.momentum_map_names``; NaN as above."""
+        return self._momentum_maps()[0]
+
+    def momentum_errors(self) -> Array:
+        """(n, k, c) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        values, sizes = self._momentum_maps()
+        with np.errstate(invalid="ignore"):
+            scales = np.fmax.reduce(sizes, axis=0)
+        errors: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+        return errors
+
+    def _momentum_maps(self) -> tuple[Array, Array]:
+        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
+        for j in range(len(self)):
+            good = self._reached(j)
+            values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
+                self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+            )
+        return values, sizes
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.
 

@@ -515,7 +515,7 @@ def _text_lines(derived: StepEquations) -> Iterator[str]:
 
 
 def _exactness(derived: StepEquations, symmetry: Symmetry) -> str:
-    return "" if is_exact(symmetry, derived.method) else "  (by the motion, not exactly by this method)"
+    return "" if is_exact(symmetry, derived.method) else "  (not guaranteed by this method)"
 
 
 def _latex(derived: StepEquations) -> str:

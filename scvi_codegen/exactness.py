@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from scvi_codegen.methods.collocation import RungeKutta
-from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.spaces import Polynomials
@@ -17,14 +18,17 @@ def is_exact(symmetry: Symmetry, method: Method) -> bool:
 
     A variational method of degree s does if the symmetry maps its curves to each other (A constant, b of degree s in
     t) and its quadrature is exact for df/dt along them (of degree d s + k - 1 for terms t^k q^d of f): then L_d changes
-    by what f does from end to end. Runge-Kutta methods in phase space conserve what is linear in (t, q, p), symplectic
-    ones what is quadratic. Of other methods nothing is claimed.
+    by what f does from end to end. Stoermer-Verlet does if, in addition, f is linear in q. Runge-Kutta methods in phase
+    space conserve what is linear in (t, q, p), symplectic ones what is quadratic. Of others nothing is claimed: a map
+    may be conserved nevertheless.
     """
     terms = symmetry.monomials()
     if terms is None:
         return False
     if max(sum(powers) for powers in terms) <= _conserved_degree(method):
         return True
+    if isinstance(method, StoermerVerlet | Composition) and any(d == 2 and e == 0 for _, d, e in terms):
+        return False
     degree, order = _curves(method)
     return all(_is_kept(k, d, e, degree, order) for k, d, e in terms)
 

@@ -512,7 +512,7 @@ class Splitting:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MomentumMap:
-    """What a symmetry conserves: its name, with its formula for people, and whether the method conserves it exactly."""
+    """What a symmetry conserves, by name and formula; ``exact`` if the method is known to conserve it, too."""
 
     name: str
     formula: str

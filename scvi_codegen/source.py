@@ -34,7 +34,7 @@ class Interface:
         workspace: doubles of workspace per call.
         has_action: whether the method has a discrete Lagrangian.
         map_names, map_formulas: of the momentum maps, what symmetries conserve.
-        map_exact: whether the method conserves them exactly.
+        map_exact: whether the method is known to conserve them exactly, to round-off.
     """
 
     prefix: str

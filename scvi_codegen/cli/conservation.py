@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.ensemble import EnsembleTrajectory
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.trajectory import Trajectory
 
@@ -36,12 +37,13 @@ def _drift(t: Array, error: Array) -> float:
     return float(centred @ error / (centred @ centred))
 
 
-def momentum_report(trajectory: Trajectory) -> Iterator[str]:
+def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
     """A line a momentum map: its largest change, relative to the largest size of its terms."""
-    described = trajectory.stepper.interface
-    errors = np.abs(trajectory.momentum_errors()).max(axis=0)
+    described = result.stepper.interface
+    errors = np.abs(result.momentum_errors()).reshape(-1, len(described.map_names))
+    errors = np.fmax.reduce(errors, axis=0, initial=0.0)
     for name, exact, error in list(zip(described.map_names, described.map_exact, errors, strict=True))[:MOST_SHOWN]:
-        note = "" if exact else " (this method does not conserve it exactly)"
+        note = "" if exact else " (not guaranteed by this method)"
         yield f"relative error of {name}: {error:.2e} at most{note}"
     if len(errors) > MOST_SHOWN:
         yield f"and {len(errors) - MOST_SHOWN} conserved quantities more, {errors[MOST_SHOWN:].max():.2e} at most"
