@@ -41,6 +41,7 @@ class Stepper:
         coordinates, parameters: names in order.
         defaults: (k,) default parameter values.
         dimension: degrees of freedom m.
+        momentum_map_names: what symmetries conserve.
         source: the C text it was compiled from.
         ensemble: the C text for many trajectories at once, compiled when first used; ``None`` if the method has none.
     """

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.ensemble import EnsembleTrajectory
+from scvi_codegen.errors import StateError
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.trajectory import Trajectory
 
@@ -40,7 +41,11 @@ def _drift(t: Array, error: Array) -> float:
 def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
     """A line a momentum map: its largest change, relative to the largest size of its terms."""
     described = result.stepper.interface
-    errors = np.abs(result.momentum_errors()).reshape(-1, len(described.map_names))
+    try:
+        errors = np.abs(result.momentum_errors()).reshape(-1, len(described.map_names))
+    except StateError as error:
+        yield str(error)
+        return
     errors = np.fmax.reduce(errors, axis=0, initial=0.0)
     for name, exact, error in list(zip(described.map_names, described.map_exact, errors, strict=True))[:MOST_SHOWN]:
         note = "" if exact else " (not guaranteed by this method)"
