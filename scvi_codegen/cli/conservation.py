@@ -42,13 +42,13 @@ def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
     """A line a momentum map: its largest change, relative to the largest size of its terms."""
     described = result.stepper.interface
     try:
-        errors = np.abs(result.momentum_errors()).reshape(-1, len(described.map_names))
-    except StateError as error:
-        yield str(error)
+        changes = np.abs(result.momentum_errors())
+    except StateError as failure:
+        yield str(failure)
         return
-    errors = np.fmax.reduce(errors, axis=0, initial=0.0)
-    for name, exact, error in list(zip(described.map_names, described.map_exact, errors, strict=True))[:MOST_SHOWN]:
+    largest = np.fmax.reduce(changes, axis=tuple(range(changes.ndim - 1)))
+    for name, exact, error in list(zip(described.map_names, described.map_exact, largest, strict=True))[:MOST_SHOWN]:
         note = "" if exact else " (not guaranteed by this method)"
         yield f"relative error of {name}: {error:.2e} at most{note}"
-    if len(errors) > MOST_SHOWN:
-        yield f"and {len(errors) - MOST_SHOWN} conserved quantities more, {errors[MOST_SHOWN:].max():.2e} at most"
+    if len(largest) > MOST_SHOWN:
+        yield f"and {len(largest) - MOST_SHOWN} conserved quantities more, {largest[MOST_SHOWN:].max():.2e} at most"
