@@ -71,6 +71,13 @@ int kepler_scvi_2_energy(double t, const double *q, const double *p, const doubl
 int kepler_scvi_2_energies(long long count, const double *t, const double *q, const double *p, const double *parameters,
     double *energy, double *workspace);
 
+/* What symmetries of the system conserve, to round-off if nothing else is said, at count states, map and size
+ * (count, 1), in this order:
+ *   angular momentum = q1*p_q2 - q2*p_q1
+ * size: root of the sum of the squares of the terms, beside which rounding is to be judged; may be NULL. */
+int kepler_scvi_2_momentum_maps(long long count, const double *t, const double *q, const double *p,
+    const double *parameters, double *map, double *size);
+
 /* One step from (q0, p0) at t to (q1, p1) at t + h; depends on nothing but its arguments. h < 0 goes back. */
 int kepler_scvi_2_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const kepler_scvi_2_options *options, double *q1, double *p1, kepler_scvi_2_report *report, double *workspace);

@@ -160,6 +160,13 @@ static void lagrangian(const double *u, const double *parameters, double *value)
   value[0] = 0.5*(u[2]*u[2] + u[3]*u[3] + 2.0*parameters[0]*inverse_root_1(u[0]*u[0] + u[1]*u[1]));
 }
 
+/* What is conserved at u = (q, p), then the sums of the squares of the terms. Operations: 8 *, 1 +, 1 -. */
+static void momentum_maps(const double *u, double *value)
+{
+  value[0] = u[3]*u[0] - u[2]*u[1];
+  value[1] = u[2]*u[2]*(u[1]*u[1]) + u[3]*u[3]*(u[0]*u[0]);
+}
+
 /* Place of each coordinate in the order in which those that meet stand near each other. */
 static const int PLACE[M] = {
   0, 1
@@ -384,6 +391,28 @@ int kepler_svi_4_energies(long long count, const double *t, const double *q, con
     const int status = kepler_svi_4_energy(t[k], q + k * M, p + k * M, parameters, energy + k, workspace);
     if (status != KEPLER_SVI_4_OK)
       return status;
+  }
+  return KEPLER_SVI_4_OK;
+}
+
+int kepler_svi_4_momentum_maps(long long count, const double *t, const double *q, const double *p,
+    const double *parameters, double *map, double *size)
+{
+  enum { MAPS = 1 };
+  (void)t;
+  (void)parameters;
+  for (long long k = 0; k < count; k++) {
+    double u[2 * M], value[2 * MAPS];
+    memcpy(u, q + k * M, sizeof(double) * M);
+    memcpy(u + M, p + k * M, sizeof(double) * M);
+    momentum_maps(u, value);
+    if (!all_finite(value, MAPS))
+      return KEPLER_SVI_4_NOT_FINITE;
+    for (int j = 0; j < MAPS; j++) {
+      map[k * MAPS + j] = value[j];
+      if (size)
+        size[k * MAPS + j] = sqrt(value[MAPS + j]);
+    }
   }
   return KEPLER_SVI_4_OK;
 }

@@ -73,6 +73,7 @@ _HOMES = {
     "binding": ("SolverOptions",),
     "run": ("Run",),
     "stepper": ("Stepper",),
+    "symmetry": ("Symmetry", "check_symmetry", "symmetries"),
     "system": ("LagrangianSystem",),
     "trajectory": ("Trajectory",),
 }

@@ -15,6 +15,7 @@ kept in the user's cache folder (:mod:`scvi_codegen.text_cache`), so the second 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.lowering import lower
@@ -27,6 +28,7 @@ from scvi_codegen.solvers.choice import check_solver, sweep_of
 from scvi_codegen.solvers.splitting import splitting_of
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
+from scvi_codegen.symmetry import Symmetry, all_symmetries
 from scvi_codegen.text_cache import Texts, remembered_texts
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
@@ -48,6 +50,7 @@ def compile_stepper(
     solver: str = "auto",
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -61,6 +64,8 @@ def compile_stepper(
             where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
+        symmetries: known beside those that are found (:func:`~scvi_codegen.symmetry.check_symmetry`): their momentum
+            maps are tracked, too.
 
     Raises:
         BuildError: if there is no C compiler.
@@ -68,29 +73,37 @@ def compile_stepper(
     """
 
     def make() -> Texts:
-        program = _program(system, method, solver=solver, prefix=prefix)
+        program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
         return render(program), describe(program, system, method), render_ensemble(program)
 
-    source, interface, ensemble = remembered_texts(system, method, solver, prefix, make)
+    source, interface, ensemble = remembered_texts(system, method, (solver, prefix, *map(repr, symmetries)), make)
     return Stepper(source, interface, ensemble=ensemble, flags=flags)
 
 
 def generate_source(
-    system: MechanicalSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
-    program = _program(system, method, solver=solver, prefix=prefix)
+    program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
     return render(program), describe(program, system, method)
 
 
-def _program(system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
+def _program(
+    system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None, symmetries: Sequence[Symmetry]
+) -> Program:
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = solver in ("auto", "fixed-point") and splitting is None
     sweep = sweep_of(system, method) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))
-    return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton)
+    tracked = all_symmetries(system, symmetries)
+    return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton, symmetries=tracked)
 
 
 def describe(program: Program, system: MechanicalSystem, method: Method) -> Interface:
@@ -107,6 +120,9 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         unknowns=program.unknowns,
         workspace=workspace_size(program),
         has_action=program.action,
+        map_names=tuple(each.name for each in program.momentum_maps),
+        map_formulas=tuple(each.formula for each in program.momentum_maps),
+        map_exact=tuple(each.exact for each in program.momentum_maps),
     )
 
 

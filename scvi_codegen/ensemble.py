@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen import building
 from scvi_codegen.arguments import checked_count, checked_number, checked_step
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.trajectory import write_atomically
+from scvi_codegen.trajectory import relative_changes, write_atomically
 
 if TYPE_CHECKING:
     from scvi_codegen.binding import SolverOptions
@@ -89,6 +89,26 @@ class EnsembleTrajectory:
             except StateError:
                 continue
         return energies
+
+    def momentum_maps(self) -> Array:
+        """(n, k, c) values of what symmetries conserve, named ``stepper.momentum_map_names``; NaN as above."""
+        return self._momentum_maps()[0]
+
+    def momentum_errors(self) -> Array:
+        """(n, k, c) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        return relative_changes(*self._momentum_maps())
+
+    def _momentum_maps(self) -> tuple[Array, Array]:
+        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
+        for j in range(len(self)):
+            good = self._reached(j)
+            try:
+                values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
+                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                )
+            except StateError:
+                continue
+        return values, sizes
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.

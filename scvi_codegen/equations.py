@@ -23,6 +23,7 @@ from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.basis import differentiation_matrix
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import MethodError
+from scvi_codegen.exactness import is_exact
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import accelerations, euler_lagrange, force, momentum
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
@@ -31,6 +32,7 @@ from scvi_codegen.nodes import exact_points
 from scvi_codegen.precision import DIGITS, Number, mp
 from scvi_codegen.quadrature import exact_rule
 from scvi_codegen.stage_system import Block, PointFamily, StageSystem, Table
+from scvi_codegen.symmetry import Symmetry, symmetries
 from scvi_codegen.tableau import exact_tableau
 
 __all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive"]
@@ -109,6 +111,11 @@ class StepEquations:
     def idel_equations(self) -> tuple[Equation, ...]:
         """The implicit discrete Euler-Lagrange equations (5): those with p_k, then those for p_{k+1}."""
         return (*(equation for equation in self.equations if equation.kind == "IDEL"), *self.end_momentum)
+
+    @property
+    def symmetries(self) -> tuple[Symmetry, ...]:
+        """Those of the system, with what they conserve."""
+        return symmetries(self.system)
 
     @property
     def jacobian(self) -> sympy.ImmutableSparseMatrix:
@@ -502,6 +509,13 @@ def _text_lines(derived: StepEquations) -> Iterator[str]:
     if derived.entries:
         yield "\ntable entries"
         yield from (f"  {entry}" for entry in derived.entries)
+    if derived.symmetries:
+        yield "\nconserved (momentum maps of symmetries)"
+        yield from (f"  {symmetry}{_exactness(derived, symmetry)}" for symmetry in derived.symmetries)
+
+
+def _exactness(derived: StepEquations, symmetry: Symmetry) -> str:
+    return "" if is_exact(symmetry, derived.method) else "  (not guaranteed by this method)"
 
 
 def _latex(derived: StepEquations) -> str:
@@ -521,8 +535,16 @@ def _latex(derived: StepEquations) -> str:
         + mp.nstr(entry.value, 17)
         for entry in derived.entries
     ]
-    blocks = [lines, tables] if tables else [lines]
+    maps = [
+        rf"J &= {sympy.latex(s.momentum_map, symbol_names=_names_of_maps(s))} \tag{{{s.name}}}"
+        for s in derived.symmetries
+    ]
+    blocks = [block for block in (lines, tables, maps) if block]
     return "\n".join("\\begin{align*}\n" + " \\\\\n".join(block) + "\n\\end{align*}" for block in blocks)
+
+
+def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:
+    return {symbol: _latex_name(symbol.name) for symbol in symmetry.momentum_map.free_symbols}
 
 
 def _tag(number: str) -> str:

@@ -23,6 +23,7 @@ import sympy
 from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.exactness import is_exact
 from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import auxiliary_multipliers, curve_rates, legendre_map, multipliers
@@ -36,6 +37,7 @@ from scvi_codegen.program import (
     GatherLoop,
     Kernel,
     Load,
+    MomentumMap,
     Operation,
     Program,
     ScatterLoop,
@@ -44,6 +46,7 @@ from scvi_codegen.program import (
     Sweep,
 )
 from scvi_codegen.stage_system import Gather, PointFamily, StageSystem
+from scvi_codegen.symmetry import Symmetry
 
 __all__ = ["lower", "lower_kernel", "lower_matrix", "lower_vector"]
 
@@ -293,6 +296,7 @@ def lower(
     sweep: Sweep | None = None,
     splitting: Splitting | None = None,
     newton: bool = True,
+    symmetries: Sequence[Symmetry] = (),
 ) -> Program:
     """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
@@ -302,10 +306,11 @@ def lower(
         sweep: the fixed-point iteration to try first (:func:`scvi_codegen.solvers.choice.sweep_of`).
         splitting: the explicit solver that replaces both (:func:`scvi_codegen.solvers.splitting.splitting_of`).
         newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
+        symmetries: whose momentum maps are emitted.
     """
     check_regular(method, system)
     stages = with_auxiliaries(system, method.stage_system(system))
-    common = {"time": system.time, "parameters": system.parameters}
+    common: dict[str, Any] = {"time": system.time, "parameters": system.parameters}
     state, transformed = legendre_map(system)
     mass = jacobian(transformed, state[system.dimension :])
     legendre = lower_kernel("legendre", arguments=state, values=transformed, slopes=tuple(mass.values()), **common)
@@ -334,10 +339,25 @@ def lower(
         mass_entries=tuple(mass),
         energy=lower_kernel(energy, arguments=state, values=(system.formula,), **common),
         hamiltonian=bool(system.auxiliaries),
+        momentum_maps=tuple(
+            MomentumMap(name=_comment(each.name), formula=_comment(each.formula), exact=is_exact(each, method))
+            for each in symmetries
+        ),
+        momentum_kernel=_momentum_kernel(symmetries, common),
         sweep=sweep,
         splitting=splitting,
         newton=newton,
     )
+
+
+def _momentum_kernel(symmetries: Sequence[Symmetry], common: dict[str, Any]) -> Kernel | None:
+    """Momentum maps, then the sums of the squares of their terms."""
+    if not symmetries:
+        return None
+    maps = [symmetry.momentum_map for symmetry in symmetries]
+    squares = [sympy.Add(*(term**2 for term in sympy.Add.make_args(J))) for J in maps]
+    arguments = (*symmetries[0].coordinates, *symmetries[0].momenta)
+    return lower_kernel("momentum_maps", arguments=arguments, values=(*maps, *squares), **common)
 
 
 def _is_regular(system: MechanicalSystem) -> bool:

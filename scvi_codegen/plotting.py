@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.bodies import AXES, Body, bodies
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.trajectory import Trajectory, write_atomically
 
@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Body", "bodies", "check_plot_path", "draw_trajectory", "plot_trajectory"]
+__all__ = ["check_plot_path", "draw_trajectory", "plot_trajectory"]
 
 Array = NDArray[np.float64]
 
-AXES = "xyz"
 SUFFIXES = (".png", ".svg")
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
 MOST_POINTS = 20_000
@@ -43,41 +42,6 @@ STYLE = {
     "svg.fonttype": "none",
     "figure.dpi": 100,
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Body:
-    """Coordinates that are the Cartesian position of one body.
-
-    Attributes:
-        name: ``"jupiter"`` for jupiter_x, jupiter_y, jupiter_z; empty for plain x, y, z.
-        columns: their indices among all coordinates, x first; two or three.
-    """
-
-    name: str
-    columns: tuple[int, ...]
-
-
-def bodies(coordinates: Sequence[str]) -> tuple[Body, ...]:
-    """Group names such as jupiter_x, jupiter_y, jupiter_z, or x, y, into bodies.
-
-    Returns:
-        The bodies, all in the plane or all in space, or none if a coordinate belongs to no body.
-
-    >>> [body.name for body in bodies(["sun_x", "sun_y", "moon_x", "moon_y"])]
-    ['sun', 'moon']
-    >>> bodies(["theta", "x", "y"])
-    ()
-    """
-    groups: dict[str, dict[str, int]] = {}
-    for index, name in enumerate(coordinates):
-        stem, axis = (name[:-2], name[-1]) if name[-2:-1] == "_" else ("", name)
-        groups.setdefault(stem, {})[axis] = index
-    shapes = {"".join(sorted(group)) for group in groups.values()}
-    if shapes not in ({"xy"}, {"xyz"}) or sum(map(len, groups.values())) != len(coordinates):
-        return ()
-    shape = shapes.pop()
-    return tuple(Body(name=stem, columns=tuple(group[axis] for axis in shape)) for stem, group in groups.items())
 
 
 def check_plot_path(path: str | os.PathLike[str]) -> None:

@@ -24,6 +24,7 @@ __all__ = [
     "Kernel",
     "LaneTable",
     "Load",
+    "MomentumMap",
     "NodeTables",
     "Operation",
     "PointSweep",
@@ -545,6 +546,15 @@ class Splitting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MomentumMap:
+    """What a symmetry conserves, by name and formula; ``exact`` if the method is known to conserve it, too."""
+
+    name: str
+    formula: str
+    exact: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """All of an integrator but its syntax.
 
@@ -567,6 +577,8 @@ class Program:
         mass_entries: (i, j) of the slopes of ``legendre``.
         energy: L at (q, v), from which and ``legendre`` follows the energy; where a Hamiltonian is given, H at (q, p).
         hamiltonian: whether a Hamiltonian is given.
+        momentum_maps: what is conserved.
+        momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` without any.
         sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
@@ -592,6 +604,8 @@ class Program:
     mass_entries: tuple[tuple[int, int], ...]
     energy: Kernel
     hamiltonian: bool
+    momentum_maps: tuple[MomentumMap, ...]
+    momentum_kernel: Kernel | None
     sweep: Sweep | None
     splitting: Splitting | None
     newton: bool
@@ -611,7 +625,8 @@ class Program:
         """Every kernel, in the order of emission."""
         pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
         actions = {family.action.name: family.action for family in self.families if self.newton and family.action}
-        return (*pairs, self.legendre, *({self.energy.name: self.energy} | actions).values())
+        maps = (self.momentum_kernel,) if self.momentum_kernel else ()
+        return (*pairs, self.legendre, *({self.energy.name: self.energy} | actions).values(), *maps)
 
     @property
     def action(self) -> bool:

@@ -155,6 +155,7 @@ def _purposes(program: Program) -> dict[str, str]:
         "derivative_2_action": "d^2L/dt^2 at u = (q, v, a, j).",
         "derivative_3_action": "d^3L/dt^3 at u = (q, v, a, j, s).",
         "hamiltonian": "H at u = (q, p).",
+        "momentum_maps": "What is conserved at u = (q, p), then the sums of the squares of the terms.",
         "force_lanes": "L_q at all points.",
         "velocity_lanes": "H_p at all points, u = (q, p).",
         "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",

@@ -33,6 +33,8 @@ class Interface:
         unknowns: length of the run's memory of its last stages.
         workspace: doubles of workspace per call.
         has_action: whether the method has a discrete Lagrangian.
+        map_names, map_formulas: of the momentum maps, what symmetries conserve.
+        map_exact: whether the method is known to conserve them exactly, to round-off.
     """
 
     prefix: str
@@ -46,6 +48,9 @@ class Interface:
     unknowns: int
     workspace: int
     has_action: bool
+    map_names: tuple[str, ...] = ()
+    map_formulas: tuple[str, ...] = ()
+    map_exact: tuple[bool, ...] = ()
 
     @property
     def dimension(self) -> int:

@@ -41,6 +41,7 @@ class Stepper:
         coordinates, parameters: names in order.
         defaults: (k,) default parameter values.
         dimension: degrees of freedom m.
+        momentum_map_names: what symmetries conserve.
         source: the C text it was compiled from.
         ensemble: the C text for many trajectories at once, compiled when first used; ``None`` if the method has none.
     """
@@ -81,6 +82,11 @@ class Stepper:
     def defaults(self) -> Array:
         """(k,) default parameter values."""
         return np.array(self.interface.defaults, dtype=float)
+
+    @property
+    def momentum_map_names(self) -> tuple[str, ...]:
+        """What symmetries of the system conserve: ``"angular momentum"``, ``"boost of x"``."""
+        return self.interface.map_names
 
     @property
     def dimension(self) -> int:
@@ -248,22 +254,10 @@ class Stepper:
 
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Energy p.v - L: a float for (m,) states, (n,) for (n, m) states with one time or (n,) times."""
-        positions, momenta = np.asarray(q, dtype=float), np.asarray(p, dtype=float)
-        if positions.ndim == 1:
-            positions, momenta = self._vector(q, "q"), self._vector(p, "p")
-        elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != self.dimension:
-            raise StateError(
-                f"states must have shape (n, {self.dimension}), not q {positions.shape} and p {momenta.shape}"
-            )
-        count = positions.size // self.dimension
-        times = np.asarray(t, dtype=float)
-        if times.shape not in ((), (count,)):
-            raise StateError(f"there are {count} states, but the time has shape {times.shape}")
-        times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
-        positions, momenta = np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
-        result = np.empty(count)
+        times, positions, momenta = self._states(q, p, t)
+        result = np.empty(len(times))
         status = self.binding.function("energies")(
-            count,
+            len(times),
             self.binding.pointer(times),
             self.binding.pointer(positions),
             self.binding.pointer(momenta),
@@ -274,6 +268,39 @@ class Stepper:
         if status:
             raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
         return float(result[0]) if np.ndim(q) == 1 else result
+
+    def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """What symmetries conserve, k numbers in the order of ``momentum_map_names``.
+
+        Returns:
+            (k,) for (m,) states, (n, k) for (n, m) states with one time or (n,) times.
+
+        Raises:
+            StateError: on wrong shapes, names or numbers.
+        """
+        values = self.momentum_maps_and_sizes(q, p, t, parameters)[0]
+        return values[0] if np.ndim(q) == 1 else values
+
+    def momentum_maps_and_sizes(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """The same, (n, k), and the roots of the sums of the squares of their terms, beside which rounding is small."""
+        times, positions, momenta = self._states(q, p, t)
+        values, sizes = np.empty((2, len(times), len(self.momentum_map_names)))
+        if not values.size:
+            return values, sizes
+        status = self.binding.function("momentum_maps")(
+            len(times),
+            self.binding.pointer(times),
+            self.binding.pointer(positions),
+            self.binding.pointer(momenta),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(values),
+            self.binding.pointer(sizes),
+        )
+        if status:
+            raise StateError(f"the momentum maps of a state cannot be computed ({STATUS[status]})")
+        return values, sizes
 
     def discrete_lagrangian(
         self,
@@ -381,6 +408,22 @@ class Stepper:
             hint = "; does this Hamiltonian determine momenta by velocities? Give p" if name == "momentum" else ""
             raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]}{hint})")
         return result
+
+    def _states(self, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
+        """(n,) times and (n, m) positions and momenta, contiguous, of one state or many."""
+        positions, momenta = np.asarray(q, dtype=float), np.asarray(p, dtype=float)
+        if positions.ndim == 1:
+            positions, momenta = self._vector(q, "q"), self._vector(p, "p")
+        elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != self.dimension:
+            raise StateError(
+                f"states must have shape (n, {self.dimension}), not q {positions.shape} and p {momenta.shape}"
+            )
+        count = positions.size // self.dimension
+        times = np.asarray(t, dtype=float)
+        if times.shape not in ((), (count,)):
+            raise StateError(f"there are {count} states, but the time has shape {times.shape}")
+        times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
+        return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
 
     def _vector(self, value: ArrayLike, name: str) -> Array:
         """A finite, contiguous (m,) copy."""

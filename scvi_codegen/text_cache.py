@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
@@ -32,10 +32,10 @@ Texts: TypeAlias = tuple[Source, Interface, Source | None]
 
 
 def remembered_texts(
-    system: MechanicalSystem, method: Method, solver: str, prefix: str | None, make: Callable[[], Texts]
+    system: MechanicalSystem, method: Method, options: Sequence[object], make: Callable[[], Texts]
 ) -> Texts:
     """What ``make`` returns for these arguments, from the cache if it was made before."""
-    path = cache_folder() / "texts" / f"{_key(system, method, solver, prefix)}.json"
+    path = cache_folder() / "texts" / f"{_key(system, method, options)}.json"
     found = _read(path)
     if found is None:
         found = make()
@@ -43,7 +43,7 @@ def remembered_texts(
     return found
 
 
-def _key(system: MechanicalSystem, method: Method, solver: str, prefix: str | None) -> str:
+def _key(system: MechanicalSystem, method: Method, options: Sequence[object]) -> str:
     symbols = (*system.coordinates, *system.auxiliaries, *system.parameters, system.time)
     parts = [
         system.name,
@@ -51,8 +51,7 @@ def _key(system: MechanicalSystem, method: Method, solver: str, prefix: str | No
         " ".join(symbol.name for symbol in symbols),
         repr((len(system.coordinates), len(system.auxiliaries), system.defaults)),
         repr(method),
-        solver,
-        str(prefix),
+        repr(tuple(map(str, options))),
         _generator(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]

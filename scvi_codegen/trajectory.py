@@ -17,7 +17,7 @@ from scvi_codegen.errors import StateError
 if TYPE_CHECKING:
     from scvi_codegen.stepper import Stepper
 
-__all__ = ["Trajectory", "write_atomically"]
+__all__ = ["Trajectory", "relative_changes", "write_atomically"]
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,15 @@ class Trajectory:
         """(n,) energies p.v - L, constant along exact trajectories when L does not depend on time."""
         energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
         return energies
+
+    def momentum_maps(self) -> Array:
+        """(n, k) values of what symmetries conserve, in the order of ``stepper.momentum_map_names``."""
+        return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
+
+    def momentum_errors(self) -> Array:
+        """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
+        return relative_changes(values, sizes)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz`` (arrays t, q, p, iterations, h, parameters, names) or ``.csv``, atomically.
@@ -86,6 +95,14 @@ class Trajectory:
         table = np.column_stack([self.t, self.q, self.p, self.iterations])
         formats = ["%.17g"] * (1 + 2 * len(names)) + ["%d"]
         np.savetxt(file, table, delimiter=",", header=header, comments="", fmt=formats)
+
+
+def relative_changes(values: Array, sizes: Array) -> Array:
+    """Changes since the first along axis 0, relative to the largest size; NaN where sizes are beyond all numbers."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        scales = np.fmax.reduce(sizes, axis=0)
+        changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+    return np.where(np.isinf(scales), np.nan, changes)
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:

@@ -347,6 +347,7 @@ static int check_PREFIX(void)
   status |= PREFIX_advance(&run, steps, steps / kept, parameters, NULL, t, qs, ps, iterations, &report, workspace);
   status |= PREFIX_energies(kept, t, qs, ps, parameters, e, workspace);
   LEGENDRE
+  MAPS
   for (int i = 0; i < kept; i++)
     status |= !(e[i] == e[i]);
   status |= report.steps != steps;
@@ -357,11 +358,19 @@ static int check_PREFIX(void)
 LEGENDRE = """status |= PREFIX_discrete_legendre(0.1, 0.05, q, q1, parameters, NULL, p, p1, e, NULL, workspace);"""
 
 
+MAPS = """double maps[kept * COUNT], sizes[kept * COUNT];
+  status |= PREFIX_momentum_maps(kept, t, qs, ps, parameters, maps, sizes);
+  status |= PREFIX_momentum_maps(kept, t, qs, ps, parameters, maps, NULL);
+  for (int i = 0; i < kept * COUNT; i++)
+    status |= !(maps[i] == maps[i]) || !(sizes[i] >= 0.0);"""
+
+
 def driver(interfaces: Sequence[Interface]) -> str:
     """A C program that calls everything each integrator exports."""
     text = "#include <stdlib.h>\n" + "".join(f'#include "{i.prefix}.h"\n' for i in interfaces)
     for i in interfaces:
         body = DRIVER.replace("LEGENDRE", LEGENDRE if i.has_action else "")
+        body = body.replace("MAPS", MAPS.replace("COUNT", str(len(i.map_names))) if i.map_names else "")
         values = ", ".join(map(repr, i.defaults)) or "0.0"
         text += body.replace("PREFIX", i.prefix).replace("CAPITALS", i.prefix.upper()).replace("DEFAULTS", values)
     calls = " + ".join(f"check_{i.prefix}()" for i in interfaces)

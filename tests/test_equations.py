@@ -178,7 +178,7 @@ def test_displays():
     derived = derive(kepler(), SCVI(2))
     assert "lambda_1_q1" in derived.to_text()
     assert r"\tag{34d}" in derived._repr_latex_()
-    assert derived._repr_latex_().count(r"\begin{align*}") == 2
+    assert derived._repr_latex_().count(r"\begin{align*}") == 3  # equations, tables, momentum maps
     kinds = {e.kind for e in derived.stage_equations}
     assert kinds == {"stage", "multiplier"}
     assert [e.number for e in derived.idel_equations] == ["34d", "34d", "34e", "34e"]

@@ -17,13 +17,18 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source ordering
+    errors precision program source ordering bodies
     derivatives expression_text nodes arguments
     symbols regularity quadrature
     mechanical_system translation
     system
     hamiltonian
     basis mechanics stage_system
+    sampling
+    invariants
+    symmetry_ansatz
+    symmetry_names
+    symmetry
     spaces
     auxiliaries
     tableau
@@ -32,6 +37,7 @@ FLOORS = """
     methods.collocation methods.composition
     methods.shooting
     methods
+    exactness
     equations lowering c_printer
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scvi_codegen.bodies import bodies
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.model_file import Model
-from scvi_codegen.plotting import bodies, check_plot_path, draw_trajectory, plot_trajectory
+from scvi_codegen.plotting import check_plot_path, draw_trajectory, plot_trajectory
 from scvi_codegen.problems import problem
 from scvi_codegen.trajectory import Trajectory
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scvi_codegen.binding import SolverOptions
+from scvi_codegen.cli.conservation import momentum_report
 from scvi_codegen.cli.running import counted, duration, interruptions, progress_bar
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory
@@ -122,7 +123,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in _statuses(result)),
     ]
-    return "\n".join([*lines, *_failures(result), _energy_report(model, result)])
+    return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])
 
 
 def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:

@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from scvi_codegen.binding import SolverOptions
-from scvi_codegen.cli.conservation import energy_report, momentum_maps
+from scvi_codegen.cli.conservation import energy_report, momentum_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.model_file import Model
@@ -122,8 +122,7 @@ def _conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
         yield energy_report(model.system, trajectory)
     except StateError as error:
         yield f"energy: {error}"
-    for quantity in momentum_maps(model.system):
-        yield f"relative error of {quantity.name}: {quantity.error(trajectory):.2e} at most"
+    yield from momentum_report(trajectory)
 
 
 def _final_state(model: Model, run: Run) -> Iterator[str]:

@@ -1,0 +1,45 @@
+"""Which coordinates, by their names, are the Cartesian position of one body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+__all__ = ["AXES", "Body", "bodies"]
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Body:
+    """Coordinates that are the Cartesian position of one body.
+
+    Attributes:
+        name: ``"jupiter"`` for jupiter_x, jupiter_y, jupiter_z; empty for plain x, y, z.
+        columns: their indices among all coordinates, x first; two or three.
+    """
+
+    name: str
+    columns: tuple[int, ...]
+
+
+def bodies(coordinates: Sequence[str]) -> tuple[Body, ...]:
+    """Group names such as jupiter_x, jupiter_y, jupiter_z, or x, y, into bodies.
+
+    Returns:
+        The bodies, all in the plane or all in space, or none if a coordinate belongs to no body.
+
+    >>> [body.name for body in bodies(["sun_x", "sun_y", "moon_x", "moon_y"])]
+    ['sun', 'moon']
+    >>> bodies(["theta", "x", "y"])
+    ()
+    """
+    groups: dict[str, dict[str, int]] = {}
+    for index, name in enumerate(coordinates):
+        stem, axis = (name[:-2], name[-1]) if name[-2:-1] == "_" else ("", name)
+        groups.setdefault(stem, {})[axis] = index
+    shapes = {"".join(sorted(group)) for group in groups.values()}
+    if shapes not in ({"xy"}, {"xyz"}) or sum(map(len, groups.values())) != len(coordinates):
+        return ()
+    shape = shapes.pop()
+    return tuple(Body(name=stem, columns=tuple(group[axis] for axis in shape)) for stem, group in groups.items())
