@@ -17,7 +17,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-__version__ = "0.1.0"
+from scvi_codegen.version import __version__ as __version__
 
 _HOMES = {
     "advice": ("Advice", "advise"),
@@ -30,9 +30,12 @@ _HOMES = {
         "ExpressionError",
         "MethodError",
         "MethodWarning",
+        "MissingLibraryError",
         "ModelFileError",
         "PackageError",
         "PlotError",
+        "RecordingError",
+        "RecordingWarning",
         "ScviCodegenError",
         "StateError",
         "StepFailedError",
@@ -68,6 +71,7 @@ _HOMES = {
         "gauss_radau",
     ),
     "binding": ("SolverOptions",),
+    "recording": ("RecordedRun", "load_run", "record_run", "resume_run"),
     "run": ("Run",),
     "stepper": ("Stepper",),
     "system": ("LagrangianSystem",),

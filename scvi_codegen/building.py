@@ -30,7 +30,15 @@ import platformdirs
 from scvi_codegen.errors import BuildError
 from scvi_codegen.source import Source
 
-__all__ = ["PORTABLE_FLAGS", "TUNED_FLAGS", "cache_folder", "find_compiler", "load"]
+__all__ = [
+    "PORTABLE_FLAGS",
+    "TUNED_FLAGS",
+    "cache_folder",
+    "compiler_title",
+    "find_compiler",
+    "fingerprint",
+    "load",
+]
 
 TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
 """For a stepper used where it is compiled; no ``-ffast-math``: NaN, infinities and the order of sums are kept."""
@@ -90,6 +98,19 @@ def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
     if key not in _loaded:
         _loaded[key] = _load_or_build(source, compiler, flags, f"_scvi_{key}")
     return _loaded[key]
+
+
+def fingerprint(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> str:
+    """24 digits made from all that determines the compiled code: text, compiler, flags, Python, processor."""
+    return _key(source, find_compiler(), flags)
+
+
+@cache
+def compiler_title() -> str:
+    """The first line that the compiler says of its version."""
+    command = find_compiler()
+    result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    return (result.stdout.splitlines() or [" ".join(command)])[0]
 
 
 def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:

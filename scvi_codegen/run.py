@@ -30,6 +30,21 @@ class Run:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
 
     @property
+    def h(self) -> float:
+        """Step size."""
+        return float(self._memory.h)
+
+    @property
+    def parameters(self) -> Array:
+        """(k,) values in the order of ``stepper.parameters``."""
+        return self._parameters.copy()
+
+    @property
+    def options(self) -> SolverOptions | None:
+        """When the stage equations count as solved; ``None`` for the defaults."""
+        return self._options
+
+    @property
     def t(self) -> float:
         """Time t0 + step h."""
         return float(self._memory.t0 + self._memory.step * self._memory.h)

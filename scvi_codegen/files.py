@@ -1,0 +1,77 @@
+"""Files written whole or not at all: beside their place first, then renamed into it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+__all__ = ["leftovers", "remove", "replaced", "sync_folder", "write_atomically"]
+
+
+def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then rename it: the old one stays until the new is whole."""
+    target = Path(path)
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        mask = os.umask(0)
+        os.umask(mask)
+        Path(name).chmod(0o666 & ~mask)
+        Path(name).replace(target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A path on the same disk for a library to make a file or a folder at; if that succeeds it takes the place of ``path``.
+
+    A file replaces a file at once. A folder cannot: the one it replaces is moved aside just before, and then removed.
+    """
+    target = Path(path)
+    with tempfile.TemporaryDirectory(
+        prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
+    ) as beside:
+        made = Path(beside) / target.name
+        yield made
+        _sync(made)
+        if target.is_dir() and not target.is_symlink():
+            target.replace(Path(beside) / "replaced")
+        made.replace(target)
+    sync_folder(target.parent)
+
+
+def leftovers(path: Path) -> Iterator[Path]:
+    """What :func:`write_atomically` left beside ``path`` where its process was killed."""
+    yield from path.parent.glob(f".{path.name}.*")
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder outlive a loss of power, where the system can."""
+    with suppress(OSError):
+        _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder with all that is in it, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
