@@ -96,8 +96,15 @@ def check_format(path: str | os.PathLike[str]) -> None:
 
 
 def write_states(states: States, path: str | os.PathLike[str]) -> None:
-    """Write states in the format of the suffix, whole or not at all. Raises as :func:`check_format`, and OSError."""
+    """Write states in the format of the suffix, whole or not at all.
+
+    Raises:
+        StateError, MissingLibraryError: as :func:`check_format`; StateError also if another folder is in the way.
+        OSError: if it cannot be written.
+    """
     check_format(path)
+    if Path(path).is_dir() and not (Path(path) / ".zgroup").exists():
+        raise StateError(f"{str(path)!r} is a folder with something else in it: choose another name")
     with replaced(path) as made:
         WRITERS[Path(path).suffix.lower()](states, made)
 
@@ -127,7 +134,9 @@ def to_dataframe(states: States) -> pandas.DataFrame:
 
 def _joined(states: States) -> dict[str, NDArray[Any]]:
     """All states at once."""
-    return {name: np.concatenate(parts) for name, parts in zip(COLUMNS, zip(*states.pieces(), strict=True), strict=True)}
+    return {
+        name: np.concatenate(parts) for name, parts in zip(COLUMNS, zip(*states.pieces(), strict=True), strict=True)
+    }
 
 
 def _write_npz(states: States, path: Path) -> None:

@@ -33,20 +33,26 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], 
 
 @contextmanager
 def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A path on the same disk for a library to make a file or a folder at; if that succeeds it takes the place of ``path``.
+    """A path on the same disk, for a library to make a file or a folder at, which then takes the place of ``path``.
 
-    A file replaces a file at once. A folder cannot: the one it replaces is moved aside just before, and then removed.
+    If that fails, nothing has changed. A file replaces a file at once. A folder cannot: the one it replaces is moved
+    aside just before, and removed after.
     """
     target = Path(path)
     with tempfile.TemporaryDirectory(
         prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
     ) as beside:
-        made = Path(beside) / target.name
+        made, aside = Path(beside) / target.name, Path(beside) / "replaced"
         yield made
         _sync(made)
-        if target.is_dir() and not target.is_symlink():
-            target.replace(Path(beside) / "replaced")
-        made.replace(target)
+        if target.is_dir():
+            target.replace(aside)
+        try:
+            made.replace(target)
+        except OSError:
+            if aside.exists():
+                aside.replace(target)
+            raise
     sync_folder(target.parent)
 
 

@@ -17,8 +17,9 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source ordering
-    derivatives expression_text nodes arguments
+    version
+    errors precision program source ordering files
+    derivatives expression_text nodes arguments export
     symbols regularity quadrature
     mechanical_system translation
     system
@@ -43,7 +44,7 @@ FLOORS = """
     run ensemble
     stepper
     compiler
-    problems pilot
+    problems pilot recording
     model_file
     package plotting advice distributed ensemble_file
     exact
@@ -66,6 +67,10 @@ OWNERS = {
     "platformdirs": ["building"],
     "matplotlib": ["plotting", "benchmark", "reproduce"],
     "click": ["cli"],
+    "h5py": ["export"],
+    "zarr": ["export"],
+    "xarray": ["export"],
+    "pandas": ["export"],
 }
 
 
@@ -128,7 +133,7 @@ def test_a_third_party_library_has_one_owner(library):
     assert {room.split(".")[0] for room in users} <= set(OWNERS[library])
 
 
-HEAVY = ("sympy", "mpmath", "jinja2", "scipy", "matplotlib", "click", "tomli_w", "pycparser")
+HEAVY = ("sympy", "mpmath", "jinja2", "scipy", "matplotlib", "click", "tomli_w", "pycparser", "h5py", "zarr", "pandas")
 """What stepping does not need; pycparser is what cffi loads to compile."""
 
 IMPORTING = "import scvi_codegen"

@@ -9,8 +9,8 @@ A file of states is written beside its place and renamed into it. The last one g
 so that one renaming brings states and the memory to go on from: however the process ends, what lies in the folder is
 the run up to some step. A full file never changes. The memory in use does not depend on the length of the run.
 
-The C text lies in the manifest: continuing a run takes neither the model nor SymPy, and no other version of this package
-changes what is compiled.
+The C text lies in the manifest: going on takes neither the model nor SymPy, and with another version of this package
+the same text is compiled.
 """
 
 from scvi_codegen.recording.reading import RecordedRun, load_run

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.export import COLUMNS, Piece
@@ -36,7 +35,6 @@ class Chunk:
 
     def __len__(self) -> int:
         return len(self.piece[0])
-
 
 
 def no_states(dimension: int) -> Piece:
@@ -66,8 +64,9 @@ def chunk_paths(folder: Path) -> list[Path]:
 def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     """Put a file of states in its place, whole and on the disk; OSError if that fails."""
     buffer = io.BytesIO()  # a full disk is met in one plain write
-    arrays: dict[str, NDArray[np.generic]] = dict(zip(COLUMNS, chunk.piece, strict=True))
-    np.savez(buffer, **arrays, step=np.int64(chunk.step), memory=np.frombuffer(chunk.memory, dtype=np.uint8))
+    t, q, p, iterations = chunk.piece
+    memory = np.frombuffer(chunk.memory, dtype=np.uint8)
+    np.savez(buffer, t=t, q=q, p=p, iterations=iterations, step=np.int64(chunk.step), memory=memory)
     write_atomically(chunk_path(folder, number), lambda file: file.write(buffer.getbuffer()))
     sync_folder(folder)
 
@@ -79,7 +78,7 @@ def read_chunk(path: Path) -> Chunk:
         RecordingError: if it cannot be read, or was changed.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
             return Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes())
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.recording.chunks import chunk_paths, no_states, read_chunk
-from scvi_codegen.recording.manifest import Manifest, read_manifest
+from scvi_codegen.recording.manifest import read_manifest
 from scvi_codegen.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -40,13 +40,13 @@ def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
 class RecordedRun:
     """A run in a folder, states read when they are looked at.
 
-    Indexing gives a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` goes through it in parts that
-    fit into memory, whatever its length.
+    Indexing gives a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` goes through it in parts
+    that fit into memory, whatever its length.
 
     Attributes:
         folder: where it lies.
         manifest: what runs.
-        t, q, p, iterations: arrays of shape (n,), (n, m), (n, m), (n,) to be indexed; ``numpy.asarray`` reads them whole.
+        t, q, p, iterations: of shape (n,), (n, m), (n, m), (n,), to be indexed; ``numpy.asarray`` reads them whole.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -71,7 +71,9 @@ class RecordedRun:
     def __getitem__(self, rows: slice) -> Trajectory:
         """States by number, as a trajectory in memory; ``iterations`` counts as in the whole run."""
         if not isinstance(rows, slice):
-            raise TypeError(f"a recorded run is indexed by slices, as in run[-1000:], not by {rows!r}; see run.q, run.p")
+            raise TypeError(
+                f"a recorded run is indexed by slices, as in run[-1000:], not by {rows!r}; see run.q, run.p"
+            )
         return self._trajectory(tuple(column[rows] for column in (self.t, self.q, self.p, self.iterations)))
 
     @cached_property

@@ -29,8 +29,8 @@ from scvi_codegen.trajectory import Trajectory
 __all__ = ["record_run", "resume_run"]
 
 CHECKPOINT_SECONDS = 10.0
-PORTION_SECONDS = 0.1
-"""Time between looks at the clock: a run is never further from its last consistent state."""
+SHORTEST_PORTION, LONGEST_PORTION = 0.01, 0.1
+"""Seconds between looks at the clock: a run is never further from its last consistent state."""
 
 
 def record_run(
@@ -54,12 +54,12 @@ def record_run(
         folder: made if it is missing; it must be empty, or hold a run that was ended before its first state.
         steps: number of steps.
         every: distance between kept states.
-        checkpoint_seconds: what is computed is written at least so often: the most that is lost if the process is killed.
+        checkpoint_seconds: what is computed is written at least so often; no more is lost if the process is killed.
         checkpoint_steps: write it also every so many steps.
         rows: states in a file, by default about 16 MiB.
         model: text of a model file (:func:`dump_model`), to be kept beside the states.
-        certificate: what was found out about the integrator: JSON data, an object with a method ``to_json``, or the path
-            of a JSON file.
+        certificate: what was found out about the integrator: JSON data, an object with a method ``to_json``, or the
+            path of a JSON file.
         progress: called now and then with the number of steps done.
         stop: asked now and then whether to end here; what was computed is written.
 
@@ -144,8 +144,7 @@ def resume_run(
         recorder.go_on_from(target)
         with recorder.telling_where_it_stands():
             _remove_leftovers(target)
-            if continued != manifest:
-                write_manifest(target, continued)
+            write_manifest(target, continued)  # also finds out at once whether the folder can be written
         recorder.advance(progress, stop)
     return load_run(target)
 
@@ -186,11 +185,12 @@ class _Recorder:
     def _portions(self) -> Iterator[int]:
         """Advance in portions, write files that are full or due, and yield the number of steps done."""
         manifest, run, portion, checked = self.manifest, self.run, 1, time.monotonic()
+        wanted = min(LONGEST_PORTION, max(SHORTEST_PORTION, self.seconds))
         while run.steps < manifest.steps:
             began = time.monotonic()
             self._advance(min(portion, self._most_steps()))
             now = time.monotonic()
-            portion = max(1, int(portion * min(2.0, min(PORTION_SECONDS, self.seconds) / max(now - began, 1e-6))))
+            portion = max(1, int(portion * min(2.0, wanted / max(now - began, 1e-6))))
             if self._rows() == manifest.rows or now - checked >= self.seconds or self._at_checkpoint():
                 self.checkpoint()
                 checked = time.monotonic()
