@@ -21,12 +21,14 @@ from scvi_codegen.version import __version__ as __version__
 
 _HOMES = {
     "advice": ("Advice", "advise"),
+    "cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper", "generate_source"),
     "ensemble": ("EnsembleTrajectory",),
     "hamiltonian": ("HamiltonianSystem", "hamiltonian_of", "lagrangian_of"),
     "equations": ("StepEquations", "derive"),
     "errors": (
         "BuildError",
+        "CacheWarning",
         "ExpressionError",
         "MethodError",
         "MethodWarning",

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BuildError",
+    "CacheWarning",
     "ExpressionError",
     "MethodError",
     "MethodWarning",
@@ -66,6 +67,10 @@ class PackageError(ScviCodegenError, ValueError):
 
 class PlotError(ScviCodegenError):
     """matplotlib is not installed."""
+
+
+class CacheWarning(UserWarning):
+    """A cache folder that is not used."""
 
 
 class MissingLibraryError(ScviCodegenError, ImportError):

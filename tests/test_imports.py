@@ -19,7 +19,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 FLOORS = """
     version
     errors precision program source ordering files
-    derivatives expression_text nodes arguments export
+    derivatives expression_text nodes arguments export cache
     symbols regularity quadrature
     mechanical_system translation
     system
@@ -64,7 +64,7 @@ FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for 
 OWNERS = {
     "jinja2": ["rendering"],
     "cffi": ["building"],
-    "platformdirs": ["building"],
+    "platformdirs": ["cache"],
     "matplotlib": ["plotting", "benchmark", "reproduce"],
     "click": ["cli"],
     "h5py": ["export"],

@@ -297,6 +297,27 @@ def methods(tableau: str | None) -> None:
     click.echo(methods_table() if tableau is None else tableau_text(tableau))
 
 
+@main.command(short_help="Show or clear the cache of compiled integrators.")
+@click.argument("action", type=click.Choice(["info", "clear", "path"]), default="info")
+def cache(action: str) -> None:
+    """Show what is in the cache of compiled integrators (info), empty it (clear), or print where it is (path).
+
+    SCVI_CODEGEN_CACHE names another folder. When the entries are larger than SCVI_CODEGEN_CACHE_SIZE (as in 500M or 2G;
+    1G if it is not set; 0 for no limit), those used least recently are removed.
+
+    \b
+    Example:
+      scvi-codegen cache info
+    """  # noqa: D301  (click wants the character \b)
+    from scvi_codegen.cache import cache_folder, cache_info, clear_cache
+
+    if action == "clear":
+        count = clear_cache()
+        click.echo(f"removed {count:,} bytes from {cache_folder()}")
+    else:
+        click.echo(cache_folder() if action == "path" else cache_info())
+
+
 @main.command(short_help="Measure this project against other integrators.")
 @click.argument("sections", nargs=-1, metavar="[SECTION ...]")
 @click.option("--peers", metavar="NAME,..", help="Only these of heyoka, rebound, cyrk, jitcode, scipy; none: ''.")
