@@ -103,6 +103,20 @@ def test_entries_that_leave_while_others_load_them_disturb_nobody(folder, rounds
     assert results == [("".join(f"{number}.0\n" for number in order), "") for order in numbers]
 
 
+def test_an_entry_that_is_removed_as_soon_as_it_is_made_is_made_again(folder, monkeypatch):
+    load, removed = building._import, []
+
+    def disturbed(entry: Path, name: str) -> object:
+        if not removed:
+            removed.append(entry)
+            cache.discard(entry)
+        return load(entry, name)
+
+    monkeypatch.setattr(building, "_import", disturbed)
+    assert building.load(source(1), flags=FAST).lib.answer_1() == 1.0
+    assert removed
+
+
 SLOW_COMPILER = """#!/bin/sh
 touch "$COMPILING"
 sleep "$SECONDS_TO_WAIT"
@@ -218,13 +232,17 @@ def test_threads_share_a_stepper(kepler, finals):
         assert list(pool.map(lambda p: final(kepler, p), MOMENTA)) == finals
 
 
-def test_threads_compile_at_once(folder):
+def test_threads_compile_each_text_once(folder, monkeypatch):
+    built = []
+    publish = building._publish
+    monkeypatch.setattr(building, "_publish", lambda *arguments: built.append(1) or publish(*arguments))
+
     def compiled(number: int) -> float:
         return getattr(building.load(source(number), flags=FAST).lib, f"answer_{number}")()
 
     with ThreadPoolExecutor(8) as pool:
         assert list(pool.map(compiled, [0, 1] * 4)) == [0.0, 1.0] * 4
-    assert len(list(folder.glob("_scvi_*"))) == 2
+    assert len(built) == len(list(folder.glob("_scvi_*"))) == 2
 
 
 def test_threads_derive_at_once(folder):

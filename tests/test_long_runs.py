@@ -414,23 +414,23 @@ if Path("a.run/manifest.json").exists():
     resume_run("a.run", **settings)
 else:
     run = stepper.start([0.5, 0.0], [0.0, 1.7], h=0.05)
-    record_run(run, "a.run", steps=10**12, every=20, rows=5000, **settings)
+    record_run(run, "a.run", steps=10**12, every=20, rows={rows}, **settings)
 """
 
 
-def child(stepper: Stepper, *, before: str = "", seconds: float = 0.01) -> subprocess.Popen[str]:
+def child(stepper: Stepper, *, before: str = "", seconds: float = 0.01, rows: int = 5000) -> subprocess.Popen[str]:
     """A process that records, or goes on, printing the number of steps done; ``before`` it does something else."""
     Path("stepper").write_bytes(pickle.dumps(stepper))
-    command = [sys.executable, "-c", CHILD.format(before=before, seconds=seconds)]
+    command = [sys.executable, "-c", CHILD.format(before=before, seconds=seconds, rows=rows)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def assert_whole(stepper: Stepper, *, further: int = 1000) -> None:
     """The run goes on, and has the bytes of one that was never interrupted."""
-    steps = load_run("a.run").steps + further
+    steps, rows = load_run("a.run").steps + further, load_run("a.run").manifest.rows
     resume_run("a.run", steps=steps)
     shutil.rmtree("whole.run", ignore_errors=True)
-    record_run(start(stepper), "whole.run", steps=steps, every=20, rows=5000)
+    record_run(start(stepper), "whole.run", steps=steps, every=20, rows=rows)
     assert digests("a.run") == digests("whole.run")
     assert {path.name for path in Path("a.run").iterdir()} == {path.name for path in Path("whole.run").iterdir()}
 
@@ -529,13 +529,13 @@ def test_an_exception_on_the_way_loses_nothing(kepler):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        recorded(kepler, 10**9, progress=interrupt)
+        recorded(kepler, 10**9, rows=10**6, progress=interrupt)
     assert load_run("a.run").steps > 300
     assert_same(resume_run("a.run", steps=3000), kepler.integrate(**STATE, h=H, steps=3000))
 
 
 def test_ctrl_c_at_any_time_loses_nothing(kepler):
-    with child(kepler, seconds=1000.0) as process:
+    with child(kepler, seconds=1000.0, rows=10**6) as process:
         assert process.stdout is not None
         for _ in range(20):
             done = int(process.stdout.readline())
