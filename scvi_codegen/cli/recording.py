@@ -104,12 +104,12 @@ class RecordedOutcome:
         return [f"in one of {stride} states kept:", *lines] if stride > 1 else lines
 
     def kept(self) -> str:
-        """How to go on."""
+        """What was written, and how to go on if that makes sense."""
         folder = self.recorded.folder
-        return (
-            f"the {len(self.recorded)} states up to there are in '{folder}'; "
-            f"go on with: scvi-codegen run --resume {shlex.quote(str(folder))}"
-        )
+        states = f"the {len(self.recorded)} states up to there are in '{folder}'"
+        if self.failure is not None:
+            return states
+        return f"{states}; go on with: scvi-codegen run --resume {shlex.quote(str(folder))}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["LazyArray", "RecordedRun", "load_run"]
 
 Array = NDArray[np.float64]
-PIECES_IN_MEMORY = 4
+PIECES_IN_MEMORY = 2
 
 
 def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
@@ -74,7 +74,7 @@ class RecordedRun:
             raise TypeError(
                 f"a recorded run is indexed by slices, as in run[-1000:], not by {rows!r}; see run.q, run.p"
             )
-        return self._trajectory(tuple(column[rows] for column in (self.t, self.q, self.p, self.iterations)))
+        return self._trajectory(tuple(self.gather(self.rows(rows), range(len(COLUMNS)))))
 
     @cached_property
     def stepper(self) -> Stepper:
@@ -120,6 +120,34 @@ class RecordedRun:
                 self._recent.popitem(last=False)
         self._recent.move_to_end(number)
         return self._recent[number]
+
+    def rows(self, rows: Any) -> NDArray[np.int64]:
+        """Numbers of rows, or one number; IndexError for one that is not there."""
+        if isinstance(rows, slice):
+            return np.arange(*rows.indices(len(self)), dtype=np.int64)
+        numbers = np.asarray(rows)
+        if numbers.dtype == bool:
+            if numbers.shape != (len(self),):
+                raise IndexError(f"there are {len(self)} rows, but truth values of shape {numbers.shape}")
+            return np.flatnonzero(numbers)
+        if not np.issubdtype(numbers.dtype, np.integer) and numbers.size:
+            raise IndexError(f"rows are chosen by numbers, slices or truth values, not by {rows!r}")
+        outside = (numbers < -len(self)) | (numbers >= len(self))
+        if outside.any():
+            raise IndexError(f"there is no row {int(numbers[outside].flat[0])} among {len(self)}")
+        return np.where(numbers < 0, numbers + len(self), numbers).astype(np.int64)
+
+    def gather(self, rows: NDArray[np.int64], columns: Sequence[int]) -> list[NDArray[Any]]:
+        """The rows of these numbers, of some columns; each file is read once."""
+        kinds = [no_states(self.manifest.interface.dimension)[column] for column in columns]
+        results = [np.empty((len(rows), *kind.shape[1:]), dtype=kind.dtype) for kind in kinds]
+        order = np.argsort(rows, kind="stable")
+        files = rows[order] // self.manifest.rows
+        for some in np.split(order, np.flatnonzero(np.diff(files)) + 1) if len(rows) else ():
+            number, places = int(rows[some[0]]) // self.manifest.rows, rows[some] % self.manifest.rows
+            for result, column in zip(results, columns, strict=True):
+                result[some] = self.piece(number)[column][places]
+        return results
 
     def energy(self) -> Array:
         """(n,) energies p.v - L."""
@@ -202,32 +230,6 @@ class LazyArray:
 
     def __getitem__(self, index: Any) -> Any:
         rows, *rest = index if isinstance(index, tuple) else (index,)
-        wanted = self._rows(rows)
-        found = self._gather(np.atleast_1d(wanted))
+        wanted = self._run.rows(rows)
+        (found,) = self._run.gather(np.atleast_1d(wanted), [self._column])
         return found[(slice(None), *rest)] if wanted.ndim else found[(0, *rest)]
-
-    def _rows(self, rows: Any) -> NDArray[np.int64]:
-        """Numbers of rows, or one number; IndexError for one that is not there."""
-        if isinstance(rows, slice):
-            return np.arange(*rows.indices(len(self)), dtype=np.int64)
-        numbers = np.asarray(rows)
-        if numbers.dtype == bool:
-            if numbers.shape != (len(self),):
-                raise IndexError(f"there are {len(self)} rows, but truth values of shape {numbers.shape}")
-            return np.flatnonzero(numbers)
-        if not np.issubdtype(numbers.dtype, np.integer) and numbers.size:
-            raise IndexError(f"rows are chosen by numbers, slices or truth values, not by {rows!r}")
-        outside = (numbers < -len(self)) | (numbers >= len(self))
-        if outside.any():
-            raise IndexError(f"there is no row {int(numbers[outside].flat[0])} among {len(self)}")
-        return np.where(numbers < 0, numbers + len(self), numbers).astype(np.int64)
-
-    def _gather(self, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """The rows of these numbers, each file read once."""
-        result = np.empty((len(rows), *self._like.shape[1:]), dtype=self.dtype)
-        order = np.argsort(rows, kind="stable")
-        files = rows[order] // self._run.manifest.rows
-        for some in np.split(order, np.flatnonzero(np.diff(files)) + 1) if len(rows) else ():
-            number, places = int(rows[some[0]]) // self._run.manifest.rows, rows[some] % self._run.manifest.rows
-            result[some] = self._run.piece(number)[self._column][places]
-        return result
