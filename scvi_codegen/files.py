@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-__all__ = ["leftovers", "remove", "replaced", "sync_folder", "write_atomically"]
+__all__ = ["remove", "replaced", "sync_folder", "write_atomically"]
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:
@@ -54,11 +54,6 @@ def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
                 aside.replace(target)
             raise
     sync_folder(target.parent)
-
-
-def leftovers(path: Path) -> Iterator[Path]:
-    """What :func:`write_atomically` left beside ``path`` where its process was killed."""
-    yield from path.parent.glob(f".{path.name}.*")
 
 
 def sync_folder(folder: Path) -> None:

@@ -14,9 +14,11 @@ from scvi_codegen.errors import RecordingError
 from scvi_codegen.export import COLUMNS, Piece
 from scvi_codegen.files import sync_folder, write_atomically
 
-__all__ = ["Chunk", "chunk_path", "chunk_paths", "no_states", "read_chunk", "write_chunk"]
+__all__ = ["Chunk", "chunk_path", "chunk_paths", "no_states", "read_chunk", "unfinished", "write_chunk"]
 
 NAME = re.compile(r"states-(\d{6,})\.npz")
+UNFINISHED = re.compile(r"\.(states-\d{6,}\.npz|manifest\.json)\..+")
+"""Files on the way to their place when their process was killed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,11 @@ def chunk_paths(folder: Path) -> list[Path]:
         if number != expected:
             raise RecordingError(f"'{chunk_path(folder, expected)}' is missing: the files after it are not continued")
     return [chunk_path(folder, number) for number in numbers]
+
+
+def unfinished(folder: Path) -> list[Path]:
+    """What processes that were killed left of files that never came to their place."""
+    return [path for path in folder.iterdir() if UNFINISHED.fullmatch(path.name)]
 
 
 def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:

@@ -8,7 +8,7 @@ import os
 import shlex
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +19,8 @@ import numpy as np
 from scvi_codegen.arguments import checked_count
 from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError
 from scvi_codegen.export import Piece, chunk_rows
-from scvi_codegen.files import leftovers, sync_folder
-from scvi_codegen.recording.chunks import Chunk, chunk_path, chunk_paths, no_states, read_chunk, write_chunk
+from scvi_codegen.files import sync_folder
+from scvi_codegen.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.recording.reading import RecordedRun, load_run
 from scvi_codegen.run import Run
@@ -143,7 +143,7 @@ def resume_run(
         recorder = _Recorder(target, continued, run, *_pace(checkpoint_seconds, checkpoint_steps))
         recorder.go_on_from(target)
         with recorder.telling_where_it_stands():
-            _remove_leftovers(target)
+            _remove(unfinished(target))
             write_manifest(target, continued)  # also finds out at once whether the folder can be written
         recorder.advance(progress, stop)
     return load_run(target)
@@ -298,7 +298,7 @@ def _prepare(folder: Path) -> None:
             f"'{folder}' holds a run already: go on with it ('scvi-codegen run --resume "
             f"{shlex.quote(str(folder))}', resume_run), or choose another folder"
         )
-    own = {*chunk_paths(folder), *_leftovers(folder)}
+    own = {*chunk_paths(folder), *unfinished(folder)}
     for path in folder.iterdir():
         if path not in own:
             raise RecordingError(f"'{folder}' is not empty (it has '{path.name}'): choose another folder")
@@ -308,18 +308,11 @@ def _clear(folder: Path) -> None:
     """Remove what a process left that was killed before there was a manifest."""
     if (folder / MANIFEST).exists():
         raise RecordingError(f"'{folder}' was given a run by another process just now: choose another folder")
-    for path in chunk_paths(folder):
-        path.unlink()
-    _remove_leftovers(folder)
+    _remove([*chunk_paths(folder), *unfinished(folder)])
 
 
-def _leftovers(folder: Path) -> Iterator[Path]:
-    for path in (folder / MANIFEST, *chunk_paths(folder), chunk_path(folder, len(chunk_paths(folder)))):
-        yield from leftovers(path)
-
-
-def _remove_leftovers(folder: Path) -> None:
-    for path in list(_leftovers(folder)):
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
         path.unlink()
 
 
