@@ -105,8 +105,14 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
     check_format(path)
     if Path(path).is_dir() and not (Path(path) / ".zgroup").exists():
         raise StateError(f"{str(path)!r} is a folder with something else in it: choose another name")
-    with replaced(path) as made:
-        WRITERS[Path(path).suffix.lower()](states, made)
+    try:
+        with replaced(path) as made:
+            WRITERS[Path(path).suffix.lower()](states, made)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        what = f"{os.strerror(error.errno)}: nothing was written, what was there before is there still"
+        raise OSError(error.errno, what, str(path)) from error
 
 
 def to_xarray(states: States) -> xarray.Dataset:

@@ -500,6 +500,17 @@ def test_a_full_disk_loses_nothing_and_the_run_goes_on_when_there_is_room(kepler
     assert digests("a.run") == digests("whole.run")
 
 
+@pytest.mark.parametrize("suffix", ["npz", "csv", "h5", "zarr"])
+def test_a_file_for_which_there_is_no_room_leaves_the_old_one_and_nothing_else(kepler, small_disk, suffix):
+    pytest.importorskip({"h5": "h5py", "zarr": "zarr"}.get(suffix, "numpy"))
+    path = small_disk / f"a.{suffix}"
+    kepler.integrate(**STATE, h=H, steps=30).save(path)
+    before = {file: file.read_bytes() for file in small_disk.rglob("*") if file.is_file()}
+    with pytest.raises(OSError, match=rf"No space left on device: nothing was written.*a\.{suffix}'"):
+        kepler.integrate(**STATE, h=H, steps=100_000).save(path)
+    assert {file: file.read_bytes() for file in small_disk.rglob("*") if file.is_file()} == before
+
+
 WITHOUT_RIGHTS = """
 for path in (*Path("a.run").iterdir(), Path("a.run"), Path()):
     path.chmod(0o555 if path.is_dir() else 0o444)
