@@ -143,6 +143,14 @@ sys.path.insert(0, {parent!r})
 import {name}
 {name}.stepper.step([0.5], [0.0], 0.1)
 """
+RECORDING = (
+    STEPPING
+    + """
+from scvi_codegen.recording import record_run, resume_run
+record_run({name}.stepper.start([0.5], [0.0], h=0.1), "a.run", steps=10)
+resume_run("a.run", steps=20).save("a.npz")
+"""
+)
 
 
 def loaded_modules(script: str, tmp_path: Path) -> set[str]:
@@ -160,11 +168,12 @@ def test_importing_the_package_loads_no_heavy_library(tmp_path):
     assert loaded.isdisjoint([*HEAVY, "numpy", "cffi"])
 
 
-def test_stepping_a_generated_package_loads_no_heavy_library(tmp_path):
+@pytest.mark.parametrize("use", [STEPPING, RECORDING], ids=["stepping", "recording"])
+def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     folder = generate_package(Model.from_problem(problem("planar-pendulum")), tmp_path / "pendulum_svi")
-    script = STEPPING.format(parent=str(tmp_path), name=folder.name)
-    loaded_modules(script, tmp_path)  # compiles
-    loaded = loaded_modules(script, tmp_path)
+    names = {"parent": str(tmp_path), "name": folder.name}
+    loaded_modules(STEPPING.format(**names), tmp_path)  # compiles
+    loaded = loaded_modules(use.format(**names), tmp_path)
     assert "numpy" in loaded
     assert loaded.isdisjoint(HEAVY)
 
