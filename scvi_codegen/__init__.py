@@ -17,10 +17,11 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-__version__ = "0.1.0"
+from scvi_codegen.version import __version__ as __version__
 
 _HOMES = {
     "advice": ("Advice", "advise"),
+    "cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper", "generate_source"),
     "ensemble": ("EnsembleTrajectory",),
     "exact": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
@@ -28,12 +29,16 @@ _HOMES = {
     "equations": ("StepEquations", "derive"),
     "errors": (
         "BuildError",
+        "CacheWarning",
         "ExpressionError",
         "MethodError",
         "MethodWarning",
+        "MissingLibraryError",
         "ModelFileError",
         "PackageError",
         "PlotError",
+        "RecordingError",
+        "RecordingWarning",
         "ScviCodegenError",
         "StateError",
         "StepFailedError",
@@ -71,6 +76,7 @@ _HOMES = {
     ),
     "spaces": ("Polynomials", "Splines", "Trigonometric"),
     "binding": ("SolverOptions",),
+    "recording": ("RecordedRun", "load_run", "record_run", "resume_run"),
     "run": ("Run",),
     "stepper": ("Stepper",),
     "symmetry": ("Symmetry", "check_symmetry", "symmetries"),

@@ -3,7 +3,8 @@
 An integrator is compiled once with its cffi binding (API mode) into one shared library, kept in the user's cache folder
 under a name made from everything that determines it: text, compiler, flags, Python ABI, processor. It is built in a
 temporary folder inside the cache and renamed into place, so processes may race without locks; what does not match its
-recorded checksum is built anew. An unwritable cache falls back to a temporary folder.
+recorded checksum is built anew. A cache that cannot be written, or that others can write, falls back to a temporary
+folder (:mod:`scvi_codegen.cache`).
 """
 
 from __future__ import annotations
@@ -20,17 +21,35 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import threading
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-import platformdirs
-
+from scvi_codegen.cache import (
+    CACHE_VARIABLE,
+    cache_folder,
+    discard,
+    exposed,
+    make_folder,
+    make_room,
+    touch,
+    trusted_folder,
+)
 from scvi_codegen.errors import BuildError
 from scvi_codegen.source import Source
 
-__all__ = ["PORTABLE_FLAGS", "TUNED_FLAGS", "cache_folder", "find_compiler", "load"]
+__all__ = [
+    "CACHE_VARIABLE",
+    "PORTABLE_FLAGS",
+    "TUNED_FLAGS",
+    "cache_folder",
+    "compiler_title",
+    "find_compiler",
+    "fingerprint",
+    "load",
+]
 
 TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
 """For a stepper used where it is compiled; no ``-ffast-math``: NaN, infinities and the order of sums are kept."""
@@ -38,17 +57,16 @@ TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", 
 PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
 
-CACHE_VARIABLE = "SCVI_CODEGEN_CACHE"
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
 COMPILE_SECONDS = 600
+ATTEMPTS = 3
+"""To load what another process may remove at any time."""
 _loaded: dict[str, ModuleType] = {}
-
-
-def cache_folder() -> Path:
-    """Where compiled steppers are kept: ``$SCVI_CODEGEN_CACHE``, else the user's cache folder."""
-    chosen = os.environ.get(CACHE_VARIABLE)
-    return Path(chosen) if chosen else platformdirs.user_cache_path("scvi-codegen")
+_locks: dict[str, threading.Lock] = {}
+"""One a library, so that threads compile it once; a process that is forked off starts with none held."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_locks.clear)
 
 
 def find_compiler() -> tuple[str, ...]:
@@ -87,9 +105,23 @@ def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
     """
     compiler = find_compiler()
     key = _key(source, compiler, flags)
-    if key not in _loaded:
-        _loaded[key] = _load_or_build(source, compiler, flags, f"_scvi_{key}")
-    return _loaded[key]
+    with _locks.setdefault(key, threading.Lock()):
+        if key not in _loaded:
+            _loaded[key] = _load_or_build(source, compiler, flags, f"_scvi_{key}")
+        return _loaded[key]
+
+
+def fingerprint(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> str:
+    """24 digits made from all that determines the compiled code: text, compiler, flags, Python, processor."""
+    return _key(source, find_compiler(), flags)
+
+
+@cache
+def compiler_title() -> str:
+    """The first line that the compiler says of its version."""
+    command = find_compiler()
+    result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    return (result.stdout.splitlines() or [" ".join(command)])[0]
 
 
 def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
@@ -134,25 +166,40 @@ def _processor() -> str:
 
 
 def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> ModuleType:
-    for root in (cache_folder(), None):
-        if root is None:
-            root = Path(tempfile.mkdtemp(prefix="scvi-codegen-"))
-            atexit.register(shutil.rmtree, root, ignore_errors=True)
-        entry = root / name
+    folder = trusted_folder()
+    if folder is not None:
+        with suppress(OSError):  # it cannot be written
+            return _load_from(folder, source, compiler, flags, name)
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix="scvi-codegen-"))
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        return _load_from(temporary, source, compiler, flags, name)
+    except OSError as error:
+        raise BuildError("neither the cache folder nor the temporary folder can be written") from error
+
+
+def _load_from(
+    folder: Path, source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str
+) -> ModuleType:
+    """The module in a folder, put there first if need be; OSError if that cannot be done."""
+    entry = folder / name
+    for _ in range(ATTEMPTS):
         if _is_intact(entry):
             try:
-                return _import(entry, name)
+                module = _import(entry, name)
             except ImportError:
-                _discard(entry)  # a foreign library: build it anew
-        try:
-            _publish(source, compiler, flags, entry)
-        except OSError:
-            continue  # the folder cannot be written
+                discard(entry)  # a foreign library: build it anew
+            else:
+                touch(entry)
+                return module
+        _publish(source, compiler, flags, entry)
         try:
             return _import(entry, name)
         except ImportError as error:
-            raise BuildError(f"what the compiler {' '.join(compiler)!r} made cannot be loaded here: {error}") from error
-    raise BuildError("neither the cache folder nor the temporary folder can be written")
+            if _is_intact(entry):
+                made = f"what the compiler {' '.join(compiler)!r} made cannot be loaded here"
+                raise BuildError(f"{made}: {error}") from error
+    raise OSError(f"{entry} is removed as soon as it is made")
 
 
 def _library(entry: Path) -> Path:
@@ -160,13 +207,14 @@ def _library(entry: Path) -> Path:
 
 
 def _is_intact(entry: Path) -> bool:
-    """Whether the library is there and is the one that was recorded."""
+    """Whether the library is there, is the one that was recorded, and nobody else can have put it there."""
     try:
         recorded = json.loads((entry / "manifest.json").read_text())
         found = hashlib.sha256(_library(entry).read_bytes()).hexdigest()
     except (OSError, ValueError):
         return False
-    return isinstance(recorded, dict) and recorded.get("sha256") == found
+    matches = isinstance(recorded, dict) and recorded.get("sha256") == found
+    return matches and not exposed(entry) and not exposed(_library(entry))
 
 
 def _import(entry: Path, name: str) -> ModuleType:
@@ -180,26 +228,23 @@ def _import(entry: Path, name: str) -> ModuleType:
 
 def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], entry: Path) -> None:
     """Build beside the entry and rename into place; a racing process that was first wins."""
-    entry.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(entry.parent)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=entry.parent, ignore_cleanup_errors=True) as folder:
         built = Path(folder) / entry.name
-        built.mkdir()
+        built.mkdir(mode=0o755)
         _compile(source, compiler, flags, built)
         checksum = hashlib.sha256(_library(built).read_bytes()).hexdigest()
         (built / "manifest.json").write_text(json.dumps({"sha256": checksum, "prefix": source.prefix}))
+        for file in built.iterdir():
+            file.chmod(file.stat().st_mode & ~0o022)
         try:
             built.replace(entry)
         except OSError:
             if _is_intact(entry):
                 return
-            _discard(entry)
+            discard(entry)
             built.replace(entry)
-
-
-def _discard(entry: Path) -> None:
-    shutil.rmtree(entry, ignore_errors=True)
-    if entry.is_file():
-        entry.unlink()
+    make_room(entry.parent, entry)
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:

@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen import building
 from scvi_codegen.arguments import checked_count, checked_number, checked_step
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.trajectory import relative_changes, write_atomically
+from scvi_codegen.files import write_atomically
+from scvi_codegen.trajectory import relative_changes
 
 if TYPE_CHECKING:
     from scvi_codegen.binding import SolverOptions

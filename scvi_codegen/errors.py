@@ -9,12 +9,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BuildError",
+    "CacheWarning",
     "ExpressionError",
     "MethodError",
     "MethodWarning",
+    "MissingLibraryError",
     "ModelFileError",
     "PackageError",
     "PlotError",
+    "RecordingError",
+    "RecordingWarning",
     "ScviCodegenError",
     "StateError",
     "StepFailedError",
@@ -63,6 +67,22 @@ class PackageError(ScviCodegenError, ValueError):
 
 class PlotError(ScviCodegenError):
     """matplotlib is not installed."""
+
+
+class CacheWarning(UserWarning):
+    """A cache folder that is not used."""
+
+
+class MissingLibraryError(ScviCodegenError, ImportError):
+    """A library that a file format or a conversion needs is not installed; the message names the extra that has it."""
+
+
+class RecordingError(ScviCodegenError, OSError):
+    """A folder that holds no run, or that cannot be read or written; the message says how far the run in it goes."""
+
+
+class RecordingWarning(UserWarning):
+    """A recorded run goes on under other circumstances than it began."""
 
 
 class StateError(ScviCodegenError, ValueError):

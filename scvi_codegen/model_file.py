@@ -45,13 +45,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError
+from scvi_codegen.files import write_atomically
 from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.problems import Problem, problem
 from scvi_codegen.system import LagrangianSystem
-from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
     from scvi_codegen.binding import SolverOptions

@@ -23,9 +23,9 @@ from string import Template
 from typing import IO, TYPE_CHECKING
 
 from scvi_codegen.errors import ModelFileError, PackageError, StateError
+from scvi_codegen.files import write_atomically
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
-from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
     from scvi_codegen.model_file import Model

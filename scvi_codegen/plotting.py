@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.bodies import AXES, Body, bodies
 from scvi_codegen.errors import PlotError, StateError
-from scvi_codegen.trajectory import Trajectory, write_atomically
+from scvi_codegen.files import write_atomically
+from scvi_codegen.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

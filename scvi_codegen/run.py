@@ -29,6 +29,24 @@ class Run:
     def __init__(self, stepper: Stepper, memory: Any, parameters: Array, options: SolverOptions | None) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_restored, (self.stepper, self.save(), self._parameters, self._options))
+
+    @property
+    def h(self) -> float:
+        """Step size."""
+        return float(self._memory.h)
+
+    @property
+    def parameters(self) -> Array:
+        """(k,) values in the order of ``stepper.parameters``."""
+        return self._parameters.copy()
+
+    @property
+    def options(self) -> SolverOptions | None:
+        """When the stage equations count as solved; ``None`` for the defaults."""
+        return self._options
+
     @property
     def t(self) -> float:
         """Time t0 + step h."""
@@ -120,3 +138,7 @@ class Run:
             parameters=self._parameters,
             stepper=self.stepper,
         )
+
+
+def _restored(stepper: Stepper, saved: bytes, parameters: Array, options: SolverOptions | None) -> Run:
+    return stepper.restore(saved, parameters=parameters, options=options)

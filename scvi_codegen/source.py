@@ -6,6 +6,8 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from scvi_codegen.version import __version__
+
 __all__ = ["Interface", "Source"]
 
 
@@ -56,6 +58,10 @@ class Interface:
     def dimension(self) -> int:
         """Degrees of freedom m."""
         return len(self.coordinates)
+
+    def about(self) -> dict[str, str]:
+        """Title, system, method, and version of this package: what belongs beside every number computed."""
+        return {"title": self.title, "system": self.system, "method": self.method, "version": __version__}
 
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`."""

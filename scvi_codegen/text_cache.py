@@ -1,8 +1,8 @@
 """Generated texts, kept beside the compiled ones: what was derived once is not derived again.
 
 The name of an entry is made from everything the text depends on: the system, the method, the solver, and the generator
-itself, of which the sizes and times of all files are taken. An entry that cannot be read or written is no error: the
-text is then made anew.
+itself, of which the sizes and times of all files are taken. An entry that cannot be read or written, or is not what its
+checksum says, is no error: the text is then made anew.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import TypeAlias
 
 import sympy
 
-from scvi_codegen.building import cache_folder
+from scvi_codegen.cache import exposed, make_folder, make_room, touch, trusted_folder
+from scvi_codegen.files import write_atomically
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.rendering import template_folder
 from scvi_codegen.source import Interface, Source
-from scvi_codegen.trajectory import write_atomically
 
 __all__ = ["Texts", "remembered_texts"]
 
@@ -35,11 +35,15 @@ def remembered_texts(
     system: MechanicalSystem, method: Method, options: Sequence[object], make: Callable[[], Texts]
 ) -> Texts:
     """What ``make`` returns for these arguments, from the cache if it was made before."""
-    path = cache_folder() / "texts" / f"{_key(system, method, options)}.json"
+    folder = trusted_folder()
+    if folder is None:
+        return make()
+    path = folder / "texts" / f"{_key(system, method, options)}.json"
     found = _read(path)
     if found is None:
         found = make()
         _write(path, found)
+        make_room(folder, path)
     return found
 
 
@@ -68,7 +72,11 @@ def _generator() -> str:
 
 def _read(path: Path) -> Texts | None:
     try:
-        entry = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["sha256"] != _checksum(record["entry"]) or exposed(path):
+            return None
+        entry = json.loads(record["entry"])
+        touch(path)
         ensemble = entry["ensemble"]
         source, interface = Source(**entry["source"]), Interface.from_json(entry["interface"])
         return source, interface, None if ensemble is None else Source(**ensemble)
@@ -83,6 +91,14 @@ def _write(path: Path, texts: Texts) -> None:
         "interface": interface.to_json(),
         "ensemble": None if ensemble is None else asdict(ensemble),
     }
+    text = json.dumps(entry)
+    record = json.dumps({"sha256": _checksum(text), "entry": text})
     with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda file: file.write(json.dumps(entry).encode()))
+        make_folder(path.parent.parent)
+        make_folder(path.parent)
+        write_atomically(path, lambda file: file.write(record.encode()))
+        path.chmod(path.stat().st_mode & ~0o022)
+
+
+def _checksum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,23 +1,23 @@
-"""The result of an integration: arrays, diagnostics, and files written whole or not at all."""
+"""The result of an integration: arrays, diagnostics, files and tables."""
 
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.export import States, to_dataframe, to_xarray, write_states
 
 if TYPE_CHECKING:
+    import pandas
+    import xarray
+
     from scvi_codegen.stepper import Stepper
 
-__all__ = ["Trajectory", "relative_changes", "write_atomically"]
+__all__ = ["Trajectory", "relative_changes"]
 
 Array = NDArray[np.float64]
 
@@ -61,40 +61,46 @@ class Trajectory:
         values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
         return relative_changes(values, sizes)
 
+    def states(self) -> States:
+        """The states as :mod:`scvi_codegen.export` writes them."""
+        interface = self.stepper.interface
+        piece = (self.t, self.q, self.p, self.iterations)
+        return States(
+            count=len(self),
+            pieces=lambda: iter([piece]),
+            coordinates=interface.coordinates,
+            parameters=dict(zip(interface.parameters, map(float, self.parameters), strict=True)),
+            h=self.h,
+            about=interface.about(),
+        )
+
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.npz`` (arrays t, q, p, iterations, h, parameters, names) or ``.csv``, atomically.
+        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, atomically.
+
+        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and texts title,
+        system, method, version. A CSV file has columns t, the coordinates x, the momenta p_x, iterations.
 
         Raises:
             StateError: for another suffix.
+            MissingLibraryError: without h5py or zarr (extra ``data``).
         """
-        suffix = Path(path).suffix.lower()
-        if suffix == ".npz":
-            write_atomically(path, self._write_npz)
-        elif suffix == ".csv":
-            write_atomically(path, self._write_csv)
-        else:
-            raise StateError(f"a trajectory is saved as .npz or .csv, not as {str(path)!r}")
+        write_states(self.states(), path)
 
-    def _write_npz(self, file: IO[bytes]) -> None:
-        np.savez(
-            file,
-            t=self.t,
-            q=self.q,
-            p=self.p,
-            iterations=self.iterations,
-            h=self.h,
-            parameters=self.parameters,
-            coordinates=np.array(self.stepper.coordinates),
-            parameter_names=np.array(self.stepper.parameters, dtype=str),
-            title=self.stepper.title,
-        )
+    def to_xarray(self) -> xarray.Dataset:
+        """Variables q and p (t, coordinate), iterations (t); h, parameters and titles as attributes.
 
-    def _write_csv(self, file: IO[bytes]) -> None:
-        names = self.stepper.coordinates
-        header = ",".join(["t", *names, *(f"p_{name}" for name in names), "iterations"])
-        table = np.column_stack([self.t, self.q, self.p, self.iterations])
-        formats = ["%.17g"] * (1 + 2 * len(names)) + ["%d"]
-        np.savetxt(file, table, delimiter=",", header=header, comments="", fmt=formats)
+        Raises:
+            MissingLibraryError: without xarray (extra ``data``).
+        """
+        return to_xarray(self.states())
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A line a state, by time: columns for each coordinate x and momentum p_x, and iterations.
+
+        Raises:
+            MissingLibraryError: without pandas (extra ``data``).
+        """
+        return to_dataframe(self.states())
 
 
 def relative_changes(values: Array, sizes: Array) -> Array:
@@ -103,21 +109,3 @@ def relative_changes(values: Array, sizes: Array) -> Array:
         scales = np.fmax.reduce(sizes, axis=0)
         changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
     return np.where(np.isinf(scales), np.nan, changes)
-
-
-def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then rename it: the old one stays until the new is whole."""
-    target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        Path(name).chmod(0o666 & ~mask)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

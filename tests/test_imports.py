@@ -17,8 +17,9 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source ordering bodies
-    derivatives expression_text nodes arguments
+    version
+    errors precision program source ordering bodies files
+    derivatives expression_text nodes arguments export cache
     symbols regularity quadrature
     mechanical_system translation
     system
@@ -50,7 +51,7 @@ FLOORS = """
     run ensemble
     stepper
     compiler
-    problems pilot
+    problems pilot recording
     model_file
     package plotting advice distributed ensemble_file
     exact mathml
@@ -70,9 +71,13 @@ FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for 
 OWNERS = {
     "jinja2": ["rendering", "reproduce"],
     "cffi": ["building"],
-    "platformdirs": ["building"],
+    "platformdirs": ["cache"],
     "matplotlib": ["plotting", "benchmark", "reproduce"],
     "click": ["cli"],
+    "h5py": ["export"],
+    "zarr": ["export"],
+    "xarray": ["export"],
+    "pandas": ["export"],
 }
 
 
@@ -135,7 +140,7 @@ def test_a_third_party_library_has_one_owner(library):
     assert {room.split(".")[0] for room in users} <= set(OWNERS[library])
 
 
-HEAVY = ("sympy", "mpmath", "jinja2", "scipy", "matplotlib", "click", "tomli_w", "pycparser")
+HEAVY = ("sympy", "mpmath", "jinja2", "scipy", "matplotlib", "click", "tomli_w", "pycparser", "h5py", "zarr", "pandas")
 """What stepping does not need; pycparser is what cffi loads to compile."""
 
 IMPORTING = "import scvi_codegen"
@@ -145,6 +150,14 @@ sys.path.insert(0, {parent!r})
 import {name}
 {name}.stepper.step([0.5], [0.0], 0.1)
 """
+RECORDING = (
+    STEPPING
+    + """
+from scvi_codegen.recording import record_run, resume_run
+record_run({name}.stepper.start([0.5], [0.0], h=0.1), "a.run", steps=10)
+resume_run("a.run", steps=20).save("a.npz")
+"""
+)
 
 
 def loaded_modules(script: str, tmp_path: Path) -> set[str]:
@@ -162,11 +175,12 @@ def test_importing_the_package_loads_no_heavy_library(tmp_path):
     assert loaded.isdisjoint([*HEAVY, "numpy", "cffi"])
 
 
-def test_stepping_a_generated_package_loads_no_heavy_library(tmp_path):
+@pytest.mark.parametrize("use", [STEPPING, RECORDING], ids=["stepping", "recording"])
+def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     folder = generate_package(Model.from_problem(problem("planar-pendulum")), tmp_path / "pendulum_svi")
-    script = STEPPING.format(parent=str(tmp_path), name=folder.name)
-    loaded_modules(script, tmp_path)  # compiles
-    loaded = loaded_modules(script, tmp_path)
+    names = {"parent": str(tmp_path), "name": folder.name}
+    loaded_modules(STEPPING.format(**names), tmp_path)  # compiles
+    loaded = loaded_modules(use.format(**names), tmp_path)
     assert "numpy" in loaded
     assert loaded.isdisjoint(HEAVY)
 

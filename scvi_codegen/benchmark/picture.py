@@ -9,8 +9,8 @@ from typing import IO, TYPE_CHECKING
 
 from scvi_codegen.benchmark.contenders import OURS
 from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.files import write_atomically
 from scvi_codegen.plotting import COLORS, STYLE, check_plot_path
-from scvi_codegen.trajectory import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -23,7 +23,7 @@ from scvi_codegen import building
 from scvi_codegen.benchmark.cases import Array, Case
 from scvi_codegen.benchmark.tracing import rates_text
 from scvi_codegen.errors import StateError
-from scvi_codegen.trajectory import write_atomically
+from scvi_codegen.files import write_atomically
 
 __all__ = ["Reference", "final_states", "gauss_tables", "reference", "rms_error"]
 

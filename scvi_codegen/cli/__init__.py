@@ -16,6 +16,7 @@ from scvi_codegen.cli.choices import Choices, model_arguments, read_model
 
 if TYPE_CHECKING:
     from scvi_codegen.binding import SolverOptions
+    from scvi_codegen.cli.recording import RecordedOutcome
     from scvi_codegen.cli.running import Outcome
     from scvi_codegen.model_file import Model
 
@@ -35,6 +36,8 @@ Examples:
   scvi-codegen run kepler --method gauss --stages 4 --parameter mu=2 --q 1,0 --velocity 0,1.2
   scvi-codegen systems kepler > mine.toml              a model file to start from
   scvi-codegen run mine.toml --span 1000 --every 10 -o orbit.csv
+  scvi-codegen run mine.toml --span 1e4 --every 1000 -o long.run    a folder: the run can be interrupted
+  scvi-codegen run --resume long.run                                and goes on where it was
   scvi-codegen derive planar-pendulum --method svi --degree 2 --quadrature gauss-legendre:2
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
   scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
@@ -67,12 +70,12 @@ class _Commands(click.Group):
     """Turns the errors a user can meet into one message and an exit status."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        from scvi_codegen.errors import BuildError, ScviCodegenError, StepFailedError
+        from scvi_codegen.errors import BuildError, RecordingError, ScviCodegenError, StepFailedError
 
         try:
             with _warnings_as_lines():
                 return super().invoke(ctx)
-        except (StepFailedError, BuildError) as error:
+        except (StepFailedError, BuildError, RecordingError) as error:
             raise _Failure(str(error), FAILURE) from error
         except ScviCodegenError as error:
             raise _Failure(str(error), USAGE) from error
@@ -91,8 +94,23 @@ def main() -> None:
 
 
 @main.command(short_help="Integrate MODEL and sum up what was conserved.")
-@model_arguments
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectories, .npz or .csv.")
+@partial(model_arguments, required=False)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="PATH",
+    help="Trajectory: .npz, .csv, .h5 or .zarr; or a folder, NAME.run or NAME/, for a run of any length.",
+)
+@click.option("--resume", type=click.Path(), metavar="FOLDER", help="Go on with the run in a folder, without MODEL.")
+@click.option(
+    "--checkpoint",
+    type=float,
+    metavar="SECONDS",
+    help="Into a folder what is computed is written at least so often [10].",
+)
+@click.option("--checkpoint-steps", type=int, metavar="N", help="And every so many steps.")
+@click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to keep in the folder.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Picture, .png or .svg (needs matplotlib).")
 @click.option(
     "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
@@ -109,8 +127,12 @@ def main() -> None:
 )
 @click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
 def run(
-    model_name: str,
+    model_name: str | None,
     output: str | None,
+    resume: str | None,
+    checkpoint: float | None,
+    checkpoint_steps: int | None,
+    certificate: str | None,
     plot: str | None,
     ensemble: str | None,
     tolerance: float | None,
@@ -137,14 +159,29 @@ def run(
     momenta (p_q1), and parameters; MODEL gives the others. An .npz file has arrays q and p of shape (states,
     trajectories, coordinates); a .csv file has a line a state.
 
+    Into a folder (-o long.run) the states are written as they are computed, with all that the run needs to go on. It
+    may be killed at any time; --resume continues it bit for bit, with --steps or --span further than it was meant to
+    go. The memory in use does not grow. 'scvi-codegen export' makes one file of it.
+
     \b
     Examples:
       scvi-codegen run outer-solar-system --plot orbits.png
       scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
       scvi-codegen run kepler --tolerance 1e-9
     """  # noqa: D301  (click wants the character \b)
-    _check_outputs(output, plot)
-    _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance)
+    from scvi_codegen.cli.recording import Recording, check_resumed, is_folder
+
+    recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
+    if resume is not None:
+        check_resumed(click.get_current_context())
+        _finish_recording(recording.resume(resume, steps=choices["steps"], span=choices["span"]))
+        return
+    if model_name is None:
+        raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
+    recorded = output is not None and is_folder(output)
+    recording.check(recorded)
+    _check_outputs(output, plot, ensemble)
+    _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
     from scvi_codegen.binding import SolverOptions
 
@@ -158,7 +195,35 @@ def run(
         from scvi_codegen.cli.advising import advised_model
 
         model = advised_model(model, tolerance, solver=solver, options=options)
+    if output is not None and recorded:
+        _finish_recording(recording.record(model, output, solver=solver, options=options))
+        return
     _run_one(model, output, plot, solver, options)
+
+
+@main.command(short_help="Make one file of a run in a folder.")
+@click.argument("folder", type=click.Path())
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory: .npz, .csv, .h5 (HDF5) or .zarr.")
+def export(folder: str, output: str | None) -> None:
+    """Write the states of the run in FOLDER to one file, or say what is in it.
+
+    The run may be under way: what is in the folder is written. Memory does not depend on its length. HDF5 and Zarr need
+    'scvi-codegen[data]'; xarray.open_dataset and xarray.open_zarr read them.
+
+    \b
+    Example:
+      scvi-codegen export long.run -o long.csv
+    """  # noqa: D301  (click wants the character \b)
+    from scvi_codegen.cli.recording import standing
+    from scvi_codegen.recording import load_run
+
+    if output is not None:
+        _check_outputs(output, None, None)
+    recorded = load_run(folder)
+    click.echo(standing(recorded))
+    if output is not None:
+        recorded.save(output)
+        click.echo(f"wrote {output}")
 
 
 @main.command(short_help="Write MODEL as C and as a Python package.")
@@ -231,6 +296,27 @@ def methods(tableau: str | None) -> None:
     from scvi_codegen.cli.listings import methods_table, tableau_text
 
     click.echo(methods_table() if tableau is None else tableau_text(tableau))
+
+
+@main.command(short_help="Show or clear the cache of compiled integrators.")
+@click.argument("action", type=click.Choice(["info", "clear", "path"]), default="info")
+def cache(action: str) -> None:
+    """Show what is in the cache of compiled integrators (info), empty it (clear), or print where it is (path).
+
+    SCVI_CODEGEN_CACHE names another folder. When the entries are larger than SCVI_CODEGEN_CACHE_SIZE (as in 500M or 2G;
+    1G if it is not set; 0 for no limit), those used least recently are removed.
+
+    \b
+    Example:
+      scvi-codegen cache info
+    """  # noqa: D301  (click wants the character \b)
+    from scvi_codegen.cache import cache_folder, cache_info, clear_cache
+
+    if action == "clear":
+        count = clear_cache()
+        click.echo(f"removed {count:,} bytes from {cache_folder()}")
+    else:
+        click.echo(cache_folder() if action == "path" else cache_info())
 
 
 @main.command(short_help="Measure this project against other integrators.")
@@ -332,13 +418,15 @@ def _warnings_as_lines() -> Iterator[None]:
         yield
 
 
-def _check_outputs(output: str | None, plot: str | None) -> None:
+def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
     """Find out before a long run whether its results can be written."""
-    if output is not None and Path(output).suffix.lower() not in (".npz", ".csv"):
-        raise click.BadParameter(f"a trajectory is written as .npz or .csv, not as '{output}'", param_hint="'-o'")
-    for path, hint in ((output, "'-o'"), (plot, "'--plot'")):
-        if path is not None:
-            _check_writable(Path(path), hint)
+    from scvi_codegen.cli.recording import check_format, is_folder
+
+    if output is not None and not (ensemble is None and is_folder(output)):
+        check_format(output, ensemble=ensemble is not None)
+        _check_writable(Path(output), "'-o'")
+    if plot is not None:
+        _check_writable(Path(plot), "'--plot'")
     if plot is not None:
         from scvi_codegen.plotting import check_plot_path
 
@@ -346,8 +434,15 @@ def _check_outputs(output: str | None, plot: str | None) -> None:
 
 
 def _check_combination(
-    choices: dict[str, Any], *, plot: str | None, ensemble: str | None, tolerance: float | None
+    choices: dict[str, Any],
+    *,
+    plot: str | None,
+    ensemble: str | None,
+    tolerance: float | None,
+    folder: str | None,
 ) -> None:
+    if folder is not None and plot is not None:
+        raise click.UsageError("--plot is for a trajectory in memory, not for a run in a folder")
     if tolerance is not None:
         for name in ("step", "steps"):
             if choices[name] is not None:
@@ -371,6 +466,16 @@ def _run_one(model: Model, output: str | None, plot: str | None, solver: str, op
         click.echo(f"wrote {path}")
 
 
+def _finish_recording(outcome: RecordedOutcome) -> None:
+    """Say what came of a recorded run, and how to go on with it."""
+    click.echo(outcome.summary())
+    if outcome.failure is not None:
+        raise _Failure(f"{outcome.failure}\n{outcome.kept()}", FAILURE)
+    if outcome.interrupted:
+        raise _Failure(f"interrupted at t = {outcome.run.t:g}\n{outcome.kept()}", INTERRUPTED)
+    click.echo(f"wrote {outcome.recorded.folder}")
+
+
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions) -> None:
     from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
     from scvi_codegen.ensemble_file import load_ensemble
@@ -390,7 +495,7 @@ def _run_ensemble(model: Model, path: str, output: str | None, solver: str, opti
 
 
 def _check_writable(path: Path, hint: str) -> None:
-    if path.is_dir():
+    if path.is_dir() and path.suffix.lower() != ".zarr":
         raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)
     if not path.parent.is_dir():
         raise click.BadParameter(f"there is no folder '{path.parent}'", param_hint=hint)
@@ -418,7 +523,7 @@ def _emit(text: str, output: str | None) -> None:
     if output is None:
         click.echo(text)
         return
-    from scvi_codegen.trajectory import write_atomically
+    from scvi_codegen.files import write_atomically
 
     _check_writable(Path(output), "'-o'")
     write_atomically(output, partial(_write, text.rstrip("\n") + "\n"))

@@ -130,11 +130,11 @@ STATE_OPTIONS = (
 )
 
 
-def model_arguments(command: Command) -> Command:
+def model_arguments(command: Command, *, required: bool = True) -> Command:
     """Give a command the argument MODEL and the options of :class:`Choices`."""
     for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
         command = option(command)
-    return click.argument("model_name", metavar="MODEL")(command)
+    return click.argument("model_name", metavar="MODEL" if required else "[MODEL]", required=required)(command)
 
 
 def read_model(name: str, choices: Choices) -> Model:

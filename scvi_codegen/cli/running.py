@@ -22,7 +22,17 @@ from scvi_codegen.model_file import Model
 from scvi_codegen.run import Run
 from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["Outcome", "counted", "duration", "integrate_model", "interruptions", "progress_bar", "summary"]
+__all__ = [
+    "Outcome",
+    "conserved",
+    "counted",
+    "duration",
+    "final_state",
+    "integrate_model",
+    "interruptions",
+    "progress_bar",
+    "summary",
+]
 
 PORTION_SECONDS = 0.2
 SHOWN_COORDINATES = 6
@@ -100,8 +110,8 @@ def summary(model: Model, outcome: Outcome) -> str:
     if run.steps:
         lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
-            lines += _conserved(model, trajectory)
-    return "\n".join([*lines, *_final_state(model, run)])
+            lines += conserved(model, trajectory)
+    return "\n".join([*lines, *final_state(run)])
 
 
 def counted(count: int, what: str) -> str:
@@ -117,7 +127,8 @@ def _speed(outcome: Outcome, every: int) -> str:
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / counted:.2f} iterations a step"
 
 
-def _conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
+def conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
+    """A line for each quantity that should have been conserved: how well it was."""
     try:
         yield energy_report(model.system, trajectory)
     except StateError as error:
@@ -125,8 +136,9 @@ def _conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
     yield from momentum_report(trajectory)
 
 
-def _final_state(model: Model, run: Run) -> Iterator[str]:
-    names = [coordinate.name for coordinate in model.system.coordinates]
+def final_state(run: Run) -> Iterator[str]:
+    """Where a run stands: lines with coordinates and momenta."""
+    names = run.stepper.coordinates
     width = max(map(len, names[:SHOWN_COORDINATES]))
     yield "final state"
     for name, q, p in list(zip(names, run.q, run.p, strict=True))[:SHOWN_COORDINATES]:

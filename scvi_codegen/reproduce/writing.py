@@ -8,9 +8,9 @@ import textwrap
 from pathlib import Path
 from typing import IO
 
+from scvi_codegen.files import write_atomically
 from scvi_codegen.reproduce.drawing import STYLE
 from scvi_codegen.reproduce.experiment import Block, Formula, Listing, Paragraph, Picture, Result, Table
-from scvi_codegen.trajectory import write_atomically
 
 __all__ = ["csv_text", "draw", "statement", "write_result"]
 

@@ -1,0 +1,205 @@
+"""``scvi-codegen run -o FOLDER.run``, ``run --resume FOLDER`` and ``export``: runs of any length in a folder."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from scvi_codegen.binding import SolverOptions
+    from scvi_codegen.errors import StepFailedError
+    from scvi_codegen.model_file import Model
+    from scvi_codegen.recording import RecordedRun
+    from scvi_codegen.run import Run
+
+__all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "is_folder", "standing"]
+
+SUFFIX = ".run"
+LOOKED_AT = 10_000
+"""States at most in which it is looked at what was conserved."""
+WITH_RESUME = {"resume", "steps", "span", "checkpoint", "checkpoint_steps"}
+
+
+def is_folder(output: str) -> bool:
+    """Whether an output is a folder for a run: NAME.run, or anything that ends in a slash."""
+    return output.endswith(("/", os.sep)) or Path(output).suffix.lower() == SUFFIX
+
+
+def check_format(output: str, *, ensemble: bool) -> None:
+    """Find out whether there is such a kind of file, and its library."""
+    from scvi_codegen.export import WRITERS
+    from scvi_codegen.export import check_format as check
+
+    known = (".npz", ".csv") if ensemble else tuple(WRITERS)
+    if Path(output).suffix.lower() not in known:
+        what = f"an ensemble is written as {' or '.join(known)}"
+        if not ensemble:
+            what = f"a trajectory is written as {', '.join(known)} or into a folder {SUFFIX}"
+        raise click.BadParameter(f"{what}, not as '{output}'", param_hint="'-o'")
+    check(output)
+
+
+def check_resumed(context: click.Context) -> None:
+    """Refuse whatever would make another run of the one that is to go on."""
+    for name in context.params:
+        given = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
+        if given and name not in WITH_RESUME:
+            word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
+            raise click.UsageError(
+                f"{word} does not go with --resume: the folder says what runs; --steps or --span say how far"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedOutcome:
+    """What came of recording.
+
+    Attributes:
+        recorded: the run as it lies in the folder.
+        run: as it stands there.
+        first: number of steps that had been done before.
+        seconds: spent from there on.
+        failure: the error of the step that failed, or ``None``.
+        interrupted: whether the user or the system stopped it.
+    """
+
+    recorded: RecordedRun
+    run: Run
+    first: int
+    seconds: float
+    failure: StepFailedError | None
+    interrupted: bool
+
+    def summary(self) -> str:
+        """The run in a few lines."""
+        from scvi_codegen.cli.running import duration, final_state
+
+        steps = self.run.steps - self.first
+        lines = [standing(self.recorded)]
+        if steps:
+            since = f" since step {self.first}" if self.first else ""
+            lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} a step, with writing")
+        return "\n".join([*lines, *self._conserved(), *final_state(self.run)])
+
+    def _conserved(self) -> list[str]:
+        """What was conserved, if there is a model to tell what should be."""
+        from numpy import errstate
+
+        from scvi_codegen.cli.running import conserved
+        from scvi_codegen.model_file import parse_model
+
+        text = self.recorded.manifest.model
+        if text is None or not self.run.steps:
+            return []
+        stride = -(-len(self.recorded) // LOOKED_AT)
+        with errstate(all="ignore"):
+            lines = list(conserved(parse_model(text), self.recorded[::stride]))
+        return [f"in one of {stride} states kept:", *lines] if stride > 1 else lines
+
+    def kept(self) -> str:
+        """What was written, and how to go on if that makes sense."""
+        folder = self.recorded.folder
+        states = f"the {len(self.recorded)} states up to there are in '{folder}'"
+        if self.failure is not None:
+            return states
+        return f"{states}; go on with: scvi-codegen run --resume {shlex.quote(str(folder))}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """How often it is written, and what is put beside the states.
+
+    Attributes:
+        seconds, steps: between checkpoints; ``None`` for the default, and for none.
+        certificate: path of a JSON file, or ``None``.
+    """
+
+    seconds: float | None
+    steps: int | None
+    certificate: str | None
+
+    def check(self, recorded: bool) -> None:
+        """Refuse options that would have no effect."""
+        given = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
+        for name, value in given.items():
+            if value is not None and not recorded:
+                raise click.UsageError(f"{name} is for a run that is written into a folder (-o NAME{SUFFIX})")
+
+    def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions) -> RecordedOutcome:
+        """Run a model into a folder, as far as it goes. Raises as :func:`record_run`."""
+        from scvi_codegen.compiler import compile_stepper
+        from scvi_codegen.errors import ModelFileError
+        from scvi_codegen.model_file import dump_model
+        from scvi_codegen.recording import record_run
+
+        text = None
+        with suppress(ModelFileError):
+            text = dump_model(model)
+        run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
+        steps, every = model.step_count, model.every
+        return self._watched(
+            record_run, run, Path(folder), first=0, steps=steps, every=every, model=text, certificate=self.certificate
+        )
+
+    def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
+        """Go on with the run in a folder. Raises as :func:`resume_run`."""
+        from scvi_codegen.recording import load_run, resume_run
+
+        if steps is not None and span is not None:
+            raise click.UsageError("--span and --steps exclude each other")
+        recorded = load_run(folder)
+        goal = recorded.manifest.steps if steps is None else steps
+        if span is not None:
+            goal = max(1, round(span / abs(recorded.manifest.h)))
+        return self._watched(resume_run, Path(folder), first=recorded.steps, steps=goal)
+
+    def _watched(self, act: Any, *arguments: Any, first: int, steps: int, **settings: Any) -> RecordedOutcome:
+        """With a progress bar, ended by Ctrl-C or SIGTERM at a state that is written."""
+        from scvi_codegen.cli.running import interruptions, progress_bar
+        from scvi_codegen.errors import StepFailedError
+        from scvi_codegen.recording import load_run
+
+        pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
+        settings |= {name: value for name, value in pace.items() if value is not None}
+        folder, failure, began, shown = arguments[-1], None, time.perf_counter(), first
+        with interruptions() as caught, progress_bar(steps - first) as advance:
+
+            def look(done: int) -> None:
+                nonlocal shown
+                advance(done - shown)
+                shown = done
+
+            try:
+                act(*arguments, steps=steps, progress=look, stop=lambda: bool(caught), **settings)
+            except StepFailedError as error:
+                failure = error
+        recorded = load_run(folder)
+        return RecordedOutcome(
+            recorded=recorded,
+            run=recorded.resumed(),
+            first=first,
+            seconds=time.perf_counter() - began,
+            failure=failure,
+            interrupted=bool(caught) and not recorded.finished,
+        )
+
+
+def standing(recorded: RecordedRun) -> str:
+    """What runs in a folder and how far it is, in two lines."""
+    from scvi_codegen.cli.running import counted
+
+    manifest = recorded.manifest
+    t = manifest.t + recorded.steps * manifest.h
+    far = "all" if recorded.finished else f"of {manifest.steps}"
+    return (
+        f"{' '.join(manifest.interface.title.split())}\n"
+        f"{counted(recorded.steps, 'step')} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}; "
+        f"{counted(len(recorded), 'state')} kept in '{recorded.folder}'"
+    )
