@@ -15,8 +15,11 @@ kept in the user's cache folder (:mod:`scvi_codegen.text_cache`), so the second 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from scvi_codegen.building import TUNED_FLAGS
+from scvi_codegen.event_source import with_events
+from scvi_codegen.events import EventLike, as_events
 from scvi_codegen.lowering import lower
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
@@ -48,6 +51,7 @@ def compile_stepper(
     solver: str = "auto",
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
+    events: EventLike | Sequence[EventLike] | None = None,
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -61,6 +65,7 @@ def compile_stepper(
             where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
+        events: zero crossings that every run of this stepper records, see :meth:`Stepper.integrate`.
 
     Raises:
         BuildError: if there is no C compiler.
@@ -72,15 +77,22 @@ def compile_stepper(
         return render(program), describe(program, system, method), render_ensemble(program)
 
     source, interface, ensemble = remembered_texts(system, method, solver, prefix, make)
-    return Stepper(source, interface, ensemble=ensemble, flags=flags)
+    return Stepper(source, interface, ensemble=ensemble, flags=flags, events=as_events(events))
 
 
 def generate_source(
-    system: MechanicalSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    events: EventLike | Sequence[EventLike] | None = None,
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
     program = _program(system, method, solver=solver, prefix=prefix)
-    return render(program), describe(program, system, method)
+    source, interface = render(program), describe(program, system, method)
+    functions = tuple(event.function for event in as_events(events))
+    return (with_events(source, interface, functions) if functions else source), interface
 
 
 def _program(system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
@@ -107,6 +119,7 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         unknowns=program.unknowns,
         workspace=workspace_size(program),
         has_action=program.action,
+        momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
     )
 
 

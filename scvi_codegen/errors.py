@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BuildError",
+    "EventError",
     "ExpressionError",
     "MethodError",
     "MethodWarning",
@@ -59,6 +60,10 @@ class ModelFileError(ScviCodegenError, ValueError):
 
 class PackageError(ScviCodegenError, ValueError):
     """A folder that cannot hold a generated package, or holds none."""
+
+
+class EventError(ScviCodegenError, ValueError):
+    """An event function that cannot be watched: an unknown symbol, a constant, a direction, a value that is not finite."""
 
 
 class PlotError(ScviCodegenError):

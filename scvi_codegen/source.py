@@ -33,6 +33,7 @@ class Interface:
         unknowns: length of the run's memory of its last stages.
         workspace: doubles of workspace per call.
         has_action: whether the method has a discrete Lagrangian.
+        momentum_names: of a Hamiltonian; see :attr:`momenta`.
     """
 
     prefix: str
@@ -46,11 +47,17 @@ class Interface:
     unknowns: int
     workspace: int
     has_action: bool
+    momentum_names: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:
         """Degrees of freedom m."""
         return len(self.coordinates)
+
+    @property
+    def momenta(self) -> tuple[str, ...]:
+        """Names of the momenta: those of a Hamiltonian, else ``p_`` before the coordinate's."""
+        return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
 
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`."""

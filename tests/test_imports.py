@@ -19,6 +19,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 FLOORS = """
     errors precision program source ordering
     derivatives expression_text nodes arguments
+    events
     symbols regularity quadrature
     mechanical_system translation
     system
@@ -36,16 +37,20 @@ FLOORS = """
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
     solvers.separable solvers.coupled solvers.collocation solvers.shooting
+    event_source
     solvers.choice
     solvers
     trajectory
     binding text_cache
+    dense_output event_search
+    recording
     run ensemble
     stepper
     compiler
     problems pilot
     model_file
     package plotting advice distributed ensemble_file
+    motion
     exact
     __init__
     benchmark
