@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["checked_times", "states_at", "times_of_run", "whole_steps"]
 
 Array = NDArray[np.float64]
+ROUNDINGS = 4.0
 ON_GRID = 1e-6
 """By how much of a step a kept state may seem to be off the grid of steps; rounding of large times makes it so."""
 
@@ -38,7 +39,7 @@ def states_at(trajectory: Trajectory, times: Array) -> tuple[Array, Array]:
         StateError: for times outside, or if the states kept do not stand at whole steps (those of ``t_eval``).
         StepFailedError: if a step of a part of h fails.
     """
-    _check_within(times, trajectory.t)
+    times = _within(times, trajectory.t[0], trajectory.t[-1])
     _check_on_grid(trajectory)
     forward = math.copysign(1.0, trajectory.h)
     left = np.searchsorted(forward * trajectory.t, forward * times, side="right") - 1
@@ -54,7 +55,7 @@ def _whole_steps(spans: Array, h: float) -> NDArray[np.int64]:
     """Steps of h that fit into spans; one that only rounding makes too long fits."""
     ratio = spans / h
     nearest = np.rint(ratio)
-    fits = np.abs(ratio - nearest) <= 4.0 * np.finfo(float).eps * np.maximum(1.0, nearest)
+    fits = np.abs(ratio - nearest) <= ROUNDINGS * np.finfo(float).eps * np.maximum(1.0, nearest)
     return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
 
 
@@ -111,23 +112,25 @@ def times_of_run(t_eval: ArrayLike, t: float, h: float, steps: int) -> Array:
         raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
     if (np.diff(times) * h < 0.0).any():
         raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
-    _check_within(times, np.array([t, t + steps * h]))
-    return times
+    return _within(times, t, t + steps * h)
 
 
-def _check_within(times: Array, kept: Array) -> None:
-    low, high = min(kept[0], kept[-1]), max(kept[0], kept[-1])
-    outside = times[(times < low) | (times > high)]
+def _within(times: Array, first: float, last: float) -> Array:
+    """The times, those beyond an end by no more than rounding at it."""
+    low, high = min(first, last), max(first, last)
+    slack = ROUNDINGS * np.finfo(float).eps * max(abs(first), abs(last))
+    outside = times[(times < low - slack) | (times > high + slack)]
     if outside.size:
         raise StateError(
-            f"t = {outside[0]:.17g} is outside of the trajectory, which goes from {kept[0]:.17g} to {kept[-1]:.17g}"
+            f"t = {outside[0]:.17g} is outside of the trajectory, which goes from {first:.17g} to {last:.17g}"
         )
+    return np.clip(times, low, high)
 
 
 def _check_on_grid(trajectory: Trajectory) -> None:
     """All states but the last, which an event may have ended, stand at whole steps from the first."""
     steps = (trajectory.t[:-1] - trajectory.t[0]) / trajectory.h
-    rounding = 4.0 * np.finfo(float).eps * np.abs(trajectory.t).max() / abs(trajectory.h)
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(trajectory.t).max() / abs(trajectory.h)
     if np.abs(steps - np.round(steps)).max(initial=0.0) > max(ON_GRID, rounding):
         raise StateError(
             "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
