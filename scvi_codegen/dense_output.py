@@ -1,11 +1,16 @@
 """States between steps: a step of a part of h from the kept state before, by the method itself.
 
-Such a state is as accurate as the method, for every method and solver. It depends continuously on time, is the state kept
-at both ends of a step, and needs nothing that a run would have to store. A polynomial through what a step leaves behind
-(states and their rates at both ends, or the velocities at the stages) costs less to evaluate, but is of order 4, or of
-about half the order of the method. Measured with SVI(8) on Kepler's problem, e = 0.5, 40 steps a revolution: the largest
-error along a revolution is 1e-11 in the states kept and between them, with cubic polynomials through states and
-velocities 2e-3; a state takes 0.7 microseconds (``tests/test_dense_output.py`` measures the orders).
+Such a state is as accurate as the method, for every method and solver. It depends continuously on time, is the state
+kept at both ends of a step, and needs nothing that a run would have to store. A polynomial through what a step leaves
+behind costs less to evaluate, but is of order 4 (states and velocities at both ends), or of about half the order of the
+method (the curve of its stages). Measured on one revolution of Kepler's problem, e = 0.5, largest errors of the
+positions at 2001 times:
+
+    method, steps    states kept    between them    cubics through positions and velocities
+    SVI(4), 40       7.0e-8         7.0e-8          9.7e-5
+    SVI(8), 20       4.2e-11        4.2e-11         1.3e-3
+
+A state takes 0.65 microseconds there, four times as long as a step of the run, whose first guess is better.
 """
 
 from __future__ import annotations
@@ -21,10 +26,9 @@ from scvi_codegen.binding import step_failure
 from scvi_codegen.errors import StateError
 
 if TYPE_CHECKING:
-    from scvi_codegen.stepper import Stepper
     from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["checked_times", "states_at", "times_of_run", "whole_steps"]
+__all__ = ["checked_times", "states_at", "times_of_run"]
 
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0

@@ -63,7 +63,7 @@ class PackageError(ScviCodegenError, ValueError):
 
 
 class EventError(ScviCodegenError, ValueError):
-    """An event function that cannot be watched: an unknown symbol, a constant, a direction, a value that is not finite."""
+    """An event that cannot be watched: an unknown symbol, a constant, another direction, a value that is not finite."""
 
 
 class PlotError(ScviCodegenError):

@@ -78,7 +78,7 @@ class EventSearch:
             )
             count = int(filled[0])
             self.found.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
-            done += report.steps
+            done += int(report.steps)
             if status:
                 raise self._failure(status, report, done, part)
             if self.ended:

@@ -3,15 +3,15 @@
 The search uses nothing of an integrator but its public functions, so that it stands behind every method and solver, and
 the text without events stays what it is. What it does on a step is said in ``templates/parts/events.c.jinja``:
 
-* the functions are evaluated at the ends and at three states between them, each a step of a part of h, and polynomials
+* the functions are evaluated at its ends and at three states between them, each a step of a part of h, and polynomials
   of degree 4 drawn through the values;
-* a polynomial without an extremum near zero tells how often its function crosses. Where an extremum is so near that
-  its sign is in doubt (nearer than the last two Chebyshev coefficients), the step is split there, ``SPLITS`` times over;
+* a polynomial tells how often its function crosses zero. Where an extremum is so near zero that its sign is in doubt
+  (nearer than the last two Chebyshev coefficients), the step is split there, ``SPLITS`` times over, and the function
+  decides;
 * each crossing is enclosed by steps of parts of h until the ends are neighbouring numbers.
 
-So no pair of crossings is missed where a function is a polynomial of degree 4 in time on the step, nor where its
-polynomial of degree 4 on a part tells its extrema to within the doubt; a function that turns more often than that within
-a step can hide one.
+No pair of crossings is missed where a function is a polynomial of degree 4 in time along a step. Of others those are
+found that their polynomials of degree 4 hint at; one that turns back and forth more often within a step can hide some.
 """
 
 from __future__ import annotations
@@ -82,7 +82,10 @@ def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kern
 def _names(interface: Interface) -> dict[str, Symbol]:
     """What a function may use; a momentum's default name gives way to a coordinate or parameter of that name."""
     velocities = [name + DOT for name in interface.coordinates]
-    return {name: symbol(name) for name in (*interface.coordinates, *velocities, *interface.momenta, TIME, *interface.parameters)}
+    return {
+        name: symbol(name)
+        for name in (*interface.coordinates, *velocities, *interface.momenta, TIME, *interface.parameters)
+    }
 
 
 def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:

@@ -1,7 +1,7 @@
 """Runs of which more is wanted than every so-many-th state: events, or states at given times.
 
-The run itself is the plain one, a portion at a time with all its states; the events are looked for between them, what is
-wanted is kept, and the rest forgotten. So states are the same, bit for bit, with events and without.
+The run itself is the plain one, a portion at a time with all its states; the events are looked for between them, what
+is wanted is kept, and the rest forgotten. So states are the same, bit for bit, with events and without.
 """
 
 from __future__ import annotations

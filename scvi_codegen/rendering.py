@@ -44,6 +44,8 @@ KEEP_RATE = 0.1
 GOOD_GUESS = 1e-3
 """Relative error below which the next guess is continued from two steps, not one."""
 MOST_TRIALS = 100
+SMALL_PART = 0.03
+STEEPNESS = 8.0
 BISECTIONS = 30
 """Halvings of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60."""
 POINT_SOURCES = ("u", "t")
@@ -153,6 +155,8 @@ def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
         "doubts": search.doubts,
         "splits": search.splits,
         "events": search.kernel.values,
+        "small_part": SMALL_PART,
+        "steepness": STEEPNESS,
         "trials": MOST_TRIALS,
         "bisections": BISECTIONS,
         "inverse_roots": [k for k in needed if f" {INVERSE_ROOT}{k}(double" not in source.code],
