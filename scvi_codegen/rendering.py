@@ -43,7 +43,7 @@ KEEP_CHANGE = 1e-2
 KEEP_RATE = 0.1
 GOOD_GUESS = 1e-3
 """Relative error below which the next guess is continued from two steps, not one."""
-MOST_TRIALS = 100
+MOST_TRIALS = 200
 SMALL_PART = 0.03
 STEEPNESS = 8.0
 BISECTIONS = 30
