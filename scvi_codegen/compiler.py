@@ -65,7 +65,7 @@ def compile_stepper(
             where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
-        events: zero crossings that every run of this stepper records, see :meth:`Stepper.integrate`.
+        events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
 
     Raises:
         BuildError: if there is no C compiler.

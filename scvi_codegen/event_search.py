@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["EventSearch", "crossings_of"]
 
+ON_GRID = 1e-6
+"""By how much of a step two states may seem to be nearer or farther; rounding of large times makes it so."""
 ROOM = 256
 """Crossings that one call can report; a step with more makes room for twice as many."""
 
@@ -46,8 +49,12 @@ class EventSearch:
         """Whether a terminal event was met."""
         return bool(self.watch.ended)
 
-    def search(self, part: Trajectory) -> int:
+    def search(self, part: Trajectory, first: int = 0) -> int:
         """Look between the states of a trajectory that has all of them; the number of steps before the search ended.
+
+        Args:
+            part: the trajectory.
+            first: number of its first state in the run, for messages.
 
         Raises:
             EventError: where a function is not finite.
@@ -80,7 +87,7 @@ class EventSearch:
             self.found.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
             done += int(report.steps)
             if status:
-                raise self._failure(status, report, done, part)
+                raise self._failure(status, report, first + done, part)
             if self.ended:
                 return done - 1
             if done == len(t) - 1:
@@ -110,11 +117,23 @@ def crossings_of(stepper: Stepper, trajectory: Trajectory) -> tuple[Crossings, .
         StateError: if states between were not kept.
         EventError, StepFailedError: as :meth:`EventSearch.search`.
     """
-    distance = np.abs(np.diff(trajectory.t) / trajectory.h)
-    if distance.max(initial=0.0) > 1.5:
-        raise StateError("events are looked for between consecutive steps, but this trajectory was kept with every > 1")
+    lengths = np.diff(trajectory.t) / trajectory.h
+    whole = np.abs(lengths - 1.0) <= ON_GRID
+    if not whole[:-1].all() or (lengths > 1.0 + ON_GRID).any():
+        raise StateError(
+            "events are looked for between consecutive steps, but this trajectory was kept with every > 1 or t_eval"
+        )
     search = EventSearch(stepper)
     for number in range(len(stepper.events)):
         search.watch.remaining[number] = 0
-    search.search(trajectory)
+    steps = int(whole.sum())
+    search.search(_part(trajectory, slice(steps + 1), trajectory.h))
+    if steps < len(whole):  # an event ended the last step
+        search.search(_part(trajectory, slice(steps, None), float(trajectory.t[-1] - trajectory.t[-2])))
     return search.crossings()
+
+
+def _part(trajectory: Trajectory, states: slice, h: float) -> Trajectory:
+    """Some of the states, with steps of h."""
+    kept = {name: getattr(trajectory, name)[states] for name in ("t", "q", "p", "iterations")}
+    return replace(trajectory, h=h, **kept)

@@ -6,6 +6,7 @@ is wanted is kept, and the rest forgotten. So states are the same, bit for bit, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,9 @@ __all__ = ["Recording"]
 Array = NDArray[np.float64]
 NUMBERS = 2**18
 """Of positions in a portion."""
-MOST_STEPS = 4096
+FIRST_STEPS = 64
+SLICE_SECONDS = 0.1
+"""Time between looks at the keyboard (and calls of ``progress``)."""
 
 
 class Recording:
@@ -53,19 +56,22 @@ class Recording:
         """
         steps = checked_count(steps, "steps", least=0)
         self._keep(self.run.record_states(0), first=True)
-        portion = max(1, min(MOST_STEPS, NUMBERS // self.run.stepper.dimension))
-        done = 0
+        most = max(1, NUMBERS // self.run.stepper.dimension)
+        portion, done = min(FIRST_STEPS, most), 0
         while done < steps:
+            size, began = min(portion, steps - done), time.perf_counter()
             try:
-                self._portion(min(portion, steps - done))
+                self._portion(size)
             except StepFailedError as failure:
                 failure.trajectory = self.trajectory()
                 raise
             if self.search is not None and self.search.ended:
                 break
-            done += portion
+            done += size
             if progress is not None:
-                progress(min(done, steps))
+                progress(done)
+            elapsed = max(time.perf_counter() - began, 1e-6)
+            portion = max(1, min(most, 2 * size, int(size * SLICE_SECONDS / elapsed)))
         return self.trajectory()
 
     def _portion(self, size: int) -> None:
@@ -76,7 +82,7 @@ class Recording:
         except StepFailedError as error:
             part, failure = error.recorded, error
         if self.search is not None:
-            reached = self.search.search(part)
+            reached = self.search.search(part, first=self.run.steps - len(part) + 1)
             if self.search.ended:
                 self.run.rewind(before)
                 part, failure = self._ended(self.run.record_states(reached)), None

@@ -16,7 +16,13 @@ from scvi_codegen.cli import main
 from scvi_codegen.model_file import load_model
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SCRIPTS = ("custom_sympy_system", "import_generated_stepper", "inspect_derivation", "kepler_conservation")
+SCRIPTS = (
+    "custom_sympy_system",
+    "import_generated_stepper",
+    "inspect_derivation",
+    "kepler_conservation",
+    "poincare_section",
+)
 ENERGY_ERRORS = {"outer_solar_system": 1e-13, "pendulum": 1e-8, "kepler": 1e-12, "double_pendulum": 1e-11}
 
 
@@ -83,3 +89,16 @@ def test_inspect_derivation_shows_equations_latex_and_radicals(tmp_path):
     assert "27a" in output
     assert r"\tag{27a}" in output
     assert "sqrt(3)" in output
+
+
+def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(tmp_path):
+    lines = output_of("poincare_section", tmp_path).splitlines()
+    assert len(lines) == 3
+    for line in lines:
+        count, away, error = re.search(r"(\d+) crossings, .x. < (\S+), energy error (\S+)", line).groups()
+        assert int(count) > 1000
+        assert float(away) < 1e-14
+        assert float(error) < 1e-13
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        f"section_{name}.png" for name in ("regular", "mixed", "chaotic")
+    }
