@@ -5,6 +5,7 @@
       -> solvers   Sweep           a solver without a matrix, where there is one (:mod:`scvi_codegen.solvers`)
       -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)
       -> render    Source          header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering`)
+         (with events, the search for them behind it: :mod:`scvi_codegen.event_source`)
       -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.stepper`)
 

@@ -28,12 +28,11 @@ from scvi_codegen.errors import StateError
 if TYPE_CHECKING:
     from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["checked_times", "states_at", "times_of_run"]
+__all__ = ["checked_times", "grid_tolerance", "states_at", "times_of_run"]
 
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0
 ON_GRID = 1e-6
-"""By how much of a step a kept state may seem to be off the grid of steps; rounding of large times makes it so."""
 
 
 def states_at(trajectory: Trajectory, times: Array) -> tuple[Array, Array]:
@@ -131,11 +130,16 @@ def _within(times: Array, first: float, last: float) -> Array:
     return np.clip(times, low, high)
 
 
+def grid_tolerance(trajectory: Trajectory) -> float:
+    """By how much of a step a kept state may seem to be off the grid of steps: times are rounded."""
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(trajectory.t).max() / abs(trajectory.h)
+    return float(max(ON_GRID, rounding))
+
+
 def _check_on_grid(trajectory: Trajectory) -> None:
     """All states but the last, which an event may have ended, stand at whole steps from the first."""
     steps = (trajectory.t[:-1] - trajectory.t[0]) / trajectory.h
-    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(trajectory.t).max() / abs(trajectory.h)
-    if np.abs(steps - np.round(steps)).max(initial=0.0) > max(ON_GRID, rounding):
+    if np.abs(steps - np.round(steps)).max(initial=0.0) > grid_tolerance(trajectory):
         raise StateError(
             "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
             "integrate without t_eval, then ask for states between"

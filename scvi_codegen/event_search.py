@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.binding import step_failure
+from scvi_codegen.dense_output import grid_tolerance
 from scvi_codegen.errors import EventError, StateError
 from scvi_codegen.events import Crossings
 
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["EventSearch", "crossings_of"]
 
-ON_GRID = 1e-6
-"""By how much of a step two states may seem to be nearer or farther; rounding of large times makes it so."""
 ROOM = 256
 """Crossings that one call can report; a step with more makes room for twice as many."""
 
@@ -118,8 +117,9 @@ def crossings_of(stepper: Stepper, trajectory: Trajectory) -> tuple[Crossings, .
         EventError, StepFailedError: as :meth:`EventSearch.search`.
     """
     lengths = np.diff(trajectory.t) / trajectory.h
-    whole = np.abs(lengths - 1.0) <= ON_GRID
-    if not whole[:-1].all() or (lengths > 1.0 + ON_GRID).any():
+    tolerance = grid_tolerance(trajectory)
+    whole = np.abs(lengths - 1.0) <= tolerance
+    if not whole[:-1].all() or (lengths > 1.0 + tolerance).any():
         raise StateError(
             "events are looked for between consecutive steps, but this trajectory was kept with every > 1 or t_eval"
         )

@@ -42,7 +42,8 @@ FLOORS = """
     solvers
     trajectory
     binding text_cache
-    dense_output event_search
+    dense_output
+    event_search
     recording
     run ensemble
     stepper
