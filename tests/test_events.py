@@ -18,7 +18,7 @@ from sympy.physics.mechanics import dynamicsymbols
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.errors import EventError, ExpressionError, StateError, StepFailedError
 from scvi_codegen.events import Event
-from scvi_codegen.hamiltonian import HamiltonianSystem, hamiltonian_of
+from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods import (
     SCVI,
@@ -275,9 +275,6 @@ def test_a_terminal_event_before_a_step_that_fails_is_met():
     assert run.q[-1, 0] == pytest.approx(5, abs=1e-14)
 
 
-# What functions may be made of.
-
-
 def test_states_are_the_same_bits_with_events_and_without(kepler):
     start = at_perihelion(0.5) | {"h": 0.1, "steps": 10_000}
     plain, watched = kepler.integrate(**start), kepler.integrate(**start, events="q1")
@@ -314,7 +311,6 @@ def test_hamiltonians_call_their_momenta_as_they_like():
     assert np.array_equal(run.events[0].t, run.events[1].t)
     assert np.abs(run.events[0].t - expected[0].t).max() < 1e-12
     assert np.abs(run.events[2].t - expected[1].t).max() < 1e-12
-    assert hamiltonian_of(problem("kepler").system).momenta[0].name == "p_q1"
 
 
 def test_point_vortices_have_no_velocity_kernel_of_their_own():
@@ -360,9 +356,6 @@ def test_errors_say_which_symbol_or_function(pendulum, event, error, words):
 def test_events_are_checked(arguments, error):
     with pytest.raises(error):
         Event("q", **arguments)
-
-
-# Texts.
 
 
 def test_a_stepper_with_events_is_pickled_and_keeps_them(pendulum):
