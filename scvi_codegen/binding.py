@@ -63,6 +63,10 @@ class Binding:
         """A zeroed ``<prefix>_<what>``, as in ``"run *"``."""
         return self._ffi.new(f"{self._interface.prefix}_{what}")
 
+    def number(self, what: str) -> Any:
+        """A zeroed number of C, as in ``"long long *"``."""
+        return self._ffi.new(what)
+
     def buffer(self, struct: Any) -> Any:
         """The bytes of a struct, writable."""
         return self._ffi.buffer(struct)

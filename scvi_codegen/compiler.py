@@ -5,6 +5,7 @@
       -> solvers   Sweep           a solver without a matrix, where there is one (:mod:`scvi_codegen.solvers`)
       -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)
       -> render    Source          header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering`)
+         (with events, the search for them behind it: :mod:`scvi_codegen.event_source`)
       -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.stepper`)
 
@@ -18,6 +19,8 @@ import re
 from collections.abc import Sequence
 
 from scvi_codegen.building import TUNED_FLAGS
+from scvi_codegen.event_source import with_events
+from scvi_codegen.events import EventLike, as_events
 from scvi_codegen.lowering import lower
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
@@ -51,6 +54,7 @@ def compile_stepper(
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
     symmetries: Sequence[Symmetry] = (),
+    events: EventLike | Sequence[EventLike] | None = None,
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -66,6 +70,7 @@ def compile_stepper(
         prefix: of the C names; by default made from the names of system and method.
         symmetries: known beside those that are found (:func:`~scvi_codegen.symmetry.check_symmetry`): their momentum
             maps are tracked, too.
+        events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
 
     Raises:
         BuildError: if there is no C compiler.
@@ -77,7 +82,7 @@ def compile_stepper(
         return render(program), describe(program, system, method), render_ensemble(program)
 
     source, interface, ensemble = remembered_texts(system, method, (solver, prefix, *map(repr, symmetries)), make)
-    return Stepper(source, interface, ensemble=ensemble, flags=flags)
+    return Stepper(source, interface, ensemble=ensemble, flags=flags, events=as_events(events))
 
 
 def generate_source(
@@ -87,10 +92,13 @@ def generate_source(
     solver: str = "auto",
     prefix: str | None = None,
     symmetries: Sequence[Symmetry] = (),
+    events: EventLike | Sequence[EventLike] | None = None,
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
     program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
-    return render(program), describe(program, system, method)
+    source, interface = render(program), describe(program, system, method)
+    functions = tuple(event.function for event in as_events(events))
+    return (with_events(source, interface, functions) if functions else source), interface
 
 
 def _program(
@@ -123,6 +131,7 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         map_names=tuple(each.name for each in program.momentum_maps),
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
+        momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
     )
 
 

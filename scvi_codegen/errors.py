@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BuildError",
     "CacheWarning",
+    "EventError",
     "ExpressionError",
     "MethodError",
     "MethodWarning",
@@ -63,6 +64,10 @@ class ModelFileError(ScviCodegenError, ValueError):
 
 class PackageError(ScviCodegenError, ValueError):
     """A folder that cannot hold a generated package, or holds none."""
+
+
+class EventError(ScviCodegenError, ValueError):
+    """An event that cannot be watched: an unknown symbol, a constant, another direction, a value that is not finite."""
 
 
 class PlotError(ScviCodegenError):

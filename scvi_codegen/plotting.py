@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["check_plot_path", "draw_trajectory", "plot_trajectory"]
+__all__ = ["check_plot_path", "draw_section", "draw_trajectory", "plot_section", "plot_trajectory"]
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,8 @@ SUFFIXES = (".png", ".svg")
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
 MOST_POINTS = 20_000
 MOST_CURVES = 6
+FEW_POINTS = 2000
+WAY = {1: ", rising", 0: "", -1: ", falling"}
 BINS = 600
 STYLE = {
     "font.size": 10,
@@ -68,6 +70,68 @@ def plot_trajectory(trajectory: Trajectory, path: str | os.PathLike[str]) -> Non
     Raises:
         StateError, PlotError: as :func:`check_plot_path`.
     """
+    _write(lambda: draw_trajectory(trajectory), path)
+
+
+def plot_section(
+    trajectories: Trajectory | Sequence[Trajectory],
+    path: str | os.PathLike[str],
+    *,
+    axes: tuple[str, str],
+    event: int = 0,
+) -> None:
+    """Draw a Poincare section, a colour a trajectory, and write the picture as :func:`plot_trajectory` does.
+
+    Args:
+        trajectories: one or several of the same system, integrated with ``events``.
+        path: the file, .png or .svg.
+        axes: two names of coordinates or momenta (``p_`` before the coordinate, or as the Hamiltonian calls it).
+        event: which of the events cuts, by its number.
+
+    Raises:
+        StateError: for an unknown name, or without such an event.
+        PlotError: as :func:`check_plot_path`.
+    """
+    several = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
+    _write(lambda: draw_section(several, axes, event), path)
+
+
+def draw_section(trajectories: Sequence[Trajectory], axes: tuple[str, str], event: int = 0) -> Figure:
+    """The figure of :func:`plot_section`."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.6, 5.2), layout="constrained")
+    panel = figure.subplots()
+    points = [[_at_crossings(trajectory, name, event) for name in axes] for trajectory in trajectories]
+    size = 2.0 if sum(len(x) for x, _ in points) > FEW_POINTS else 4.0
+    for number, (x, y) in enumerate(points):
+        panel.plot(x, y, ".", color=COLORS[number % len(COLORS)], markersize=size, markeredgewidth=0.0)
+    stepper = trajectories[0].stepper
+    cut = stepper.events[event]
+    panel.set(xlabel=axes[0], ylabel=axes[1])
+    panel.set_title(f"{stepper.interface.system}: {cut.function} = 0{WAY[cut.direction]}".replace("$", r"\$"))
+    return figure
+
+
+def _at_crossings(trajectory: Trajectory, name: str, event: int) -> Array:
+    """(k,) values of a coordinate or momentum at the crossings of an event."""
+    interface = trajectory.stepper.interface
+    if not -len(trajectory.events) <= event < len(trajectory.events):
+        raise StateError(
+            f"there is no event {event} in a trajectory with {len(trajectory.events)}: integrate(..., events=...)"
+        )
+    found = trajectory.events[event]
+    columns = {
+        **{name: found.p[:, k] for k, name in enumerate(interface.momenta)},
+        **{name: found.q[:, k] for k, name in enumerate(interface.coordinates)},
+    }
+    if name not in columns:
+        raise StateError(f"{name!r} is neither a coordinate nor a momentum; there are {', '.join(sorted(columns))}")
+    return columns[name]
+
+
+def _write(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> None:
+    """A figure into a file, whole or not at all, with equal bytes for equal figures."""
     check_plot_path(path)
     import matplotlib as mpl
 
@@ -75,7 +139,7 @@ def plot_trajectory(trajectory: Trajectory, path: str | os.PathLike[str]) -> Non
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
 
     def write(file: IO[bytes]) -> None:
-        draw_trajectory(trajectory).savefig(file, format=kind, dpi=150, metadata=metadata)
+        draw().savefig(file, format=kind, dpi=150, metadata=metadata)
 
     with mpl.rc_context(STYLE):
         write_atomically(path, write)

@@ -23,7 +23,16 @@ from scvi_codegen.c_printer import (
 from scvi_codegen.program import CoupledSweep, Family, Kernel, Program, SeparableSweep, Sweep
 from scvi_codegen.source import Interface, Source
 
-__all__ = ["DEFAULT_TOLERANCE", "MAX_ITERATIONS", "ExampleRun", "render", "render_example", "template_folder"]
+__all__ = [
+    "DEFAULT_TOLERANCE",
+    "MAX_ITERATIONS",
+    "EventSearch",
+    "ExampleRun",
+    "render",
+    "render_events",
+    "render_example",
+    "template_folder",
+]
 
 DEFAULT_TOLERANCE = 2.0**-52
 """Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
@@ -34,6 +43,11 @@ KEEP_CHANGE = 1e-2
 KEEP_RATE = 0.1
 GOOD_GUESS = 1e-3
 """Relative error below which the next guess is continued from two steps, not one."""
+MOST_TRIALS = 200
+SMALL_PART = 0.03
+STEEPNESS = 8.0
+BISECTIONS = 30
+"""Halvings of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60."""
 POINT_SOURCES = ("u", "t")
 TRAJECTORY_SOURCES = ("u", "parameters")
 ENSEMBLE_LANES = 8
@@ -56,6 +70,30 @@ class ExampleRun:
     h: float
     every: int
     outputs: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSearch:
+    """What the search for zeros of functions of the state is made from.
+
+    Attributes:
+        prefix, dimension: of the integrator.
+        kernel: the functions at u = (q, p, v).
+        uses_velocity: whether v occurs in them.
+        nodes: (d + 1,) where they are evaluated on a part of a step, as fractions of it.
+        coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
+        doubts: of the last two of these, what part of them is in doubt.
+        splits: how many times over a step is split at most.
+    """
+
+    prefix: str
+    dimension: int
+    kernel: Kernel
+    uses_velocity: bool
+    nodes: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+    doubts: tuple[float, float]
+    splits: int
 
 
 def template_folder() -> Path:
@@ -101,6 +139,32 @@ def render_ensemble(program: Program) -> Source | None:
         header=environment.get_template("ensemble.h.jinja").render(context),
         code=environment.get_template("ensemble.c.jinja").render(context),
         declarations=environment.get_template("parts/ensemble_declarations.h.jinja").render(context),
+    )
+
+
+def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
+    """Declarations and code of the search for events, to stand behind those of an integrator."""
+    needed = _inverse_roots(scalar_functions(search.kernel))
+    context = {
+        "prefix": search.prefix,
+        "dimension": search.dimension,
+        "kernel": search.kernel,
+        "uses_velocity": search.uses_velocity,
+        "nodes": search.nodes,
+        "coefficients": search.coefficients,
+        "doubts": search.doubts,
+        "splits": search.splits,
+        "events": search.kernel.values,
+        "small_part": SMALL_PART,
+        "steepness": STEEPNESS,
+        "trials": MOST_TRIALS,
+        "bisections": BISECTIONS,
+        "inverse_roots": [k for k in needed if f" {INVERSE_ROOT}{k}(double" not in source.code],
+    }
+    environment = _environment()
+    return (
+        environment.get_template("parts/events_declarations.h.jinja").render(context),
+        environment.get_template("parts/events.c.jinja").render(context),
     )
 
 

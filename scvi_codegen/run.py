@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.arguments import checked_count
 from scvi_codegen.binding import SolverOptions, step_failure
+from scvi_codegen.events import Crossings
+from scvi_codegen.observation import Observation
 from scvi_codegen.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -78,12 +80,29 @@ class Run:
         """The whole memory of the run, for :meth:`Stepper.restore` on the same kind of machine."""
         return bytes(self.stepper.binding.buffer(self._memory))
 
+    def rewind(self, saved: bytes) -> None:
+        """Back to when :meth:`save` gave these bytes."""
+        self.stepper.binding.buffer(self._memory)[:] = saved
+
+    def skip(self, steps: int) -> None:
+        """Advance by ``steps`` and keep nothing."""
+        self.record_states(steps, every=max(1, steps + self.steps))
+
     def record(self, steps: int, *, every: int = 1, progress: Callable[[int], None] | None = None) -> Trajectory:
         """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``every``.
 
+        The events of the stepper, if it has any, are recorded; a terminal one ends the run before the step it is in.
+
         Raises:
             StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
+            EventError: where an event function is not finite.
         """
+        if self.stepper.events:
+            return Observation(self, every=every).advance(steps, progress)
+        return self.record_states(steps, every=every, progress=progress)
+
+    def record_states(self, steps: int, *, every: int = 1, progress: Callable[[int], None] | None = None) -> Trajectory:
+        """The same without events."""
         steps = checked_count(steps, "steps", least=0)
         every = checked_count(every, "every", least=1)
         first = self.steps
@@ -100,13 +119,13 @@ class Run:
             done += report.steps
             filled = 1 + (first + done) // every - first // every
             if status:
-                kept = self._trajectory(t[:filled], q[:filled], p[:filled], iterations[:filled])
+                kept = self.trajectory(t[:filled], q[:filled], p[:filled], iterations[:filled])
                 raise step_failure(status, report, step=self.steps, h=self._memory.h, trajectory=kept)
             if progress is not None:
                 progress(done)
             elapsed = max(time.perf_counter() - began, 1e-6)
             portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
-        return self._trajectory(t, q, p, iterations)
+        return self.trajectory(t, q, p, iterations)
 
     def _advance(
         self, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
@@ -128,7 +147,10 @@ class Run:
         )
         return status, report
 
-    def _trajectory(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]) -> Trajectory:
+    def trajectory(
+        self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], events: tuple[Crossings, ...] = ()
+    ) -> Trajectory:
+        """These states as states of this run."""
         return Trajectory(
             t=t,
             q=q,
@@ -137,6 +159,8 @@ class Run:
             h=float(self._memory.h),
             parameters=self._parameters,
             stepper=self.stepper,
+            options=self._options,
+            events=events,
         )
 
 

@@ -37,6 +37,7 @@ class Interface:
         has_action: whether the method has a discrete Lagrangian.
         map_names, map_formulas: of the momentum maps, what symmetries conserve.
         map_exact: whether the method is known to conserve them exactly, to round-off.
+        momentum_names: of a Hamiltonian; see :attr:`momenta`.
     """
 
     prefix: str
@@ -53,6 +54,7 @@ class Interface:
     map_names: tuple[str, ...] = ()
     map_formulas: tuple[str, ...] = ()
     map_exact: tuple[bool, ...] = ()
+    momentum_names: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -62,6 +64,11 @@ class Interface:
     def about(self) -> dict[str, str]:
         """Title, system, method, and version of this package: what belongs beside every number computed."""
         return {"title": self.title, "system": self.system, "method": self.method, "version": __version__}
+
+    @property
+    def momenta(self) -> tuple[str, ...]:
+        """Names of the momenta: those of a Hamiltonian, else ``p_`` before the coordinate's."""
+        return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
 
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`."""

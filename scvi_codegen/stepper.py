@@ -19,7 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen import building
 from scvi_codegen.arguments import checked_number, checked_step
 from scvi_codegen.binding import STATUS, Binding, SolverOptions, step_failure
+from scvi_codegen.dense_output import checked_times, states_at, times_of_run
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.event_search import crossings_of
+from scvi_codegen.events import Crossings, Event, EventLike, as_events
+from scvi_codegen.observation import Observation
 from scvi_codegen.run import Run
 from scvi_codegen.source import Interface, Source
 from scvi_codegen.trajectory import Trajectory
@@ -44,6 +48,7 @@ class Stepper:
         momentum_map_names: what symmetries conserve.
         source: the C text it was compiled from.
         ensemble: the C text for many trajectories at once, compiled when first used; ``None`` if the method has none.
+        events: zero crossings that every run records.
     """
 
     def __init__(
@@ -53,15 +58,18 @@ class Stepper:
         *,
         ensemble: Source | None = None,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
+        events: tuple[Event, ...] = (),
     ) -> None:
-        self.source, self.interface, self.ensemble, self.flags = source, interface, ensemble, flags
-        self.binding = Binding(building.load(source, flags=flags), interface)
+        self.interface, self.ensemble, self.flags, self.events = interface, ensemble, flags, events
+        self._plain = source
+        self.source = _watching(source, interface, events) if events else source
+        self.binding = Binding(building.load(self.source, flags=flags), interface)
 
     def __repr__(self) -> str:
         return f"<Stepper {self.title}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_rebuild, (self.source, self.interface, self.ensemble, self.flags))
+        return (_rebuild, (self._plain, self.interface, self.ensemble, self.flags, self.events))
 
     @property
     def title(self) -> str:
@@ -150,6 +158,8 @@ class Stepper:
         parameters: Parameters = None,
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
+        t_eval: ArrayLike | None = None,
+        events: EventLike | Sequence[EventLike] | None = None,
     ) -> Trajectory:
         """Run ``steps`` steps and keep every ``every``-th state, the initial one first.
 
@@ -161,16 +171,44 @@ class Stepper:
             t: initial time.
             parameters, options: as in :meth:`step`.
             progress: called now and then with the number of steps done.
+            t_eval: (n,) times, sorted as the run goes: keep the states at these instead, as :meth:`Trajectory.at` gives
+                them.
+            events: zero crossings to record as ``events`` of the trajectory; a terminal one ends it. An
+                :class:`~scvi_codegen.events.Event`, a function of (q, v, p, t) as text or SymPy expression, or several.
+                They are compiled with the integrator, once. By default those of :func:`compile_stepper`.
 
         Returns:
-            A :class:`Trajectory` of steps // every + 1 states.
+            A :class:`Trajectory` of steps // every + 1 states, fewer if an event ended it.
 
         Raises:
             StateError: on wrong shapes, names or numbers.
+            EventError: for an event with an unknown symbol, or where its function is not finite.
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
-        run = self.start(q, p, h=h, t=t, parameters=parameters, options=options)
-        return run.record(steps, every=every, progress=progress)
+        stepper = self if events is None else self.with_events(events)
+        run = stepper.start(q, p, h=h, t=t, parameters=parameters, options=options)
+        if t_eval is None:
+            return run.record(steps, every=every, progress=progress)
+        if every != 1:
+            raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
+        return Observation(run, times=times_of_run(t_eval, t, h, steps)).advance(steps, progress)
+
+    def with_events(self, events: EventLike | Sequence[EventLike]) -> Stepper:
+        """The same integrator, whose runs record these events in place of its own."""
+        wanted = as_events(events)
+        if wanted == self.events:
+            return self
+        return Stepper(self._plain, self.interface, ensemble=self.ensemble, flags=self.flags, events=wanted)
+
+    def crossings(self, trajectory: Trajectory) -> tuple[Crossings, ...]:
+        """The events of this stepper along a trajectory of the same integrator, see :meth:`Trajectory.crossings`."""
+        return crossings_of(self, trajectory)
+
+    def states_at(self, trajectory: Trajectory, t: ArrayLike) -> tuple[Array, Array]:
+        """States between those of a trajectory, see :meth:`Trajectory.at`."""
+        times = checked_times(t, "t")
+        q, p = states_at(trajectory, times.ravel())
+        return q.reshape(*times.shape, -1), p.reshape(*times.shape, -1)
 
     def integrate_ensemble(
         self,
@@ -470,5 +508,13 @@ class Stepper:
         raise StateError(f"there is no parameter {name!r} among {', '.join(self.parameters) or 'none'}{hint}")
 
 
-def _rebuild(source: Source, interface: Interface, ensemble: Source | None, flags: tuple[str, ...]) -> Stepper:
-    return Stepper(source, interface, ensemble=ensemble, flags=flags)
+def _watching(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+    from scvi_codegen.event_source import with_events  # here, because it imports SymPy
+
+    return with_events(source, interface, tuple(event.function for event in events))
+
+
+def _rebuild(
+    source: Source, interface: Interface, ensemble: Source | None, flags: tuple[str, ...], events: tuple[Event, ...]
+) -> Stepper:
+    return Stepper(source, interface, ensemble=ensemble, flags=flags, events=events)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.export import States, to_dataframe, to_xarray, write_states
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from scvi_codegen.binding import SolverOptions
+    from scvi_codegen.events import Crossings, Event, EventLike
     from scvi_codegen.stepper import Stepper
 
 __all__ = ["Trajectory", "relative_changes"]
@@ -34,6 +37,8 @@ class Trajectory:
         h: step size (negative: backward).
         parameters: (k,) values in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
+        options: convergence of the stage equations, ``None`` for the defaults.
+        events: the zero crossings found, parallel to ``stepper.events``.
     """
 
     t: Array
@@ -43,6 +48,8 @@ class Trajectory:
     h: float
     parameters: Array
     stepper: Stepper = field(repr=False)
+    options: SolverOptions | None = field(default=None, repr=False)
+    events: tuple[Crossings, ...] = ()
 
     def __len__(self) -> int:
         return len(self.t)
@@ -73,6 +80,39 @@ class Trajectory:
             h=self.h,
             about=interface.about(),
         )
+
+    @property
+    def ended_by(self) -> Event | None:
+        """The terminal event that ended the run, at whose crossing the last state is, or ``None``."""
+        for found in self.events:
+            if found.event.terminal and len(found) >= int(found.event.terminal):
+                return found.event
+        return None
+
+    def at(self, t: ArrayLike) -> tuple[Array, Array]:
+        """States between those kept: steps of a part of h, as accurate as the method and continuous in t.
+
+        A whole step is the state kept there, so nothing jumps; where only every so-many-th was kept, the steps between
+        are taken again, to round-off. Backward runs as well.
+
+        Args:
+            t: a time, or (n,) times in any order, within the trajectory.
+
+        Returns:
+            (q, p), each (m,) for a number and (n, m) for times.
+
+        Raises:
+            StateError: for times outside, and of a trajectory made with ``t_eval``.
+        """
+        return self.stepper.states_at(self, t)
+
+    def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
+        """Zero crossings of functions along the trajectory, looked for now; it needs all states (``every=1``).
+
+        Args:
+            events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
+        """
+        return self.stepper.with_events(events).crossings(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, atomically.

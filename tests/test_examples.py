@@ -22,6 +22,7 @@ SCRIPTS = (
     "import_generated_stepper",
     "inspect_derivation",
     "kepler_conservation",
+    "poincare_section",
 )
 ENERGY_ERRORS = {
     "outer_solar_system": 1e-13,
@@ -105,3 +106,16 @@ def test_inspect_derivation_shows_equations_latex_and_radicals(tmp_path):
     assert "27a" in output
     assert r"\tag{27a}" in output
     assert "sqrt(3)" in output
+
+
+def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(tmp_path):
+    lines = output_of("poincare_section", tmp_path).splitlines()
+    assert len(lines) == 3
+    for line in lines:
+        count, away, error = re.search(r"(\d+) crossings, .x. < (\S+), energy error (\S+)", line).groups()
+        assert int(count) > 1000
+        assert float(away) < 1e-14
+        assert float(error) < 1e-13
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        f"section_{name}.png" for name in ("regular", "mixed", "chaotic")
+    }

@@ -20,6 +20,7 @@ FLOORS = """
     version
     errors precision program source ordering bodies files
     derivatives expression_text nodes arguments export cache
+    events
     symbols regularity quadrature
     mechanical_system translation
     system
@@ -44,16 +45,21 @@ FLOORS = """
     solvers.curve_tables
     solvers.separable solvers.coupled solvers.collocation solvers.shooting
     solvers.hamiltonian
+    event_source
     solvers.choice
     solvers
     trajectory
     binding text_cache
+    dense_output
+    event_search
+    observation
     run ensemble
     stepper
     compiler
     problems pilot recording
     model_file
     package plotting advice distributed ensemble_file
+    motion
     exact mathml
     __init__
     benchmark

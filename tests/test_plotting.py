@@ -11,9 +11,10 @@ import pytest
 from scvi_codegen.bodies import bodies
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PlotError, StateError
+from scvi_codegen.events import Event
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.model_file import Model
-from scvi_codegen.plotting import check_plot_path, draw_trajectory, plot_trajectory
+from scvi_codegen.plotting import check_plot_path, draw_section, draw_trajectory, plot_section, plot_trajectory
 from scvi_codegen.problems import problem
 from scvi_codegen.trajectory import Trajectory
 
@@ -126,3 +127,33 @@ def test_dollar_signs_in_names_are_no_formulas(tmp_path):
     system = replace(model.system, name="a $ b $ {")
     stepper = compile_stepper(system, SVI(1))
     plot_trajectory(stepper.integrate([0.5], [0.0], h=0.1, steps=10), tmp_path / "dollar.png")
+
+
+@pytest.fixture(scope="module")
+def orbits() -> list[Trajectory]:
+    system = problem("henon-heiles").system
+    stepper = compile_stepper(system, StoermerVerlet(), flags=("-O0",), events=["y", Event("x", 1)])
+    return [stepper.integrate([0.0, y], [0.3, 0.0], h=0.1, steps=3000) for y in (-0.1, 0.2)]
+
+
+def test_a_section_has_the_states_at_the_crossings(orbits, tmp_path):
+    figure = draw_section(orbits, ("y", "p_y"), event=1)
+    (axes,) = figure.axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
+    assert axes.get_title() == "Henon-Heiles system: x = 0, rising"
+    for line, orbit in zip(axes.get_lines(), orbits, strict=True):
+        assert len(line.get_xdata()) > 40
+        assert np.array_equal(line.get_xydata(), np.stack([orbit.events[1].q[:, 1], orbit.events[1].p[:, 1]], axis=1))
+    one, two = tmp_path / "one.png", tmp_path / "two.png"
+    plot_section(orbits, one, axes=("y", "p_y"), event=1)
+    plot_section(orbits, two, axes=("y", "p_y"), event=1)
+    assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [({"axes": ("y", "z")}, "'z' is neither"), ({"axes": ("y", "p_y"), "event": 2}, "no event 2")],
+)
+def test_a_section_says_what_it_lacks(orbits, arguments, words, tmp_path):
+    with pytest.raises(StateError, match=words):
+        plot_section(orbits[0], tmp_path / "section.png", **arguments)

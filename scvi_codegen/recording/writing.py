@@ -95,7 +95,7 @@ def record_run(
     with _locked(target):
         with recorder.telling_where_it_stands():
             _clear(target)
-            recorder.keep(_piece(run.record(0), 0))
+            recorder.keep(_piece(run.record_states(0), 0))
             recorder.write()
             write_manifest(target, manifest)
             sync_folder(target)
@@ -198,7 +198,7 @@ class _Recorder:
 
     def _advance(self, steps: int) -> None:
         try:
-            self.keep(_piece(self.run.record(steps, every=self.manifest.every), 1))
+            self.keep(_piece(self.run.record_states(steps, every=self.manifest.every), 1))
         except StepFailedError as error:
             if error.trajectory is not None:
                 self.keep(_piece(error.trajectory, 1))
