@@ -18,7 +18,7 @@ from scvi_codegen.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.precision import Vector
 from scvi_codegen.problems import kepler, planar_pendulum
 from scvi_codegen.quadrature import gauss_legendre, gauss_lobatto
-from scvi_codegen.reproduce.digits import derived_step
+from scvi_codegen.derived_step import derived_step
 from scvi_codegen.reproduce.drawing import COLORS, draw_orbit, panels
 from scvi_codegen.reproduce.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
 from scvi_codegen.reproduce.one_degree import drift, judged, largest

@@ -1,0 +1,174 @@
+"""How fast a step approaches the exact motion: in h, and with the degree. In 60 digits, below all rounding.
+
+The compiled step is that of 60 digits up to rounding, which is a check of its own; what is measured here is whether
+those digits are the right ones. The exact motion is computed from the formula alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.exact_motion import Numbers
+from scvi_codegen.methods import method_from_specification
+from scvi_codegen.methods.method import Method
+from scvi_codegen.precision import Number, mp
+from scvi_codegen.verification.certificate import Check, at_least, at_most, broken, not_measured
+from scvi_codegen.verification.subject import State, Subject
+
+__all__ = ["convergence_checks"]
+
+GOAL = mp.mpf(10) ** -17
+"""Error at which the order is measured: below the rounding of doubles, so that no fault of that size hides."""
+FLOOR = mp.mpf(10) ** -38
+"""Errors below are not told from none."""
+MOST_TRIALS, MOST_HALVINGS = 12, 5
+SLACK = 0.2
+LEAST_ORDER = 0.8
+"""Of methods that claim no order: they converge to the motion all the same."""
+FALL = 0.25
+"""Factor by which two degrees more shrink the error at least."""
+
+EXPECTED: Mapping[str, Callable[[int], tuple[int, bool, bool]]] = {
+    "gauss": lambda s: (2 * s, True, True),
+    "radau-iia": lambda s: (2 * s - 1, False, False),
+    "radau-ia": lambda s: (2 * s - 1, False, False),
+    "lobatto-iiia": lambda s: (2 * s - 2, False, True),
+    "chebyshev-gauss": lambda s: (s + s % 2, s == 1, True),
+    "chebyshev-lobatto": lambda s: (s + s % 2, False, True),
+}
+"""Order, whether symplectic (in phase space), whether symmetric: what is known of the families (paper, Table 4)."""
+
+RULES: Mapping[str, Callable[[int], int]] = {
+    "gauss-legendre": lambda n: 2 * n,
+    "gauss-lobatto": lambda n: 2 * n - 2,
+    "gauss-radau-left": lambda n: 2 * n - 1,
+    "gauss-radau-right": lambda n: 2 * n - 1,
+    "clenshaw-curtis": lambda n: n + n % 2,
+    "fejer": lambda n: n + n % 2,
+}
+"""Order of the quadratures."""
+
+
+def convergence_checks(subject: Subject) -> Iterator[Check]:
+    """All of this room."""
+    yield from _claims(subject.method)
+    yield _order(subject)
+    yield from _rate_in_degree(subject)
+
+
+def _claims(method: Method) -> Iterator[Check]:
+    """The properties that the method computes from its coefficients are those of its family."""
+    expected = _expected(method)
+    if expected is None:
+        return
+    own = (method.order, method.symplectic, method.symmetric)
+    name, promise = "claims", "order, symplecticity and symmetry are those known of the family"
+    if own == expected:
+        yield at_most(name, promise, 0.0, 0.0, f"order {own[0]}")
+    else:
+        yield broken(name, promise, f"they are {own}, known are {expected}")
+
+
+def _expected(method: Method) -> tuple[int | None, bool, bool] | None:
+    what = method.specification()
+    kind = str(what["method"])
+    if kind in EXPECTED:
+        order, symplectic, symmetric = EXPECTED[kind](int(str(what["stages"])))
+        return order, symplectic and what["form"] == "phase-space", symmetric
+    family, _, count = str(what.get("quadrature", "")).partition(":")
+    if kind == "svi" and family in RULES and "space" not in what:
+        degree, points = int(str(what["degree"])), int(count)
+        order = min(2 * degree, RULES[family](points))
+        return order if points >= degree else None, True, "radau" not in family
+    return {"stoermer-verlet": (2, True, True), "explicit-euler": (1, False, False)}.get(kind)
+
+
+def _order(subject: Subject) -> Check:
+    order = subject.method.order
+    name = "order"
+    promise = f"order {order} in h" if order else "the steps approach the motion (no order is claimed)"
+    try:
+        measured, error = _measured_order(subject)
+    except (StateError, ArithmeticError) as failure:
+        return not_measured(name, promise, str(failure))
+    if measured is None:
+        return at_most(name, promise, float(error), float(FLOOR), "a step is exact")
+    return at_least(name, promise, measured, (order - SLACK) if order else LEAST_ORDER, f"where a step errs by {error:.1e}")
+
+
+def _measured_order(subject: Subject) -> tuple[float | None, float]:
+    """From the errors of a step and of half of it, both below rounding; with the larger of them."""
+    state, power = subject.states[0], (subject.method.order or 1) + 1
+    h = mp.mpf(state.h)
+    error = _error(subject, subject.method, state, h)
+    for _ in range(MOST_TRIALS):
+        if error <= GOAL:
+            break
+        h *= min(mp.mpf("0.5"), max((GOAL / error / 10) ** (mp.one / power), mp.mpf("1e-4")))
+        error = _error(subject, subject.method, state, h)
+    best: tuple[float | None, float] = (None, float(error))
+    for _ in range(MOST_HALVINGS):
+        half = _error(subject, subject.method, state, h / 2)
+        if half < FLOOR:
+            break
+        measured = float(mp.log(error / half, 2)) - 1
+        if best[0] is None or measured > best[0]:
+            best = (measured, float(error))
+        if measured >= (subject.method.order or 1) - SLACK:
+            break
+        h, error = h / 2, half
+    return best
+
+
+def _error(subject: Subject, method: Method, state: State, h: Number) -> Number:
+    """Of one step of length h, relative to the sizes of q and of p."""
+    found = subject.derived(method)(state.q, state.p, h, state.t)
+    q, p = _exact(subject, state, h)
+    m, scales = len(state.q), subject.scales(state)
+    return max(*(abs(found.q - q) / scales[:m]), *(abs(found.p - p) / scales[m:]))
+
+
+def _exact(subject: Subject, state: State, h: Number) -> tuple[Numbers, Numbers]:
+    return subject.motion.flow(state.q, state.p, h, state.t)
+
+
+def _rate_in_degree(subject: Subject) -> Iterator[Check]:
+    what = subject.method.specification()
+    key = "degree" if "degree" in what else "stages" if "stages" in what else None
+    if key is None or "abscissae" in what:
+        return
+    name, promise = "rate in degree", "two degrees more shrink the error of a step at least fourfold"
+    size = int(str(what[key]))
+    others = [other for change in (-2, 2) if (other := _of_size(what, key, size + change)) is not None]
+    if not others:
+        yield not_measured(name, promise, "neighbouring degrees do not exist with this quadrature")
+        return
+    state = subject.states[0]
+    low, high = (others[0], subject.method) if size > 2 else (subject.method, others[0])
+    try:
+        errors = [_error(subject, method, state, mp.mpf(state.h)) for method in (low, high)]
+    except (StateError, ArithmeticError) as failure:
+        yield not_measured(name, promise, str(failure))
+        return
+    remark = f"{low.name}: {float(errors[0]):.1e}, {high.name}: {float(errors[1]):.1e}, h = {state.h:g}"
+    if errors[0] < FLOOR:
+        yield at_most(name, promise, float(errors[1]), float(FLOOR), remark)
+    else:
+        yield at_most(name, promise, float(errors[1] / errors[0]), FALL, remark)
+
+
+def _of_size(what: Mapping[str, Any], key: str, size: int) -> Method | None:
+    """The method of another degree, with as many points more or less."""
+    if size < 1:
+        return None
+    changed = {**what, key: size}
+    family, colon, count = str(what.get("quadrature", "")).partition(":")
+    if colon and count.isdigit():
+        changed["quadrature"] = f"{family}:{int(count) + size - int(what[key])}"
+    try:
+        return method_from_specification(changed)
+    except MethodError:
+        return None

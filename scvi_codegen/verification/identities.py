@@ -1,0 +1,159 @@
+"""Methods that must be one and the same map, by paths through the generator that differ; solved in 60 digits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
+from scvi_codegen.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import is_separable
+from scvi_codegen.methods.collocation import CollocationRK, Gauss, RungeKutta, SpectralCollocation
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.quadrature import Quadrature, clenshaw_curtis, fejer, gauss_legendre, gauss_lobatto, gauss_radau
+from scvi_codegen.spaces import Polynomials
+from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.verification.certificate import Check, at_most, not_measured
+from scvi_codegen.verification.subject import Subject
+
+__all__ = ["identity_checks"]
+
+EQUAL, ROUNDED = 1e-30, 1e-13
+"""Of equations in 60 digits; of equations whose tables are rounded together to 52 bits."""
+LARGEST_TWIN = 6
+"""Coordinates up to which Legendre's transform is taken symbolically."""
+
+POINTS: dict[str, Callable[[int], Quadrature]] = {
+    "gauss": gauss_legendre,
+    "radau-iia": lambda s: gauss_radau(s, "right"),
+    "lobatto-iiia": gauss_lobatto,
+    "chebyshev-gauss": fejer,
+    "chebyshev-lobatto": clenshaw_curtis,
+}
+"""The quadrature on whose points a family of tableaux collocates."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Twin:
+    """Another way to the same map."""
+
+    name: str
+    method: Method
+    bound: float = EQUAL
+
+
+def identity_checks(subject: Subject) -> Iterator[Check]:
+    """Those that apply to the method and the system."""
+    for twin in _twins(subject.moved, subject.method):
+        yield _compared(subject, f"identity: {twin.name}", subject.moved, twin.method, twin.bound)
+    yield from _legendre_twin(subject)
+
+
+def _compared(subject: Subject, name: str, system: MechanicalSystem, method: Method, bound: float) -> Check:
+    promise = "the same step by another path"
+    state = subject.states[0]
+    try:
+        own = subject.solved(0)
+        other = subject.derived(method, system)(state.q, state.p, state.h, state.t)
+    except (StateError, ArithmeticError, MethodError) as error:
+        return not_measured(name, promise, str(error))
+    scales = subject.scales(state)
+    apart = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / scales
+    return at_most(name, promise, float(max(apart)), bound, method.name)
+
+
+def _twins(system: MechanicalSystem, method: Method) -> Iterator[_Twin]:
+    separable = is_separable(system)
+    if isinstance(method, SVI):
+        yield from _galerkin_twins(method, separable)
+    elif isinstance(method, SCVI):
+        yield from _shooting_twins(method, separable)
+    elif isinstance(method, SpectralCollocation):
+        abscissae = [(x + 1) / 2 for x in method.node_set.points[1:]]
+        yield _Twin("collocation at its nodes", CollocationRK(abscissae, form=method.form))
+    elif isinstance(method, RungeKutta):
+        yield from _tableau_twins(method)
+    if isinstance(method, SpectralCollocation | RungeKutta) and separable:
+        yield _Twin("position form is phase-space form for constant mass", _other_form(method))
+    if isinstance(method, StoermerVerlet) and separable:
+        yield _Twin("SVI of degree 1 with the trapezoidal rule", SVI(1, "gauss-lobatto:2"), ROUNDED)
+        yield _Twin("kick, drift, kick", Composition(2), ROUNDED)
+    if isinstance(method, Composition) and method.composition_order == 2:
+        yield _Twin("Lobatto IIIA-IIIB", StoermerVerlet(), ROUNDED)
+
+
+def _galerkin_twins(method: SVI, separable: bool) -> Iterator[_Twin]:
+    s, rule = method.degree, method.rule
+    if not isinstance(method.curves, Polynomials) or rule.derivative_weights:
+        return
+    if s > 1:
+        other = "equispaced" if method.node_set.name != "equispaced" else "chebyshev-lobatto"
+        yield _Twin("independent of its nodes", SVI(s, rule, other))
+    if rule.name == f"gauss-legendre:{s}":
+        yield _Twin("SVI(s, s Gauss points) = Gauss(s)", Gauss(s))
+    if s == 1:
+        yield _Twin("SVI(1) = SCVI(1)", SCVI(1, rule))
+        if rule.name == "gauss-lobatto:2" and separable:
+            yield _Twin("SVI(1, trapezoidal rule) = Stoermer-Verlet", StoermerVerlet(), ROUNDED)
+
+
+def _shooting_twins(method: SCVI, separable: bool) -> Iterator[_Twin]:
+    s, rule = method.degree, method.rule
+    if s == 1:
+        yield _Twin("SCVI(1) = SVI(1)", SVI(1, rule))
+    elif method.variational and method.abscissae is None:
+        abscissae = tuple((x + 1) / 2 for x in method.node_set.points[1:])
+        yield _Twin("its nodes as abscissae", SCVI(s, rule, abscissae=abscissae), ROUNDED)
+    elif method.abscissae == "gauss" and rule.name == f"gauss-legendre:{s}" and separable:
+        yield _Twin("SCVI on Gauss points = SVI", SVI(s, rule), ROUNDED)
+
+
+def _tableau_twins(method: RungeKutta) -> Iterator[_Twin]:
+    family, _, stages = method.tableau.name.partition(":")
+    if family in POINTS:
+        points = POINTS[family](int(stages)).abscissae
+        yield _Twin("collocation at the points of a quadrature", CollocationRK(list(points), form=method.form))
+    if family == "gauss" and method.form == "phase-space":
+        s = int(stages)
+        yield _Twin("Gauss(s) = SVI(s, s Gauss points)", SVI(s))
+
+
+def _other_form(method: SpectralCollocation | RungeKutta) -> Method:
+    form = "position" if method.form == "phase-space" else "phase-space"
+    if isinstance(method, SpectralCollocation):
+        return SpectralCollocation(method.degree, method.node_set, form)
+    return RungeKutta(method.tableau, form)
+
+
+def _legendre_twin(subject: Subject) -> Iterator[Check]:
+    """The step of the Hamiltonian of a Lagrangian, or the other way round."""
+    system, method = subject.moved, subject.method
+    singular = isinstance(system, HamiltonianSystem) and not system.is_regular
+    if singular or getattr(getattr(method, "rule", None), "derivative_weights", ()):
+        return
+    name = "identity: from H as from L"
+    if system.dimension > LARGEST_TWIN:
+        yield not_measured(name, "the same step", f"more than {LARGEST_TWIN} coordinates")
+        return
+    try:
+        twin = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
+    except SystemDefinitionError as error:
+        yield not_measured(name, "the same step", str(error))
+        return
+    yield _compared(subject, name, twin, method, _bound(method))
+
+
+def _lagrangian(system: MechanicalSystem) -> LagrangianSystem:
+    assert isinstance(system, HamiltonianSystem)
+    return lagrangian_of(system)
+
+
+def _bound(method: Method) -> float:
+    """Equal tables make equal steps, rounded or not."""
+    return EQUAL
