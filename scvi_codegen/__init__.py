@@ -72,6 +72,7 @@ _HOMES = {
     "stepper": ("Stepper",),
     "system": ("LagrangianSystem",),
     "trajectory": ("Trajectory",),
+    "verification": ("Certificate", "verify"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -7,13 +7,11 @@ kernels are evaluated expression by expression, and the matrix of Newton's itera
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.errors import StateError
@@ -58,19 +56,15 @@ class DerivedStep:
         self.constants = self.motion.parameters
         self.powers = [row.power for row in stages.rows] + [0]
         self.momenta = numbers([*(row.momentum for row in stages.rows), stages.end_momentum])
-        self.gathers = [
-            [numbers(gather.table.entries) for gather in family.gathers] for family in stages.families
-        ]
-        self.scatters = [
-            [numbers(scatter.table.entries) for scatter in family.scatters] for family in stages.families
-        ]
+        self.gathers = [[numbers(gather.table.entries) for gather in family.gathers] for family in stages.families]
+        self.scatters = [[numbers(scatter.table.entries) for scatter in family.scatters] for family in stages.families]
 
     @property
     def unknowns(self) -> int:
         """How many numbers a step is solved for."""
         return len(self.stages.blocks) * self.system.dimension
 
-    def __call__(self, q: Sequence[Any], p: Sequence[Any], h: Any, t: Any = 0) -> SolvedStep:
+    def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """The step from (q, p) at t to t + h; numbers are taken as they are given, so 0.1 is the double.
 
         Raises:
@@ -91,7 +85,7 @@ class DerivedStep:
             last = size
         raise StateError(f"the derived equations were not solved in {MOST_ITERATIONS} iterations with h = {float(h):g}")
 
-    def first_update(self, q: Sequence[Any], p: Sequence[Any], h: Any, t: Any = 0) -> SolvedStep:
+    def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """What one update of Newton's iteration makes of the straight line, the matrix from finite differences."""
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
         z = self._straight(known)
@@ -166,7 +160,7 @@ class DerivedStep:
         point, shared = self._point(family, n, arguments, known), dict[Any, Number]()
         return np.array([evaluate(result, point, shared) for result in family.results], dtype=object)
 
-    def _factor(self, family: PointFamily, s: int, n: int, r: int, known: _Known) -> Number:
+    def _factor(self, family: PointFamily, s: int, n: int, r: Any, known: _Known) -> Number:
         scatter = family.scatters[s]
         scale = mp.mpf(scatter.scale.numerator) / scatter.scale.denominator
         return scale * family.weights[n] * known.h ** (scatter.power + self.powers[r])
@@ -214,7 +208,7 @@ class DerivedStep:
             slopes[:, i] = (self._kernel(family, n, moved, known) - values) / width
         return slopes
 
-    def _matrix(self, z: Numbers, known: _Known) -> NDArray[np.float64]:
+    def _matrix(self, z: Numbers, known: _Known) -> Numbers:
         """The inverse in double precision, with rows and columns scaled to size 1: later updates correct it."""
         exact = self._exact_matrix(z, known)
         rows = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact], dtype=object)
@@ -227,7 +221,8 @@ class DerivedStep:
         return columns[:, None] * inverse * rows
 
     def _solved(self, inverse: Numbers, rows: Numbers) -> Numbers:
-        return (inverse @ rows.ravel()).reshape(rows.shape)
+        update: Numbers = (inverse @ rows.ravel()).reshape(rows.shape)
+        return update
 
     def _end(self, z: Numbers, known: _Known) -> SolvedStep:
         powers = np.array([known.h**block.power for block in self.stages.blocks], dtype=object)

@@ -147,7 +147,8 @@ class Motion:
 
     def _midpoints(self, start: Numbers, h: Number, t: Number, n: int) -> Numbers:
         width = h / n
-        before, now = start, start + width * self._rates(start, t)
+        before: Numbers = start
+        now: Numbers = start + width * self._rates(start, t)
         for j in range(1, n):
             before, now = now, before + 2 * width * self._rates(now, t + j * width)
         return now
@@ -155,7 +156,7 @@ class Motion:
 
 def _solved(matrix: Numbers, right: Numbers) -> Numbers:
     if len(right) == 1:
-        return right / matrix[0, 0]
+        return np.array([right[0] / matrix[0, 0]], dtype=object)
     return np.array(list(mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(right.tolist()))), dtype=object)
 
 

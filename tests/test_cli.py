@@ -19,8 +19,8 @@ from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import main
 from scvi_codegen.cli.choices import Choices, read_model
-from scvi_codegen.cli.conservation import momentum_maps
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.conservation import momentum_maps
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.model_file import Model, load_model, parse_model, save_model
 from scvi_codegen.problems import PROBLEMS, problem

@@ -32,6 +32,8 @@ FLOORS = """
     methods.collocation methods.composition
     methods.shooting
     methods
+    exact_motion
+    derived_step
     equations lowering c_printer
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
@@ -46,6 +48,11 @@ FLOORS = """
     problems pilot
     model_file
     package plotting advice distributed ensemble_file
+    conservation
+    verification.certificate verification.linearisation
+    verification.subject
+    verification.stepping verification.structure verification.convergence verification.identities
+    verification
     exact
     __init__
     benchmark

@@ -15,8 +15,8 @@ import click
 import numpy as np
 
 from scvi_codegen.binding import SolverOptions
-from scvi_codegen.cli.conservation import energy_report, momentum_maps
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.conservation import energy_report, momentum_maps
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.model_file import Model
 from scvi_codegen.run import Run

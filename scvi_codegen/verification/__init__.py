@@ -12,16 +12,16 @@ All is measured at states and parameters a little off those given: nothing hides
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import time
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-import scvi_codegen
 from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
@@ -34,6 +34,11 @@ from scvi_codegen.verification.structure import largest_step, structure_checks
 from scvi_codegen.verification.subject import State, Subject
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
+
+Array = NDArray[np.float64]
+
+SEEDS = range(20)
+LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 
 
 def verify(
@@ -88,7 +93,7 @@ def _certificate(subject: Subject, checks: tuple[Check, ...], seconds: float) ->
         title=stepper.title,
         system=subject.system.name,
         method=subject.method.name,
-        version=scvi_codegen.__version__,
+        version=_version(),
         checksum=hashlib.sha256((stepper.source.header + stepper.source.code).encode()).hexdigest(),
         flags=stepper.flags,
         q=tuple(given.q.tolist()),
@@ -99,6 +104,13 @@ def _certificate(subject: Subject, checks: tuple[Check, ...], seconds: float) ->
         checks=checks,
         seconds=seconds,
     )
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("scvi-codegen")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _newton(
@@ -123,10 +135,6 @@ def _given(
     return State(position, momentum, float(t), float(h) if h else _step(stepper, position, momentum, t))
 
 
-SEEDS = range(20)
-LONGEST, HALVINGS, PART = 1.0, 40, 0.1
-
-
 def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:
     """A state of size 1 at which steps succeed and the energy is finite."""
     for seed in SEEDS:
@@ -142,7 +150,7 @@ def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float
     raise StateError(f"no state of '{system.name}' of size 1 was found at which a step succeeds: give q, p and h")
 
 
-def _step(stepper: Stepper, q: ArrayLike, p: ArrayLike, t: float) -> float:
+def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
     """A step that moves q and p by at most a tenth of their size."""
     h = LONGEST
     for _ in range(HALVINGS):

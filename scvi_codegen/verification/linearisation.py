@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 
-__all__ = ["Linearised", "linearised"]
+__all__ = ["WEIGHTS", "Linearised", "linearised"]
 
 Array = NDArray[np.float64]
 Map = Callable[[Array], Array]

@@ -14,6 +14,7 @@ from scvi_codegen.exact_motion import numbers
 from scvi_codegen.precision import mp
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.verification.certificate import Check, at_most, broken, not_measured
+from scvi_codegen.verification.linearisation import WEIGHTS
 from scvi_codegen.verification.subject import LARGEST, State, Subject
 
 __all__ = ["step_checks"]
@@ -55,8 +56,8 @@ def _solves(subject: Subject, stepper: Stepper, name: str, promise: str) -> Chec
         except (StateError, ArithmeticError) as error:
             return not_measured(name, promise, str(error))
         try:
-            error = subject.ends(state, stepper) - _rounded(expected.q, expected.p)
-            worst = max(worst, float(np.max(np.abs(error) / subject.rounding(state))))
+            apart = np.abs(subject.ends(state, stepper) - _rounded(expected.q, expected.p))
+            worst = max(worst, float(np.max(apart / subject.rounding(state))))
         except StepFailedError as failure:
             return broken(name, promise, f"they have a solution, but {failure}")
     return at_most(name, promise, worst, ROUNDINGS, "largest distance in units of rounding, 2 states")
@@ -95,7 +96,8 @@ def _newton(subject: Subject) -> Iterator[Check]:
         return
     found = subject.ends(state, subject.newton, ANY_UPDATE)
     wrong = float(np.max(np.abs((found - exact).astype(float)) / scales))
-    yield at_most(name, promise, max(0.0, wrong - ROUNDINGS * rounding) / way, WRONG_PART, "part of the way that it misses")
+    missed = max(0.0, wrong - ROUNDINGS * rounding) / way
+    yield at_most(name, promise, float(missed), WRONG_PART, "part of the way that it misses")
 
 
 def _fallback(subject: Subject) -> Iterator[Check]:
@@ -171,7 +173,7 @@ def _run(subject: Subject) -> Check:
 
 
 def _action_by_differences(subject: Subject) -> Iterator[Check]:
-    """dS = p1 dq1 - p0 dq0 along the solution, S by evaluation of L alone, its slopes by differences."""
+    """The action S by evaluation of L alone, its slopes by differences: dS = p1 dq1 - p0 dq0 at the solution."""
     name, promise = "stationarity", "the action is stationary, p0 and p1 are its slopes (finite differences, 60 digits)"
     state = subject.states[0]
     try:
@@ -245,10 +247,8 @@ def _slopes(subject: Subject, state: State, q1: Array) -> Array:
     for width in (3e-2, 1e-2, 3e-3, 1e-3):
         moved = width * (np.abs(q1 - state.q).max() or 1.0)
         units = np.eye(2 * m) * moved
-        weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
-        found.append(
-            np.array([sum(w * (action(both + k * e) - action(both - k * e)) for k, w in weights) for e in units]) / moved
-        )
+        changes = [sum(w * (action(both + k * e) - action(both - k * e)) for k, w in WEIGHTS.items()) for e in units]
+        found.append(np.array(changes) / moved)
     best = min(range(1, len(found)), key=lambda k: float(np.abs(found[k] - found[k - 1]).max()))
     slopes: Array = found[best]
     return slopes

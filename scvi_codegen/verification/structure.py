@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scvi_codegen.conservation import MomentumMap, momentum_maps
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.verification.certificate import Check, at_most, broken, information, not_measured
+from scvi_codegen.verification.certificate import Check, at_most, information, not_measured
 from scvi_codegen.verification.subject import EPSILON, State, Subject
 
 __all__ = ["largest_step", "structure_checks"]
@@ -86,10 +86,10 @@ def _momenta(subject: Subject) -> Iterator[Check]:
         try:
             run = subject.stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t)
         except StepFailedError as failure:
-            run = failure.trajectory
-            if run is None or len(run) < TRIED:
-                yield broken(name, promise, str(failure))
+            if failure.trajectory is None or len(failure.trajectory) <= TRIED:
+                yield not_measured(name, promise, str(failure))
                 continue
+            run = failure.trajectory
         steps = len(run) - 1
         bound = ROUNDINGS * EPSILON * float(np.sqrt(steps))
         yield at_most(name, promise, quantity.error(run), bound, f"relative, {steps} steps of {given.h:g}")

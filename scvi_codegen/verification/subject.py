@@ -125,7 +125,9 @@ class Subject:
             return state
         return given
 
-    def step(self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None) -> tuple[Array, Array]:
+    def step(
+        self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None
+    ) -> tuple[Array, Array]:
         """(q1, p1) of the compiled step. Raises as :meth:`Stepper.step`."""
         stepper = stepper or self.stepper
         return stepper.step(state.q, state.p, state.h, state.t, self.parameters, options=options)
@@ -174,7 +176,9 @@ class Subject:
         """
         found = derived_step(system or self.moved, method or self.method)
         if found.unknowns > LARGEST:
-            raise StateError(f"a step has {found.unknowns} unknowns, more than the {LARGEST} that are solved in 60 digits")
+            raise StateError(
+                f"{found.unknowns} unknowns a step are more than the {LARGEST} that are solved in 60 digits"
+            )
         return found
 
     @cached_property
@@ -192,9 +196,6 @@ class Subject:
         """Each state with its number and the size of rounding there."""
         for index, state in enumerate(self.states):
             yield index, state, self.rounding(state)
-
-
-
 
 
 def _rms(values: Array) -> float:
