@@ -16,11 +16,11 @@ import numpy as np
 from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact_motion import Numbers, motion_of, numbers
-from scvi_codegen.expression_text import evaluate
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import Number, mp
 from scvi_codegen.stage_system import PointFamily, StageSystem
+from scvi_codegen.tape import Tape
 
 __all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
 
@@ -53,7 +53,12 @@ class DerivedStep:
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, motion_of(system)
-        self.constants = self.motion.parameters
+        symbols = [(*family.arguments, system.time, *system.parameters) for family in stages.families]
+        self.kernels = [Tape(family.results, own) for family, own in zip(stages.families, symbols, strict=True)]
+        self.scalars = [
+            None if family.scalar is None else Tape([family.scalar], own)
+            for family, own in zip(stages.families, symbols, strict=True)
+        ]
         self.powers = [row.power for row in stages.rows] + [0]
         self.momenta = numbers([*(row.momentum for row in stages.rows), stages.end_momentum])
         self.gathers = [[numbers(gather.table.entries) for gather in family.gathers] for family in stages.families]
@@ -72,18 +77,29 @@ class DerivedStep:
         """
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
         z = self._straight(known)
-        matrix, last = None, mp.inf
+        matrix, rows, last = None, self._rows(z, known), mp.inf
         for _ in range(MOST_ITERATIONS):
             if matrix is None:
                 matrix = self._matrix(z, known)
-            change = self._solved(matrix, self._rows(z, known)[:-1])
-            z, size = z - change, max(map(abs, change.ravel()))
-            if size <= mp.eps**0.75 * max(1, *map(abs, z.ravel())):
-                return self._end(z, known)
+            change = self._solved(matrix, rows[:-1])
+            size = max(map(abs, change.ravel()))
+            z, rows, whole = self._moved(z, change, known)
+            if whole and size <= mp.eps**0.75 * max(1, *map(abs, z.ravel())):
+                return self._end(z, rows, known)
             if size > STEADY * last:
                 matrix = None
             last = size
         raise StateError(f"the derived equations were not solved in {MOST_ITERATIONS} iterations with h = {float(h):g}")
+
+    def _moved(self, z: Numbers, change: Numbers, known: _Known) -> tuple[Numbers, Numbers, bool]:
+        """Unknowns and rows after the update, or so much of it that the formula is defined; whether it is the whole."""
+        for halvings in range(MOST_ITERATIONS):
+            trial = z - change / 2**halvings
+            try:
+                return trial, self._rows(trial, known), halvings == 0
+            except ArithmeticError:
+                continue
+        raise StateError(f"the derived equations lead out of the domain of the formula with h = {float(known.h):g}")
 
     def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """What one update of Newton's iteration makes of the straight line, the matrix from finite differences."""
@@ -91,14 +107,15 @@ class DerivedStep:
         z = self._straight(known)
         matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[:-1]
         update = mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(rows.ravel().tolist()))
-        return self._end(z - np.array(list(update), dtype=object).reshape(z.shape), known)
+        z = z - np.array(list(update), dtype=object).reshape(z.shape)
+        return self._end(z, self._rows(z, known), known)
 
     def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
         """(m,) and (blocks, m) derivatives of the generating function by q0 and the unknowns, by central differences.
 
         ``None`` where a family of points has no scalar.
         """
-        if any(family.scalar is None for family in self.stages.families):
+        if None in self.scalars:
             return None
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
         z = np.array(solved.unknowns, dtype=object).reshape(len(self.stages.blocks), -1)
@@ -125,7 +142,9 @@ class DerivedStep:
             scale = mp.mpf(family.scatters[0].scale.numerator) / family.scatters[0].scale.denominator
             scale /= mp.mpf(family.gathers[0].scale.numerator) / family.gathers[0].scale.denominator
             for n, weight in enumerate(family.weights):
-                value = evaluate(family.scalar, self._point(family, n, arguments[n], known))
+                scalar = self.scalars[f]
+                assert scalar is not None  # or there would be no slopes
+                (value,) = scalar(self._point(family, n, arguments[n], known))
                 total += scale * weight * known.h ** (1 + family.scalar_power) * value
         return total
 
@@ -134,9 +153,9 @@ class DerivedStep:
         v = self.motion.velocity(known.q, known.p, known.t)
         return np.array(
             [
-                block.straight[0] * known.q
-                + block.straight[1] * known.h ** (1 - block.power) * v
-                + block.momentum * known.p
+                known.q * block.straight[0]
+                + v * (block.straight[1] * known.h ** (1 - block.power))
+                + known.p * block.momentum
                 for block in self.stages.blocks
             ],
             dtype=object,
@@ -149,16 +168,14 @@ class DerivedStep:
         parts = []
         for gather, table in zip(self.stages.families[f].gathers, self.gathers[f], strict=True):
             factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
-            parts.append(factor * (table @ columns))
+            parts.append((table @ columns) * factor)
         return np.concatenate(parts, axis=1)
 
-    def _point(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> dict[Any, Number]:
-        values = dict(zip(family.arguments, arguments, strict=True))
-        return {**self.constants, **values, self.system.time: known.t + family.abscissae[n] * known.h}
+    def _point(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> list[Number]:
+        return [*arguments, known.t + family.abscissae[n] * known.h, *self.motion.parameters]
 
-    def _kernel(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> Numbers:
-        point, shared = self._point(family, n, arguments, known), dict[Any, Number]()
-        return np.array([evaluate(result, point, shared) for result in family.results], dtype=object)
+    def _kernel(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
+        return np.array(self.kernels[f](self._point(self.stages.families[f], n, arguments, known)), dtype=object)
 
     def _factor(self, family: PointFamily, s: int, n: int, r: Any, known: _Known) -> Number:
         scatter = family.scatters[s]
@@ -172,11 +189,11 @@ class DerivedStep:
         for f, family in enumerate(self.stages.families):
             arguments = self._arguments(f, z, known)
             for n in range(len(family.abscissae)):
-                values = self._kernel(family, n, arguments[n], known)
+                values = self._kernel(f, n, arguments[n], known)
                 for s, table in enumerate(self.scatters[f]):
                     own = values[s * m : (s + 1) * m]
                     for r in np.flatnonzero(table[n]):
-                        rows[r] = rows[r] + self._factor(family, s, n, r, known) * table[n, r] * own
+                        rows[r] = rows[r] + own * (self._factor(family, s, n, r, known) * table[n, r])
         return rows
 
     def _exact_matrix(self, z: Numbers, known: _Known) -> Numbers:
@@ -187,7 +204,7 @@ class DerivedStep:
         for f, family in enumerate(self.stages.families):
             arguments = self._arguments(f, z, known)
             for n in range(len(family.abscissae)):
-                slopes = self._kernel_slopes(family, n, arguments[n], known)
+                slopes = self._kernel_slopes(f, n, arguments[n], known)
                 for s, rows in enumerate(self.scatters[f]):
                     for g, gather in enumerate(family.gathers):
                         own = slopes[s * m : (s + 1) * m, g * m : (g + 1) * m]
@@ -196,16 +213,16 @@ class DerivedStep:
                             factor = self._factor(family, s, n, r, known) * rows[n, r] * moved
                             for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
                                 entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
-                                matrix[r, :, b, :] += entry * own
+                                matrix[r, :, b, :] += own * entry
         return matrix.reshape(blocks * m, blocks * m)
 
-    def _kernel_slopes(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> Numbers:
-        values = self._kernel(family, n, arguments, known)
+    def _kernel_slopes(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
+        values = self._kernel(f, n, arguments, known)
         slopes = numbers(np.zeros((len(values), len(arguments))))
         for i in range(len(arguments)):
             moved, width = arguments.copy(), WIDTH * max(1, abs(arguments[i]))
             moved[i] += width
-            slopes[:, i] = (self._kernel(family, n, moved, known) - values) / width
+            slopes[:, i] = (self._kernel(f, n, moved, known) - values) / width
         return slopes
 
     def _matrix(self, z: Numbers, known: _Known) -> Numbers:
@@ -224,11 +241,11 @@ class DerivedStep:
         update: Numbers = (inverse @ rows.ravel()).reshape(rows.shape)
         return update
 
-    def _end(self, z: Numbers, known: _Known) -> SolvedStep:
+    def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
         powers = np.array([known.h**block.power for block in self.stages.blocks], dtype=object)
         row = numbers(self.stages.end_position.entries[0])
         q = row @ np.concatenate([known.q[None], powers[:, None] * z])
-        return SolvedStep(unknowns=tuple(z.ravel()), q=tuple(q), p=tuple(self._rows(z, known)[-1]))
+        return SolvedStep(unknowns=tuple(z.ravel()), q=tuple(q), p=tuple(rows[-1]))
 
 
 @lru_cache(maxsize=64)

@@ -8,7 +8,6 @@ against this.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -17,9 +16,9 @@ import sympy
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.expression_text import evaluate
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.precision import Number, mp
+from scvi_codegen.tape import Tape
 
 __all__ = ["Motion", "Numbers", "motion_of", "numbers"]
 
@@ -42,30 +41,43 @@ class Motion:
     def __init__(self, system: MechanicalSystem) -> None:
         self.system, self.hamiltonian = system, bool(system.auxiliaries)
         self.second = system.auxiliaries or system.velocities
-        self.parameters = {name: mp.mpf(value) for name, value in system.constants.items()}
+        self.parameters = [mp.mpf(value) for value in system.defaults]
+        self.symbols = (*system.coordinates, *self.second, system.time, *system.parameters)
 
     @cached_property
-    def _by_position(self) -> list[sympy.Expr]:
-        return [self.system.formula.diff(q) for q in self.system.coordinates]
+    def _formula(self) -> Tape:
+        return Tape([self.system.formula], self.symbols)
 
     @cached_property
-    def _by_second(self) -> list[sympy.Expr]:
+    def _slopes(self) -> list[sympy.Expr]:
         """DL/dv, or dH/dp."""
         return [self.system.formula.diff(x) for x in self.second]
 
     @cached_property
+    def _by_second(self) -> Tape:
+        return Tape(self._slopes, self.symbols)
+
+    @cached_property
     def _curvature(self) -> list[list[sympy.Expr]]:
-        """Derivatives of dL/dv (dH/dp) by v (p), q and t, a row each."""
+        """Derivatives of dL/dv by v, q and t, a row each."""
         variables = (*self.second, *self.system.coordinates, self.system.time)
-        return [[slope.diff(x) for x in variables] for slope in self._by_second]
+        return [[slope.diff(x) for x in variables] for slope in self._slopes]
 
-    def _point(self, q: Numbers, second: Numbers, t: Number) -> dict[sympy.Symbol, Number]:
-        state = zip((*self.system.coordinates, *self.second), (*q, *second), strict=True)
-        return {**self.parameters, **dict(state), self.system.time: t}
+    @cached_property
+    def _momentum_and_mass(self) -> Tape:
+        """DL/dv and d2L/dv2."""
+        m = len(self.second)
+        return Tape([*self._slopes, *(entry for row in self._curvature for entry in row[:m])], self.symbols)
 
-    def _values(self, expressions: Sequence[sympy.Expr], q: Numbers, second: Numbers, t: Number) -> Numbers:
-        point, known = self._point(q, second, t), dict[sympy.Expr, Number]()
-        return np.array([evaluate(expression, point, known) for expression in expressions], dtype=object)
+    @cached_property
+    def _right_hand_side(self) -> Tape:
+        """DL/dq and the derivatives of dL/dv; dH/dp and dH/dq."""
+        by_position = [self.system.formula.diff(q) for q in self.system.coordinates]
+        others = self._slopes if self.hamiltonian else [entry for row in self._curvature for entry in row]
+        return Tape([*by_position, *others], self.symbols)
+
+    def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
+        return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
 
     def momentum(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """(m,) momenta dL/dv of a Lagrangian."""
@@ -80,35 +92,41 @@ class Motion:
         if self.hamiltonian:
             return self._values(self._by_second, q, p, t)
         v = numbers(np.zeros(len(q)))
+        m = len(q)
         for _ in range(MOST_ITERATIONS):
-            mass = self._mass(q, v, t)
-            change = _solved(mass, self.momentum(q, v, t) - p)
-            v = v - change
-            if max(map(abs, change)) <= ACCURACY * max(1, *map(abs, v)):
+            found = self._values(self._momentum_and_mass, q, v, t)
+            change = _solved(found[m:].reshape(m, m), found[:m] - p)
+            v, whole = self._moved(q, v, t, change)
+            if whole and max(map(abs, change)) <= ACCURACY * max(1, *map(abs, v)):
                 return v
+        raise StateError("the momenta of this state have no velocities that Newton's iteration finds")
+
+    def _moved(self, q: Numbers, v: Numbers, t: Number, change: Numbers) -> tuple[Numbers, bool]:
+        """The update, or so much of it that L is defined there; whether it is the whole."""
+        for halvings in range(MOST_ITERATIONS):
+            trial = v - change / 2**halvings
+            try:
+                self.momentum(q, trial, t)
+            except ArithmeticError:
+                continue
+            return trial, halvings == 0
         raise StateError("the momenta of this state have no velocities that Newton's iteration finds")
 
     def energy(self, q: Numbers, p: Numbers, t: Number) -> Number:
         """H, or p . v - L."""
         if self.hamiltonian:
-            return self._values([self.system.formula], q, p, t)[0]
+            return self._values(self._formula, q, p, t)[0]
         v = self.velocity(q, p, t)
-        return p @ v - self._values([self.system.formula], q, v, t)[0]
-
-    def _mass(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
-        m = len(q)
-        entries = [entry for row in self._curvature for entry in row[:m]]
-        return self._values(entries, q, v, t).reshape(m, m)
+        return p @ v - self._values(self._formula, q, v, t)[0]
 
     def _rates(self, state: Numbers, t: Number) -> Numbers:
         """Of (q, p) where H is given, of (q, v) where L is."""
         q, second = np.split(state, 2)
-        force = self._values(self._by_position, q, second, t)
+        m, found = len(q), self._values(self._right_hand_side, q, second, t)
+        force = found[:m]
         if self.hamiltonian:
-            return np.concatenate([self._values(self._by_second, q, second, t), -force])
-        m = len(q)
-        entries = [entry for row in self._curvature for entry in row]
-        slopes = self._values(entries, q, second, t).reshape(m, 2 * m + 1)
+            return np.concatenate([found[m:], -force])
+        slopes = found[m:].reshape(m, 2 * m + 1)
         applied = force - slopes[:, m : 2 * m] @ second - slopes[:, 2 * m]
         return np.concatenate([second, _solved(slopes[:, :m], applied)])
 
@@ -148,9 +166,9 @@ class Motion:
     def _midpoints(self, start: Numbers, h: Number, t: Number, n: int) -> Numbers:
         width = h / n
         before: Numbers = start
-        now: Numbers = start + width * self._rates(start, t)
+        now: Numbers = start + self._rates(start, t) * width
         for j in range(1, n):
-            before, now = now, before + 2 * width * self._rates(now, t + j * width)
+            before, now = now, before + self._rates(now, t + j * width) * (2 * width)
         return now
 
 
