@@ -27,6 +27,7 @@ __all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
 MOST_ITERATIONS = 60
 WIDTH = mp.mpf(10) ** -30
 """Relative, of the differences: slopes to 30 digits."""
+REFINEMENTS = 4
 STEADY = mp.mpf("0.1")
 """The matrix is kept while updates shrink so fast."""
 
@@ -80,7 +81,7 @@ class DerivedStep:
         matrix, rows, last = None, self._rows(z, known), mp.inf
         for _ in range(MOST_ITERATIONS):
             if matrix is None:
-                matrix = self._matrix(z, known)
+                matrix = self._inverse(self._exact_matrix(z, known), known)
             change = self._solved(matrix, rows[:-1])
             size = max(map(abs, change.ravel()))
             z, rows, whole = self._moved(z, change, known)
@@ -106,8 +107,11 @@ class DerivedStep:
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
         z = self._straight(known)
         matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[:-1]
-        update = mp.lu_solve(mp.matrix(matrix.tolist()), mp.matrix(rows.ravel().tolist()))
-        z = z - np.array(list(update), dtype=object).reshape(z.shape)
+        inverse = self._inverse(matrix, known)
+        update = self._solved(inverse, rows)
+        for _ in range(REFINEMENTS):
+            update = update + self._solved(inverse, rows - (matrix @ update.ravel()).reshape(rows.shape))
+        z = z - update
         return self._end(z, self._rows(z, known), known)
 
     def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
@@ -225,9 +229,8 @@ class DerivedStep:
             slopes[:, i] = (self._kernel(f, n, moved, known) - values) / width
         return slopes
 
-    def _matrix(self, z: Numbers, known: _Known) -> Numbers:
+    def _inverse(self, exact: Numbers, known: _Known) -> Numbers:
         """The inverse in double precision, with rows and columns scaled to size 1: later updates correct it."""
-        exact = self._exact_matrix(z, known)
         rows = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact], dtype=object)
         exact = rows[:, None] * exact
         columns = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact.T], dtype=object)
@@ -235,7 +238,8 @@ class DerivedStep:
             inverse = np.linalg.inv((exact * columns).astype(float)).astype(object)
         except np.linalg.LinAlgError as error:
             raise StateError(f"the derived equations are singular with h = {float(known.h):g}") from error
-        return columns[:, None] * inverse * rows
+        result: Numbers = columns[:, None] * inverse * rows
+        return result
 
     def _solved(self, inverse: Numbers, rows: Numbers) -> Numbers:
         update: Numbers = (inverse @ rows.ravel()).reshape(rows.shape)

@@ -6,14 +6,16 @@ import json
 import math
 import os
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from functools import partial
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
+from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.trajectory import write_atomically
 
-__all__ = ["Certificate", "Check", "Outcome", "at_least", "at_most", "broken", "information", "not_measured"]
+__all__ = ["BrokenError", "Certificate", "Check", "Finding", "Outcome", "checked", "information"]
 
 
 class Outcome(StrEnum):
@@ -53,26 +55,44 @@ class Check:
         return f"{self.outcome.value:12}  {self.name}: {self.promise}{': ' + end if end else ''}"
 
 
-def at_most(name: str, promise: str, measured: float, bound: float, remark: str = "") -> Check:
-    """Kept if ``measured <= bound``; a NaN breaks the promise."""
-    kept = Outcome.KEPT if measured <= bound else Outcome.BROKEN
-    return Check(name=name, promise=promise, outcome=kept, measured=measured, bound=bound, remark=remark)
+class Finding(NamedTuple):
+    """A number, and what it is held to: at most the bound, or at least."""
+
+    measured: float
+    bound: float
+    remark: str = ""
+    at_least: bool = False
+
+    @property
+    def kept(self) -> bool:
+        """Whether it is on the right side; a NaN never is."""
+        return self.measured >= self.bound if self.at_least else self.measured <= self.bound
 
 
-def at_least(name: str, promise: str, measured: float, bound: float, remark: str = "") -> Check:
-    """Kept if ``measured >= bound``."""
-    kept = Outcome.KEPT if measured >= bound else Outcome.BROKEN
-    return Check(name=name, promise=promise, outcome=kept, measured=measured, bound=bound, remark=remark)
+class BrokenError(Exception):
+    """A promise that fails without a number."""
 
 
-def broken(name: str, promise: str, reason: str) -> Check:
-    """A promise that failed without a number."""
-    return Check(name=name, promise=promise, outcome=Outcome.BROKEN, remark=reason)
-
-
-def not_measured(name: str, promise: str, reason: str) -> Check:
-    """A promise about which nothing is known, and why."""
-    return Check(name=name, promise=promise, outcome=Outcome.NOT_MEASURED, remark=reason)
+def checked(name: str, promise: str, measure: Callable[[], Finding | None]) -> Iterator[Check]:
+    """The check of a promise; nothing where it does not apply, and the reason where it cannot be measured."""
+    outcome, remark, finding = Outcome.NOT_MEASURED, "", None
+    try:
+        finding = measure()
+        if finding is None:
+            return
+        outcome, remark = Outcome.KEPT if finding.kept else Outcome.BROKEN, finding.remark
+    except BrokenError as fault:
+        outcome, remark = Outcome.BROKEN, str(fault)
+    except (StateError, StepFailedError, MethodError, SystemDefinitionError, ArithmeticError) as reason:
+        remark = str(reason)
+    yield Check(
+        name=name,
+        promise=promise,
+        outcome=outcome,
+        measured=finding and finding.measured,
+        bound=finding and finding.bound,
+        remark=remark,
+    )
 
 
 def information(name: str, what: str, measured: float | None, remark: str = "") -> Check:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
+from scvi_codegen.derived_step import derived_step
+from scvi_codegen.errors import StateError
+from scvi_codegen.exact_motion import motion_of
 from scvi_codegen.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import is_separable
@@ -17,9 +20,9 @@ from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.quadrature import Quadrature, clenshaw_curtis, fejer, gauss_legendre, gauss_lobatto, gauss_radau
-from scvi_codegen.spaces import Polynomials
+from scvi_codegen.spaces import Polynomials, Trigonometric
 from scvi_codegen.system import LagrangianSystem
-from scvi_codegen.verification.certificate import Check, at_most, not_measured
+from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.subject import Subject
 
 __all__ = ["identity_checks"]
@@ -50,22 +53,20 @@ class _Twin:
 
 def identity_checks(subject: Subject) -> Iterator[Check]:
     """Those that apply to the method and the system."""
-    for twin in _twins(subject.moved, subject.method):
-        yield _compared(subject, f"identity: {twin.name}", subject.moved, twin.method, twin.bound)
-    yield from _legendre_twin(subject)
-
-
-def _compared(subject: Subject, name: str, system: MechanicalSystem, method: Method, bound: float) -> Check:
     promise = "the same step by another path"
-    state = subject.states[0]
-    try:
-        own = subject.solved(0)
-        other = subject.derived(method, system)(state.q, state.p, state.h, state.t)
-    except (StateError, ArithmeticError, MethodError) as error:
-        return not_measured(name, promise, str(error))
-    scales = subject.scales(state)
-    apart = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / scales
-    return at_most(name, promise, float(max(apart)), bound, method.name)
+    for twin in _twins(subject.moved, subject.method):
+        measure = partial(_compared, subject, subject.moved, twin.method, twin.bound)
+        yield from checked(f"identity: {twin.name}", promise, measure)
+    yield from checked("identity: from H as from L", promise, partial(_legendre_twin, subject))
+    promise = "a step is exact on the oscillator of the curves' frequency"
+    yield from checked("oscillator", promise, partial(_oscillator, subject.method))
+
+
+def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound: float) -> Finding:
+    state, own = subject.states[0], subject.solved(0)
+    other = subject.derived(method, system)(state.q, state.p, state.h, state.t)
+    apart = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / subject.scales(state)
+    return Finding(float(max(apart)), bound, method.name)
 
 
 def _twins(system: MechanicalSystem, method: Method) -> Iterator[_Twin]:
@@ -131,22 +132,28 @@ def _other_form(method: SpectralCollocation | RungeKutta) -> Method:
     return RungeKutta(method.tableau, form)
 
 
-def _legendre_twin(subject: Subject) -> Iterator[Check]:
+def _legendre_twin(subject: Subject) -> Finding | None:
     """The step of the Hamiltonian of a Lagrangian, or the other way round."""
     system, method = subject.moved, subject.method
     singular = isinstance(system, HamiltonianSystem) and not system.is_regular
     if singular or (isinstance(method, SVI) and method.rule.derivative_weights):
-        return
-    name = "identity: from H as from L"
+        return None
     if system.dimension > LARGEST_TWIN:
-        yield not_measured(name, "the same step", f"more than {LARGEST_TWIN} coordinates")
-        return
-    try:
-        twin = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
-    except SystemDefinitionError as error:
-        yield not_measured(name, "the same step", str(error))
-        return
-    yield _compared(subject, name, twin, method, EQUAL)
+        raise StateError(f"Legendre's transform is taken for {LARGEST_TWIN} coordinates at most")
+    twin = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
+    return _compared(subject, twin, method, EQUAL)
+
+
+def _oscillator(method: Method) -> Finding | None:
+    """Of curves fitted to a frequency, whatever the system; with the quadrature that is made for them."""
+    if not isinstance(method, SVI) or not isinstance(method.curves, Trigonometric):
+        return None
+    if method.quadrature != method.curves.default_rule(method.degree):
+        return None
+    formula, frequency = "(q_dot**2 - w**2*q**2)/2", {"w": method.curves.frequency}
+    system = LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian=formula, parameters=frequency)
+    found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), motion_of(system).flow([0.7], [0.4], 1)
+    return Finding(float(max(abs(found.q[0] - q[0]), abs(found.p[0] - p[0]))), ROUNDED)
 
 
 def _lagrangian(system: MechanicalSystem) -> LagrangianSystem:
