@@ -130,6 +130,17 @@ class Motion:
         applied = force - slopes[:, m : 2 * m] @ second - slopes[:, 2 * m]
         return np.concatenate([second, _solved(slopes[:, :m], applied)])
 
+    def rates(self, q: Numbers, p: Numbers, t: Number) -> tuple[Numbers, Numbers]:
+        """(m,) velocities and forces: the rates of q and p by Hamilton's equations."""
+        v = self.velocity(q, p, t)
+        if self.hamiltonian:
+            return v, self._rates(np.concatenate([q, p]), t)[len(q) :]
+        return v, self._values(self._right_hand_side, q, v, t)[: len(q)]
+
+    def acceleration(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
+        """(m,) accelerations at (q, v) of a Lagrangian."""
+        return self._rates(np.concatenate([q, v]), t)[len(q) :]
+
     def flow(self, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
         """(q, p) at t + h of the motion through (q, p) at t, to about 45 digits.
 

@@ -67,9 +67,9 @@ def case(name: str) -> Case:
 
 WHOLE = """
     pendulum/svi driven/svi kepler/svi-3 double/svi double/lobatto-svi cart/svi pendulum/hermite pendulum/splines
-    pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss kepler/printed double/printed double/sc
-    cart/sc kepler/sc-phase-space double/gauss kepler/gauss double/gauss-position kepler/radau-iia double/radau-ia
-    kepler/lobatto driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
+    pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss kepler/printed double/printed
+    double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss double/gauss-position kepler/radau-iia
+    double/radau-ia kepler/lobatto driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
 """
 CASES = {name: case(name) for name in WHOLE.split()}
 """Everything that is sabotaged, whole."""

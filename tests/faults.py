@@ -89,7 +89,7 @@ def without_rates_of(*names: str) -> Make:
 
     def make(original: Any) -> Any:
         def rate(expressions: Any, variables: Any, rates: Any) -> Any:
-            kept = [pair for pair in zip(variables, rates, strict=True) if pair[0].name not in names]
+            kept = [pair for pair in zip(variables, rates, strict=False) if pair[0].name not in names]
             return original(expressions, *(tuple(part) for part in zip(*kept, strict=True)))
 
         return rate

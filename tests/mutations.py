@@ -142,12 +142,19 @@ MUTATIONS = (
         "moved->relative <= 1e-5",
     ),
     text("sweeps accept too early", case("kepler/svi-3"), r"<= tolerance \* tolerance", "<= 1e-12"),
+    text(
+        "Newton's residual wrong with kept factors",
+        case("pendulum/svi"),
+        r"value\[0\] = ",
+        "value[0] = 1.001*",
+        within="quadrature_value",
+    ),
     text("half of the discrete action", case("pendulum/svi"), r"sum \+= ", "sum += 0.5 * ", within="quadrature_sum"),
     text(
-        "increments of a run scaled",
+        "momenta of a run advanced by dq",
         case("kepler/svi-3"),
-        r"const double sum = x\[i\] \+ increment\[i\]",
-        "const double sum = x[i] + (1.0 + 1e-9) * increment[i]",
+        r"add_compensated\(now\.p, now\.carry_p, dp\)",
+        "add_compensated(now.p, now.carry_p, dq)",
     ),
     text(
         "a kick of the wrong size", case("kepler/composition"), r"dp\[i\] \+= step->h", "dp[i] += 1.0000001 * step->h"

@@ -10,7 +10,7 @@ import numpy as np
 
 from scvi_codegen.derived_step import derived_step
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact_motion import motion_of
+from scvi_codegen.exact_motion import motion_of, numbers
 from scvi_codegen.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import is_separable
@@ -19,6 +19,7 @@ from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.precision import mp
 from scvi_codegen.quadrature import Quadrature, clenshaw_curtis, fejer, gauss_legendre, gauss_lobatto, gauss_radau
 from scvi_codegen.spaces import Polynomials, Trigonometric
 from scvi_codegen.system import LagrangianSystem
@@ -60,6 +61,7 @@ def identity_checks(subject: Subject) -> Iterator[Check]:
     yield from checked("identity: from H as from L", promise, partial(_legendre_twin, subject))
     promise = "a step is exact on the oscillator of the curves' frequency"
     yield from checked("oscillator", promise, partial(_oscillator, subject.method))
+    yield from checked("Euler", "a step is the rates at its start times h", partial(_euler, subject))
 
 
 def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound: float) -> Finding:
@@ -154,6 +156,23 @@ def _oscillator(method: Method) -> Finding | None:
     system = LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian=formula, parameters=frequency)
     found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), motion_of(system).flow([0.7], [0.4], 1)
     return Finding(float(max(abs(found.q[0] - q[0]), abs(found.p[0] - p[0]))), ROUNDED)
+
+
+def _euler(subject: Subject) -> Finding | None:
+    """Explicit Euler written out: order 1 and nothing else would also be kept by the implicit one."""
+    what, state, motion = subject.method.specification(), subject.states[0], subject.motion
+    if what["method"] != "explicit-euler":
+        return None
+    q, p, h, t = numbers(state.q), numbers(state.p), mp.mpf(state.h), mp.mpf(state.t)
+    v, force = motion.rates(q, p, t)
+    if what["form"] == "phase-space":
+        end = [*(q + v * h), *(p + force * h)]
+    elif motion.hamiltonian:
+        raise StateError("positions and velocities of a Hamiltonian are not written out")
+    else:
+        end = [*(q + v * h), *motion.momentum(q + v * h, v + motion.acceleration(q, v, t) * h, t + h)]
+    solved = subject.solved(0)
+    return Finding(float(max(abs(np.array([*solved.q, *solved.p]) - end) / subject.scales(state))), EQUAL)
 
 
 def _lagrangian(system: MechanicalSystem) -> LagrangianSystem:

@@ -121,7 +121,7 @@ def _fallback(subject: Subject) -> Finding | None:
                 iterations, end = _counted(subject, state, SolverOptions(max_iterations=most))
             except StepFailedError:
                 continue
-            if iterations <= most:  # the sweeps converged
+            if iterations <= most + 1:  # the sweeps converged
                 break
             expected = subject.derived()(state.q, state.p, state.h, state.t)
             return Finding(_apart(subject, state, end, expected), ROUNDINGS, f"in units of rounding, h = {state.h:.3g}")
@@ -147,15 +147,18 @@ def _contraction(subject: Subject) -> Finding:
 
 def _run(subject: Subject) -> Finding:
     """A run remembers stages and carries rounding errors; each of its steps must be the step all the same."""
+    worst = max(_run_of(subject, stepper) for stepper in {subject.stepper, subject.newton or subject.stepper})
+    return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also by Newton's solver alone")
+
+
+def _run_of(subject: Subject, stepper: Stepper) -> float:
     first, worst = subject.states[0], 0.0
-    run = subject.stepper.integrate(
-        first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=subject.parameters
-    )
+    run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=subject.parameters)
     for k in range(RUN_STEPS):
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
         change = np.abs(subject.ends(state) - np.concatenate([run.q[k + 1], run.p[k + 1]]))
         worst = max(worst, float(np.max(change / subject.rounding(state))))
-    return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps")
+    return worst
 
 
 def _action(subject: Subject) -> Finding | None:
@@ -196,8 +199,11 @@ def _discrete(subject: Subject) -> Finding | None:
         return None
     q1, p1 = subject.step(state)
     arguments = (state.q, q1, state.h, state.t, subject.parameters)
-    p0, end = stepper.discrete_legendre_minus(*arguments)[1], stepper.discrete_legendre_plus(*arguments)[1]
-    slopes = _slopes_of_action(subject, state, q1)
+    try:
+        p0, end = stepper.discrete_legendre_minus(*arguments)[1], stepper.discrete_legendre_plus(*arguments)[1]
+        slopes = _slopes_of_action(subject, state, q1)
+    except StepFailedError as failure:
+        raise BrokenError(f"the step has a curve from q0 to q1, but looking for it {failure}") from failure
     size = max(np.abs(state.p).max(), np.abs(p1).max()) or 1.0
     wrong = np.concatenate([slopes + np.concatenate([state.p, -p1]), p0 - state.p, end - p1])
     return Finding(float(np.abs(wrong).max() / size), SLOPES, "relative")
