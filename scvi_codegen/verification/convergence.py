@@ -26,6 +26,8 @@ GOAL = mp.mpf(10) ** -17
 """Error at which the order is measured: below the rounding of doubles, so that no fault of that size hides."""
 FLOOR = mp.mpf(10) ** -38
 """Errors below are not told from none."""
+SMALLEST = 1e-9
+"""Part of the step below which none is tried: an error that is not small there is one of order 0."""
 MOST_TRIALS, MOST_HALVINGS = 12, 5
 SLACK = 0.2
 LEAST_ORDER = 0.8
@@ -111,15 +113,19 @@ def _measured_order(subject: Subject) -> tuple[float | None, float]:
     h = mp.mpf(state.h)
     error = _error(subject, subject.method, state, h)
     for _ in range(MOST_TRIALS):
-        if error <= GOAL:
+        if error <= GOAL or abs(h) < SMALLEST * abs(state.h):
             break
         h *= min(mp.mpf("0.5"), max((GOAL / error / 10) ** (mp.one / power), mp.mpf("1e-4")))
         error = _error(subject, subject.method, state, h)
     best: tuple[float | None, float] = (None, float(error))
     for _ in range(MOST_HALVINGS):
         half = _error(subject, subject.method, state, h / 2)
-        if half < FLOOR:
+        if error < FLOOR:
             break
+        if half < FLOOR:
+            h *= 2
+            error = _error(subject, subject.method, state, h)
+            continue
         measured = float(mp.log(error / half, 2)) - 1
         if best[0] is None or measured > best[0]:
             best = (measured, float(error))
