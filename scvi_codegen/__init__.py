@@ -85,6 +85,7 @@ _HOMES = {
     "symmetry": ("Symmetry", "check_symmetry", "symmetries"),
     "system": ("LagrangianSystem",),
     "trajectory": ("Trajectory",),
+    "verification": ("Certificate", "verify"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

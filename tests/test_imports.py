@@ -40,6 +40,8 @@ FLOORS = """
     methods.shooting
     methods
     exactness
+    exact_motion
+    derived_step
     equations lowering c_printer
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
@@ -60,6 +62,10 @@ FLOORS = """
     model_file
     package plotting advice distributed ensemble_file
     motion
+    verification.certificate verification.linearisation
+    verification.subject
+    verification.stepping verification.structure verification.convergence verification.identities
+    verification
     exact mathml
     __init__
     benchmark

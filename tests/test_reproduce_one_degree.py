@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
+from scvi_codegen.derived_step import derived_step
 from scvi_codegen.precision import mp
 from scvi_codegen.reproduce import duffing, one_degree, oscillator, oscillator_orders, overview, pendulum
-from scvi_codegen.reproduce.digits import derived_step
 from scvi_codegen.reproduce.experiment import Experiment, Result, Verdict
 from scvi_codegen.reproduce.running import SECTION_4, stepper_of
 from scvi_codegen.reproduce.writing import draw

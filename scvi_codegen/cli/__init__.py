@@ -41,9 +41,10 @@ Examples:
   scvi-codegen derive planar-pendulum --method svi --degree 2 --quadrature gauss-legendre:2
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
   scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
+  scvi-codegen verify mine_svi                         measure whether it keeps what it promises
 
-Exit status: 0; 2 if the command line or a model is at fault; 1 if a step failed, there is no C compiler or a file
-cannot be written; 130 after Ctrl-C.
+Exit status: 0; 2 if the command line or a model is at fault; 1 if a step failed, a promise is broken, there is
+no C compiler or a file cannot be written; 130 after Ctrl-C.
 """
 
 
@@ -267,6 +268,37 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, **c
 
     equations = derive_equations(model.system, model.method, radicals=radicals)
     _emit(equations.to_latex() if latex else equations.to_text(), output)
+
+
+@main.command(short_help="Measure whether the integrator of MODEL keeps what it promises.")
+@model_arguments
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="The certificate as JSON.")
+@SOLVER_OPTION
+def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> None:
+    """Build the integrator of MODEL and measure what it promises; exit status 1 if a promise is broken.
+
+    MODEL may also be a folder written by 'generate': then the C code in it is what is measured. A step is held against
+    the paper's equations in 60 digits and these against the exact motion; order, symplecticity, reversal, momenta,
+    Newton's matrix and identities between methods are measured. The JSON goes into the folder or beside the model file.
+
+    \b
+    Examples:
+      scvi-codegen verify kepler --method scvi --degree 3
+      scvi-codegen verify mine.toml
+      scvi-codegen generate mine.toml -o mine_svi && scvi-codegen verify mine_svi
+    """  # noqa: D301  (click wants the character \b)
+    from scvi_codegen.cli.verifying import certificate_path, verified
+
+    path = certificate_path(model_name) if output is None else Path(output)
+    if path is not None:
+        _check_writable(path, "'-o'")
+    certificate = verified(model_name, Choices(**choices), solver=solver)
+    click.echo(certificate.to_text(), nl=False)
+    if path is not None:
+        certificate.save(path)
+        click.echo(f"wrote {path}", err=True)
+    if not certificate.passed:
+        raise _Failure(f"broken: {', '.join(check.name for check in certificate.broken)}", FAILURE)
 
 
 @main.command(short_help="List the catalogue, or print an entry as a file.")

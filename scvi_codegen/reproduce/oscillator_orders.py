@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.derived_step import derived_step
 from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.precision import Number, mp
-from scvi_codegen.reproduce.digits import derived_step
 from scvi_codegen.reproduce.drawing import COLORS, draw_powers, panels
 from scvi_codegen.reproduce.experiment import Cell, Check, Experiment, Picture, Result, Table, Verdict
 from scvi_codegen.reproduce.one_degree import judged, svi_with_points

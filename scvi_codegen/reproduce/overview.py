@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.basis import cardinal_values
+from scvi_codegen.derived_step import derived_step
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.precision import Vector
 from scvi_codegen.problems import kepler, planar_pendulum
 from scvi_codegen.quadrature import gauss_legendre, gauss_lobatto
-from scvi_codegen.reproduce.digits import derived_step
 from scvi_codegen.reproduce.drawing import COLORS, draw_orbit, panels
 from scvi_codegen.reproduce.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
 from scvi_codegen.reproduce.one_degree import drift, judged, largest

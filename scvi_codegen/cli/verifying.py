@@ -1,0 +1,53 @@
+"""``scvi-codegen verify``: the certificate of a model, or of a generated folder as it stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from scvi_codegen.cli.choices import Choices, read_model
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import PackageError
+from scvi_codegen.model_file import Model
+from scvi_codegen.package import load_package
+from scvi_codegen.stepper import Stepper
+from scvi_codegen.verification import Certificate, verify
+
+__all__ = ["certificate_path", "verified"]
+
+MODEL_FILE, CERTIFICATE = "model.toml", "certificate.json"
+METHOD_CHOICES = tuple(
+    "method degree stages order nodes quadrature space form variational abscissae".split()  # noqa: SIM905  (a line of words)
+)
+
+
+def verified(name: str, choices: Choices, *, solver: str) -> Certificate:
+    """The certificate of a model file, an entry of the catalogue or a generated folder.
+
+    Raises:
+        click.UsageError: for a folder with another method or solver than it was generated with.
+        ScviCodegenError: as reading and building the model do.
+    """
+    folder = Path(name)
+    if not folder.is_dir():
+        model = read_model(name, choices)
+        return _certificate(model, compile_stepper(model.system, model.method, solver=solver), solver)
+    if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
+        raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
+    if not (folder / MODEL_FILE).is_file():
+        raise PackageError(f"{folder} has no {MODEL_FILE} to say what its C code promises: generate it from a model")
+    return _certificate(read_model(str(folder / MODEL_FILE), choices), load_package(folder), "auto")
+
+
+def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
+    p = model.momenta(stepper)
+    return verify(model.system, model.method, model.q, p, h=model.h, t=model.t, stepper=stepper, solver=solver)
+
+
+def certificate_path(name: str) -> Path | None:
+    """Beside the artefact: in a generated folder, beside a model file; ``None`` for a name of the catalogue."""
+    path = Path(name)
+    if path.is_dir():
+        return path / CERTIFICATE
+    return path.with_suffix(f".{CERTIFICATE}") if path.is_file() else None

@@ -1,0 +1,166 @@
+"""The certificate of an integrator: what it promises, measured of it as it was built.
+
+Three independent paths meet. The *compiled* step is held against the paper's equations solved in 60 digits
+(:mod:`scvi_codegen.derived_step`) and, for its structure, against finite differences of itself. *Those digits* are held
+against the exact motion, which comes from the formula of L or H alone (:mod:`scvi_codegen.exact_motion`), and against
+other methods that must be the same map. A fault of the printing, the tables, a kernel or a solver shows on the first
+path; one of the derivation, which both would share, on the second.
+
+All is measured at states and parameters a little off those given: nothing hides behind a symmetry, or a mass of 1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.building import TUNED_FLAGS
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.method import Method
+from scvi_codegen.stepper import Stepper
+from scvi_codegen.verification.certificate import Certificate, Check, Outcome
+from scvi_codegen.verification.convergence import convergence_checks
+from scvi_codegen.verification.identities import identity_checks
+from scvi_codegen.verification.stepping import step_checks
+from scvi_codegen.verification.structure import largest_step, structure_checks
+from scvi_codegen.verification.subject import State, Subject
+
+__all__ = ["Certificate", "Check", "Outcome", "verify"]
+
+Array = NDArray[np.float64]
+
+SEEDS = range(20)
+LONGEST, HALVINGS, PART = 1.0, 40, 0.1
+
+
+def verify(
+    system: MechanicalSystem,
+    method: Method,
+    q: ArrayLike | None = None,
+    p: ArrayLike | None = None,
+    *,
+    h: float | None = None,
+    t: float = 0.0,
+    stepper: Stepper | None = None,
+    solver: str = "auto",
+    flags: Sequence[str] = TUNED_FLAGS,
+) -> Certificate:
+    """Measure what the integrator of ``system`` by ``method`` promises.
+
+    Args:
+        system, method: what is integrated and how.
+        q, p: (m,) a state to measure at, both or neither; by default one that is found by trying.
+        h: a step; by default one that moves this state by about a tenth of its size.
+        t: time.
+        stepper: the integrator as built, for example from ``load_package``; by default compiled now.
+        solver, flags: as of ``compile_stepper``.
+
+    Returns:
+        The certificate. Promises are the method's (order, symmetry, symplecticity) and the system's (momentum maps);
+        one that cannot be measured says why.
+
+    Raises:
+        BuildError: without a C compiler.
+        MethodError: if the method does not take the system, or has no such solver.
+        StateError: if only one of q and p is given, or no state is found.
+    """
+    began = time.perf_counter()
+    flags = tuple(flags if stepper is None else stepper.flags)
+    stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
+    given = _given(system, stepper, q, p, h, t)
+    subject = Subject(system, method, stepper, _newton(system, method, stepper, solver, flags), given)
+    checks = (
+        *step_checks(subject),
+        *structure_checks(subject),
+        *convergence_checks(subject),
+        *identity_checks(subject),
+        largest_step(subject),
+    )
+    return _certificate(subject, checks, time.perf_counter() - began)
+
+
+def _certificate(subject: Subject, checks: tuple[Check, ...], seconds: float) -> Certificate:
+    stepper, given = subject.stepper, subject.given
+    return Certificate(
+        title=stepper.title,
+        system=subject.system.name,
+        method=subject.method.name,
+        version=_version(),
+        checksum=hashlib.sha256((stepper.source.header + stepper.source.code).encode()).hexdigest(),
+        flags=stepper.flags,
+        q=tuple(given.q.tolist()),
+        p=tuple(given.p.tolist()),
+        t=given.t,
+        h=given.h,
+        parameters={name.name: value for name, value in subject.system.constants.items()},
+        checks=checks,
+        seconds=seconds,
+    )
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("scvi-codegen")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _newton(
+    system: MechanicalSystem, method: Method, stepper: Stepper, solver: str, flags: tuple[str, ...]
+) -> Stepper | None:
+    """Newton's solver alone, where the artefact has it; the artefact itself where that is all it has."""
+    if solver == "newton":
+        return stepper
+    if solver != "auto" or isinstance(method, Composition):
+        return None
+    return compile_stepper(system, method, solver="newton", flags=flags)
+
+
+def _given(
+    system: MechanicalSystem, stepper: Stepper, q: ArrayLike | None, p: ArrayLike | None, h: float | None, t: float
+) -> State:
+    if (q is None) != (p is None):
+        raise StateError("give both q and p, or neither")
+    if q is None or p is None:
+        return _found(system, stepper, h, t)
+    position, momentum = np.array(q, dtype=float), np.array(p, dtype=float)
+    return State(position, momentum, float(t), float(h) if h else _step(stepper, position, momentum, t))
+
+
+def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:
+    """A state of size 1 at which steps succeed and the energy is finite."""
+    for seed in SEEDS:
+        generator = np.random.default_rng(seed)
+        q, v = generator.uniform(0.2, 1.0, (2, system.dimension))
+        try:
+            p = v if system.auxiliaries else stepper.momentum(q, v, t)
+            step = h or _step(stepper, q, p, t)
+            stepper.step(q, p, step, t)
+        except (StateError, StepFailedError):
+            continue
+        return State(q, p, t, step)
+    raise StateError(f"no state of '{system.name}' of size 1 was found at which a step succeeds: give q, p and h")
+
+
+def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
+    """A step that moves q and p by at most a tenth of their size."""
+    h = LONGEST
+    for _ in range(HALVINGS):
+        try:
+            q1, p1 = stepper.step(q, p, h, t)
+        except StepFailedError:
+            h /= 2
+            continue
+        change = max(np.abs(q1 - q).max() / (np.abs(q).max() or 1.0), np.abs(p1 - p).max() / (np.abs(p).max() or 1.0))
+        if change <= PART:
+            return h
+        h /= 2
+    raise StateError("no step succeeds at this state: give h, or another state")

@@ -1,0 +1,190 @@
+"""How fast a step approaches the exact motion: in h, and with the degree. In 60 digits, below all rounding.
+
+The compiled step is that of 60 digits up to rounding, which is a check of its own; what is measured here is whether
+those digits are the right ones. The exact motion is computed from the formula alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.exact_motion import Numbers
+from scvi_codegen.methods import method_from_specification
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.method import Method
+from scvi_codegen.precision import Number, mp
+from scvi_codegen.spaces import Trigonometric
+from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
+from scvi_codegen.verification.subject import State, Subject
+
+__all__ = ["convergence_checks"]
+
+GOAL = mp.mpf(10) ** -17
+"""Error at which the order is measured: below the rounding of doubles, so that no fault of that size hides."""
+FLOOR = mp.mpf(10) ** -38
+"""Errors below are not told from none."""
+SMALLEST = 1e-9
+"""Part of the step below which none is tried: an error that is not small there is one of order 0."""
+MOST_TRIALS, MOST_HALVINGS = 12, 5
+SLACK = 0.2
+LEAST_ORDER = 0.8
+"""Of methods that claim no order: they converge to the motion all the same."""
+FALL = 0.25
+"""Factor by which two degrees more shrink the error at least."""
+
+EXPECTED: Mapping[str, Callable[[int], tuple[int, bool, bool]]] = {
+    "gauss": lambda s: (2 * s, True, True),
+    "radau-iia": lambda s: (2 * s - 1, False, False),
+    "radau-ia": lambda s: (2 * s - 1, False, False),
+    "lobatto-iiia": lambda s: (2 * s - 2, False, True),
+    "chebyshev-gauss": lambda s: (s + s % 2, s == 1, True),
+    "chebyshev-lobatto": lambda s: (s + s % 2, False, True),
+}
+"""Order, whether symplectic (in phase space), whether symmetric: what is known of the families (paper, Table 4)."""
+
+RULES: Mapping[str, Callable[[int], int]] = {
+    "gauss-legendre": lambda n: 2 * n,
+    "gauss-lobatto": lambda n: 2 * n - 2,
+    "gauss-radau-left": lambda n: 2 * n - 1,
+    "gauss-radau-right": lambda n: 2 * n - 1,
+    "clenshaw-curtis": lambda n: n + n % 2,
+    "fejer": lambda n: n + n % 2,
+}
+"""Order of the quadratures."""
+
+
+def convergence_checks(subject: Subject) -> Iterator[Check]:
+    """All of this room."""
+    method = subject.method
+    promise = "order, symplecticity and symmetry are those known of the family"
+    yield from checked("claims", promise, partial(_claims, method))
+    order = f"order {method.order} in h" if method.order else "steps approach the motion (no order is claimed)"
+    yield from checked("order", order, partial(_order, subject))
+    promise = "two degrees more shrink the error of a step at least fourfold"
+    yield from checked("rate in degree", promise, partial(_rate_in_degree, subject))
+
+
+def _claims(method: Method) -> Finding | None:
+    """The properties that the method computes from its coefficients are those of its family."""
+    expected, own = _expected(method), (method.order, method.symplectic, method.symmetric)
+    if expected is None:
+        return None
+    if own != expected:
+        raise BrokenError(f"they are {own}, known are {expected}")
+    return Finding(0.0, 0.0, f"order {own[0]}")
+
+
+def _expected(method: Method) -> tuple[int | None, bool, bool] | None:
+    what = method.specification()
+    kind = str(what["method"])
+    if kind in EXPECTED:
+        order, symplectic, symmetric = EXPECTED[kind](int(str(what["stages"])))
+        return order, symplectic and what["form"] == "phase-space", symmetric
+    family, _, count = str(what.get("quadrature", "")).partition(":")
+    if kind == "svi" and family in RULES and "space" not in what:
+        degree, points = int(str(what["degree"])), int(count)
+        order = min(2 * degree, RULES[family](points))
+        return order if points >= degree else None, True, "radau" not in family
+    return {"stoermer-verlet": (2, True, True), "explicit-euler": (1, False, False)}.get(kind)
+
+
+def _order(subject: Subject) -> Finding | None:
+    if _fits_one_frequency(subject.method):
+        return None
+    order = subject.method.order
+    measured, error = _measured_order(subject)
+    if measured is None:
+        return Finding(error, float(FLOOR), "a step is exact")
+    least = order - SLACK if order else LEAST_ORDER
+    return Finding(measured, least, f"where a step errs by {error:.1e}", at_least=True)
+
+
+def _fits_one_frequency(method: Method) -> bool:
+    """Curves fitted to a frequency in radians a step are not meant for h to 0: they may lack even straight lines."""
+    return isinstance(method, SVI) and isinstance(method.curves, Trigonometric)
+
+
+def _measured_order(subject: Subject) -> tuple[float | None, float]:
+    """From the errors of a step and of half of it, both below rounding; with the larger of them."""
+    state, power = subject.states[0], (subject.method.order or 1) + 1
+    h = mp.mpf(state.h)
+    error = _error(subject, subject.method, state, h)
+    for _ in range(MOST_TRIALS):
+        if error <= GOAL or abs(h) < SMALLEST * abs(state.h):
+            break
+        h *= min(mp.mpf("0.5"), max((GOAL / error / 10) ** (mp.one / power), mp.mpf("1e-4")))
+        error = _error(subject, subject.method, state, h)
+    best: tuple[float | None, float] = (None, float(error))
+    for _ in range(MOST_HALVINGS):
+        half = _error(subject, subject.method, state, h / 2)
+        if error < FLOOR:
+            break
+        if half < FLOOR:
+            h *= 2
+            error = _error(subject, subject.method, state, h)
+            continue
+        measured = float(mp.log(error / half, 2)) - 1
+        if best[0] is None or measured > best[0]:
+            best = (measured, float(error))
+        if measured >= (subject.method.order or 1) - SLACK:
+            break
+        h, error = h / 2, half
+    return best
+
+
+def _error(subject: Subject, method: Method, state: State, h: Number) -> Number:
+    """Of one step of length h, relative to the sizes of q and of p."""
+    found = subject.derived(method)(state.q, state.p, h, state.t)
+    q, p = _exact(subject, state, h)
+    m, scales = len(state.q), subject.scales(state)
+    return max(*(abs(found.q - q) / scales[:m]), *(abs(found.p - p) / scales[m:]))
+
+
+def _exact(subject: Subject, state: State, h: Number) -> tuple[Numbers, Numbers]:
+    return subject.motion.flow(state.q, state.p, h, state.t)
+
+
+def _rate_in_degree(subject: Subject) -> Finding | None:
+    what = subject.method.specification()
+    key = "degree" if "degree" in what else "stages" if "stages" in what else None
+    if key is None or "abscissae" in what or subject.method.order is None:
+        return None
+    size = int(str(what[key]))
+    less, more = (_of_size(what, key, size + change) for change in (-2, 2))
+    pair = (less, subject.method) if less else (subject.method, more) if more else None
+    if pair is None:
+        raise StateError("neighbouring degrees do not exist with this quadrature")
+    h, (coarse, fine) = _errors_of(subject, pair)
+    remark = f"{pair[0].name}: {float(coarse):.1e}, {pair[1].name}: {float(fine):.1e}, h = {float(h):.3g}"
+    if coarse < FLOOR:
+        return Finding(float(fine), float(FLOOR), remark)
+    return Finding(float(fine / coarse), FALL, remark)
+
+
+def _errors_of(subject: Subject, pair: tuple[Method, Method]) -> tuple[Number, list[Number]]:
+    """Errors of one step of both, with a step that both solve."""
+    state = subject.states[0]
+    h = mp.mpf(state.h)
+    for _ in range(MOST_HALVINGS):
+        try:
+            return h, [_error(subject, method, state, h) for method in pair]
+        except (StateError, ArithmeticError):
+            h /= 2
+    return h, [_error(subject, method, state, h) for method in pair]
+
+
+def _of_size(what: Mapping[str, Any], key: str, size: int) -> Method | None:
+    """The method of another degree, with as many points more or less."""
+    if size < 1:
+        return None
+    changed = {**what, key: size}
+    family, colon, count = str(what.get("quadrature", "")).partition(":")
+    if colon and count.isdigit():
+        changed["quadrature"] = f"{family}:{int(count) + size - int(what[key])}"
+    try:
+        return method_from_specification(changed)
+    except MethodError:
+        return None

@@ -1,0 +1,180 @@
+"""Methods that must be one and the same map, by paths through the generator that differ; solved in 60 digits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from scvi_codegen.derived_step import derived_step
+from scvi_codegen.errors import StateError
+from scvi_codegen.exact_motion import motion_of, numbers
+from scvi_codegen.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import is_separable
+from scvi_codegen.methods.collocation import CollocationRK, Gauss, RungeKutta, SpectralCollocation
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.precision import mp
+from scvi_codegen.quadrature import Quadrature, clenshaw_curtis, fejer, gauss_legendre, gauss_lobatto, gauss_radau
+from scvi_codegen.spaces import Polynomials, Trigonometric
+from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.verification.certificate import Check, Finding, checked
+from scvi_codegen.verification.subject import Subject
+
+__all__ = ["identity_checks"]
+
+EQUAL, ROUNDED = 1e-30, 1e-13
+"""Of equations in 60 digits; of equations whose tables are rounded together to 52 bits."""
+LARGEST_TWIN = 6
+"""Coordinates up to which Legendre's transform is taken symbolically."""
+
+POINTS: dict[str, Callable[[int], Quadrature]] = {
+    "gauss": gauss_legendre,
+    "radau-iia": lambda s: gauss_radau(s, "right"),
+    "lobatto-iiia": gauss_lobatto,
+    "chebyshev-gauss": fejer,
+    "chebyshev-lobatto": clenshaw_curtis,
+}
+"""The quadrature on whose points a family of tableaux collocates."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Twin:
+    """Another way to the same map."""
+
+    name: str
+    method: Method
+    bound: float = EQUAL
+
+
+def identity_checks(subject: Subject) -> Iterator[Check]:
+    """Those that apply to the method and the system."""
+    promise = "the same step by another path"
+    for twin in _twins(subject.moved, subject.method):
+        measure = partial(_compared, subject, subject.moved, twin.method, twin.bound)
+        yield from checked(f"identity: {twin.name}", promise, measure)
+    yield from checked("identity: from H as from L", promise, partial(_legendre_twin, subject))
+    promise = "a step is exact on the oscillator of the curves' frequency"
+    yield from checked("oscillator", promise, partial(_oscillator, subject.method))
+    yield from checked("Euler", "a step is the rates at its start times h", partial(_euler, subject))
+
+
+def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound: float) -> Finding:
+    state, own = subject.states[0], subject.solved(0)
+    other = subject.derived(method, system)(state.q, state.p, state.h, state.t)
+    apart = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / subject.scales(state)
+    return Finding(float(max(apart)), bound, method.name)
+
+
+def _twins(system: MechanicalSystem, method: Method) -> Iterator[_Twin]:
+    separable = is_separable(system)
+    if isinstance(method, SVI):
+        yield from _galerkin_twins(method, separable)
+    elif isinstance(method, SCVI):
+        yield from _shooting_twins(method, separable)
+    elif isinstance(method, SpectralCollocation):
+        abscissae = [(x + 1) / 2 for x in method.node_set.points[1:]]
+        yield _Twin("collocation at its nodes", CollocationRK(abscissae, form=method.form))
+    elif isinstance(method, RungeKutta):
+        yield from _tableau_twins(method)
+    if isinstance(method, SpectralCollocation | RungeKutta) and separable:
+        yield _Twin("position form is phase-space form for constant mass", _other_form(method))
+    if isinstance(method, StoermerVerlet) and separable:
+        yield _Twin("SVI of degree 1 with the trapezoidal rule", SVI(1, "gauss-lobatto:2"), ROUNDED)
+        yield _Twin("kick, drift, kick", Composition(2), ROUNDED)
+    if isinstance(method, Composition) and method.composition_order == 2:
+        yield _Twin("Lobatto IIIA-IIIB", StoermerVerlet(), ROUNDED)
+
+
+def _galerkin_twins(method: SVI, separable: bool) -> Iterator[_Twin]:
+    s, rule = method.degree, method.rule
+    if not isinstance(method.curves, Polynomials) or rule.derivative_weights:
+        return
+    if s > 1:
+        other = "equispaced" if method.node_set.name != "equispaced" else "chebyshev-lobatto"
+        yield _Twin("independent of its nodes", SVI(s, rule, other))
+    if rule.name == f"gauss-legendre:{s}":
+        yield _Twin("SVI(s, s Gauss points) = Gauss(s)", Gauss(s))
+    if s == 1:
+        yield _Twin("SVI(1) = SCVI(1)", SCVI(1, rule))
+        if rule.name == "gauss-lobatto:2" and separable:
+            yield _Twin("SVI(1, trapezoidal rule) = Stoermer-Verlet", StoermerVerlet(), ROUNDED)
+
+
+def _shooting_twins(method: SCVI, separable: bool) -> Iterator[_Twin]:
+    s, rule = method.degree, method.rule
+    if s == 1:
+        yield _Twin("SCVI(1) = SVI(1)", SVI(1, rule))
+    elif method.variational and method.abscissae is None:
+        abscissae = tuple((x + 1) / 2 for x in method.node_set.points[1:])
+        yield _Twin("its nodes as abscissae", SCVI(s, rule, abscissae=abscissae), ROUNDED)
+    elif method.abscissae == "gauss" and rule.name == f"gauss-legendre:{s}" and separable:
+        yield _Twin("SCVI on Gauss points = SVI", SVI(s, rule), ROUNDED)
+
+
+def _tableau_twins(method: RungeKutta) -> Iterator[_Twin]:
+    family, _, stages = method.tableau.name.partition(":")
+    if family in POINTS:
+        points = POINTS[family](int(stages)).abscissae
+        yield _Twin("collocation at the points of a quadrature", CollocationRK(list(points), form=method.form))
+    if family == "gauss" and method.form == "phase-space":
+        s = int(stages)
+        yield _Twin("Gauss(s) = SVI(s, s Gauss points)", SVI(s))
+
+
+def _other_form(method: SpectralCollocation | RungeKutta) -> Method:
+    form = "position" if method.form == "phase-space" else "phase-space"
+    if isinstance(method, SpectralCollocation):
+        return SpectralCollocation(method.degree, method.node_set, form)
+    return RungeKutta(method.tableau, form)
+
+
+def _legendre_twin(subject: Subject) -> Finding | None:
+    """The step of the Hamiltonian of a Lagrangian, or the other way round."""
+    system, method = subject.moved, subject.method
+    singular = isinstance(system, HamiltonianSystem) and not system.is_regular
+    if singular or (isinstance(method, SVI) and method.rule.derivative_weights):
+        return None
+    if system.dimension > LARGEST_TWIN:
+        raise StateError(f"Legendre's transform is taken for {LARGEST_TWIN} coordinates at most")
+    twin = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
+    return _compared(subject, twin, method, EQUAL)
+
+
+def _oscillator(method: Method) -> Finding | None:
+    """Of curves fitted to a frequency, whatever the system; with the quadrature that is made for them."""
+    if not isinstance(method, SVI) or not isinstance(method.curves, Trigonometric):
+        return None
+    if method.quadrature != method.curves.default_rule(method.degree):
+        return None
+    formula, frequency = "(q_dot**2 - w**2*q**2)/2", {"w": method.curves.frequency}
+    system = LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian=formula, parameters=frequency)
+    found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), motion_of(system).flow([0.7], [0.4], 1)
+    return Finding(float(max(abs(found.q[0] - q[0]), abs(found.p[0] - p[0]))), ROUNDED)
+
+
+def _euler(subject: Subject) -> Finding | None:
+    """Explicit Euler written out: order 1 and nothing else would also be kept by the implicit one."""
+    what, state, motion = subject.method.specification(), subject.states[0], subject.motion
+    if what["method"] != "explicit-euler":
+        return None
+    q, p, h, t = numbers(state.q), numbers(state.p), mp.mpf(state.h), mp.mpf(state.t)
+    v, force = motion.rates(q, p, t)
+    if what["form"] == "phase-space":
+        end = [*(q + v * h), *(p + force * h)]
+    elif motion.hamiltonian:
+        raise StateError("positions and velocities of a Hamiltonian are not written out")
+    else:
+        end = [*(q + v * h), *motion.momentum(q + v * h, v + motion.acceleration(q, v, t) * h, t + h)]
+    solved = subject.solved(0)
+    return Finding(float(max(abs(np.array([*solved.q, *solved.p]) - end) / subject.scales(state))), EQUAL)
+
+
+def _lagrangian(system: MechanicalSystem) -> LagrangianSystem:
+    assert isinstance(system, HamiltonianSystem)
+    return lagrangian_of(system)

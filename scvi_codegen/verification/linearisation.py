@@ -1,0 +1,67 @@
+"""The derivative of a step by finite differences, and how much rounding may change the step's end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StepFailedError
+
+__all__ = ["WEIGHTS", "Linearised", "linearised"]
+
+Array = NDArray[np.float64]
+Map = Callable[[Array], Array]
+
+WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+"""Central differences of order six."""
+WIDTHS = (0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4)
+"""In parts of the scales; of two neighbours those that differ least are taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Linearised:
+    """A derivative in units of the scales.
+
+    Attributes:
+        matrix: (2m, 2m), dimensionless.
+        uncertainty: of its entries: how much two widths of the differences disagree.
+        scales: (2m,) sizes of q and of p, m times each.
+    """
+
+    matrix: Array
+    uncertainty: float
+    scales: Array
+
+    def carried(self, change: Array) -> Array:
+        """(2m,) what changes of the arguments, of any signs, make of the end."""
+        spread: Array = self.scales * (np.abs(self.matrix) @ (np.abs(change) / self.scales))
+        return spread
+
+
+def linearised(step: Map, state: Array, scales: Array) -> Linearised | None:
+    """The derivative of ``step`` at ``state``; ``None`` where it cannot be evaluated around it."""
+    best: Linearised | None = None
+    before: Array | None = None
+    for width in WIDTHS:
+        try:
+            now = _differences(step, state, scales, width)
+        except StepFailedError:
+            continue
+        if before is not None:
+            change = float(np.abs(now - before).max())
+            if best is None or change < best.uncertainty:
+                best = Linearised(now, change, scales)
+        before = now
+    return best
+
+
+def _differences(step: Map, state: Array, scales: Array, width: float) -> Array:
+    columns = []
+    for unit in np.diag(width * scales):
+        slopes = sum(w * (step(state + k * unit) - step(state - k * unit)) for k, w in WEIGHTS.items())
+        columns.append(slopes / (width * scales))
+    matrix: Array = np.array(columns).T
+    return matrix

@@ -1,0 +1,226 @@
+"""Whether the compiled step solves the equations of its method: against 60 digits, and by finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.binding import SolverOptions
+from scvi_codegen.derived_step import SolvedStep, compiled_equations
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.exact_motion import Numbers, numbers
+from scvi_codegen.precision import mp
+from scvi_codegen.stepper import Stepper
+from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
+from scvi_codegen.verification.linearisation import WEIGHTS
+from scvi_codegen.verification.subject import LARGEST, State, Subject
+
+__all__ = ["step_checks"]
+
+Array = NDArray[np.float64]
+
+ROUNDINGS = 16.0
+"""Roundings, each of the size that the state itself has, that a step may add up."""
+ANY_UPDATE = SolverOptions(tolerance=1e300)
+"""Newton's iteration ends after its first update."""
+SHORTEST_WAY = 1e6
+"""In units of rounding: what a first update must go, for its end to tell a wrong matrix from an exact one."""
+SMALLER, MOST_SWEEPS = 256, 10
+"""An iteration that contracts in proportion to h, somehow at h, takes 52 bits / 8 bits a sweep at h / 256; some more
+for the first and the last one."""
+FALLBACK = "solve_again"
+"""The C function that calls Newton's iteration where sweeps fail."""
+MOST_TRIED = 30
+RUN_STEPS = 12
+STATIONARY = 1e-25
+TRANSFORM = 1e-11
+SLOPES = 1e-6
+SLOPE_WIDTHS = (3e-2, 1e-2, 3e-3, 1e-3)
+
+
+def step_checks(subject: Subject) -> Iterator[Check]:
+    """All of this room."""
+    for name, promise, measure in (
+        ("stage equations", "a step solves the paper's equations (60 digits)", _artefact),
+        ("Newton's solver", "it solves the same equations", _newton),
+        ("Newton's matrix", "its first update is that of the exact one (finite differences, 60 digits)", _matrix),
+        ("fallback", "where sweeps fail, Newton's iteration solves the same equations", _fallback),
+        ("contraction", f"iterations shrink errors in proportion to h or better (count at h/{SMALLER})", _contraction),
+        ("run", "each step of a run, with its memory, is the step from the same state", _run),
+        ("stationarity", "p0, p1 are slopes of the action, others vanish (finite differences, 60 digits)", _action),
+        ("Legendre transform", "momentum, velocity, energy are those of the formula (60 digits)", _transform),
+        ("discrete Lagrangian", "p0 and p1 are its slopes, compiled and by finite differences", _discrete),
+    ):
+        yield from checked(name, promise, partial(measure, subject))
+
+
+def _artefact(subject: Subject) -> Finding:
+    return _solves(subject, subject.stepper)
+
+
+def _newton(subject: Subject) -> Finding | None:
+    if subject.newton is None or subject.newton is subject.stepper:
+        return None
+    return _solves(subject, subject.newton)
+
+
+def _solves(subject: Subject, stepper: Stepper) -> Finding:
+    worst = 0.0
+    for index, state in enumerate(subject.states):
+        expected = subject.solved(index)
+        try:
+            worst = max(worst, _apart(subject, state, subject.ends(state, stepper), expected))
+        except StepFailedError as failure:
+            raise BrokenError(f"they have a solution, but {failure}") from failure
+    return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
+
+
+def _apart(subject: Subject, state: State, end: Array, expected: SolvedStep) -> float:
+    """Largest distance from the step in 60 digits in units of rounding."""
+    return float(np.max(np.abs(end - _joined(expected).astype(float)) / subject.rounding(state)))
+
+
+def _joined(step: SolvedStep) -> Numbers:
+    return np.array([*step.q, *step.p], dtype=object)
+
+
+def _matrix(subject: Subject) -> Finding | None:
+    """The first update from the straight line, a way that an exact matrix and a wrong one go differently."""
+    if subject.newton is None:
+        return None
+    state, equations = subject.states[0], compiled_equations(subject.moved, subject.method)
+    if equations.unknowns > LARGEST:
+        raise StateError(f"{equations.unknowns} unknowns are more than the {LARGEST} that are solved in 60 digits")
+    end, scales = _joined(subject.solved(0)), subject.scales(state)
+    exact = _joined(equations.first_update(state.q, state.p, state.h, state.t))
+    v = subject.motion.velocity(numbers(state.q), numbers(state.p), mp.mpf(state.t))
+    straight = np.concatenate([numbers(state.q) + v * state.h, numbers(state.p)])
+    rounding = float(np.max(subject.rounding(state) / scales))
+    if _size(end - straight, scales) < SHORTEST_WAY * rounding:
+        raise StateError("a straight line is the solution already")
+    missed = _size(subject.ends(state, subject.newton, ANY_UPDATE) - exact, scales)
+    return Finding(missed / rounding, ROUNDINGS, "in units of rounding")
+
+
+def _size(vector: Numbers, scales: Array) -> float:
+    return float(np.max(np.abs(vector.astype(float)) / scales))
+
+
+def _fallback(subject: Subject) -> Finding | None:
+    """Newton's iteration in the artefact itself, reached where so few sweeps do not converge."""
+    if subject.newton is None or FALLBACK not in subject.stepper.source.code:
+        return None
+    first = subject.states[0]
+    for factor in (1, 2, 4, 8):
+        state = State(first.q, first.p, first.t, factor * first.h)
+        for most in range(3, MOST_TRIED):
+            try:
+                iterations, end = _counted(subject, state, SolverOptions(max_iterations=most))
+            except StepFailedError:
+                continue
+            if iterations <= most + 1:  # the sweeps converged
+                break
+            expected = subject.derived()(state.q, state.p, state.h, state.t)
+            return Finding(_apart(subject, state, end, expected), ROUNDINGS, f"in units of rounding, h = {state.h:.3g}")
+    raise StateError("sweeps take no more iterations than Newton at the steps tried, so it is not reached")
+
+
+def _counted(subject: Subject, state: State, options: SolverOptions | None = None) -> tuple[int, Array]:
+    """Iterations of a step of the artefact, and its end."""
+    run = subject.stepper.integrate(
+        state.q, state.p, h=state.h, steps=1, t=state.t, parameters=subject.parameters, options=options
+    )
+    return int(run.iterations[1]), np.concatenate([run.q[1], run.p[1]])
+
+
+def _contraction(subject: Subject) -> Finding:
+    first = subject.states[0]
+    try:
+        iterations, _ = _counted(subject, State(first.q, first.p, first.t, first.h / SMALLER))
+    except StepFailedError as failure:
+        raise BrokenError(str(failure)) from failure
+    return Finding(iterations, MOST_SWEEPS)
+
+
+def _run(subject: Subject) -> Finding:
+    """A run remembers stages and carries rounding errors; each of its steps must be the step all the same."""
+    worst = max(_run_of(subject, stepper) for stepper in {subject.stepper, subject.newton or subject.stepper})
+    return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also by Newton's solver alone")
+
+
+def _run_of(subject: Subject, stepper: Stepper) -> float:
+    first, worst = subject.states[0], 0.0
+    run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=subject.parameters)
+    for k in range(RUN_STEPS):
+        state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
+        change = np.abs(subject.ends(state) - np.concatenate([run.q[k + 1], run.p[k + 1]]))
+        worst = max(worst, float(np.max(change / subject.rounding(state))))
+    return worst
+
+
+def _action(subject: Subject) -> Finding | None:
+    """The action S by evaluation of L alone, its slopes by differences: dS = p1 dq1 - p0 dq0 at the solution."""
+    state, equations, solved = subject.states[0], subject.derived(), subject.solved(0)
+    slopes = equations.action_slopes(solved, state.q, state.p, state.h, state.t)
+    if slopes is None:
+        return None
+    p0, p1 = numbers(state.p), np.array(solved.p, dtype=object)
+    row = numbers(equations.stages.end_position.entries[0])
+    powers = [mp.mpf(state.h) ** block.power for block in equations.stages.blocks]
+    expected = np.array([p1 * (row[b + 1] * power) for b, power in enumerate(powers)], dtype=object)
+    wrong = [*(slopes[0] - p1 * row[0] + p0), *(slopes[1] - expected).ravel()]
+    size = max(1, *map(abs, p0), *map(abs, p1))
+    return Finding(float(max(map(abs, wrong)) / size), STATIONARY)
+
+
+def _transform(subject: Subject) -> Finding:
+    state, motion, stepper = subject.states[0], subject.motion, subject.stepper
+    q, p, t = numbers(state.q), numbers(state.p), mp.mpf(state.t)
+    v, energy = motion.velocity(q, p, t), motion.energy(q, p, t)
+    wrong = [_relative(stepper.velocity(state.q, state.p, state.t, subject.parameters), v)]
+    if not motion.hamiltonian:
+        wrong.append(_relative(stepper.momentum(state.q, v.astype(float), state.t, subject.parameters), p))
+    value = stepper.energy(state.q, state.p, state.t, subject.parameters)
+    wrong.append(float(abs(value - energy) / (abs(p) @ abs(v) + abs(energy) or 1)))
+    return Finding(max(wrong), TRANSFORM, "relative")
+
+
+def _relative(found: Array, expected: Numbers) -> float:
+    return float(max(abs(found - expected)) / (max(map(abs, expected)) or 1))
+
+
+def _discrete(subject: Subject) -> Finding | None:
+    """The discrete Lagrangian and its slopes, compiled, by central differences."""
+    stepper, state = subject.stepper, subject.states[0]
+    if not stepper.interface.has_action:
+        return None
+    q1, p1 = subject.step(state)
+    arguments = (state.q, q1, state.h, state.t, subject.parameters)
+    try:
+        p0, end = stepper.discrete_legendre_minus(*arguments)[1], stepper.discrete_legendre_plus(*arguments)[1]
+        slopes = _slopes_of_action(subject, state, q1)
+    except StepFailedError as failure:
+        raise BrokenError(f"the step has a curve from q0 to q1, but looking for it {failure}") from failure
+    size = max(np.abs(state.p).max(), np.abs(p1).max()) or 1.0
+    wrong = np.concatenate([slopes + np.concatenate([state.p, -p1]), p0 - state.p, end - p1])
+    return Finding(float(np.abs(wrong).max() / size), SLOPES, "relative")
+
+
+def _slopes_of_action(subject: Subject, state: State, q1: Array) -> Array:
+    """(2m,) derivatives of the compiled L_d by q0 and q1; of several widths two that agree best."""
+    m, both = len(state.q), np.concatenate([state.q, q1])
+
+    def action(ends: Array) -> float:
+        return subject.stepper.discrete_lagrangian(ends[:m], ends[m:], state.h, state.t, subject.parameters)
+
+    found: list[Array] = []
+    for width in SLOPE_WIDTHS:
+        moved = width * (np.abs(q1 - state.q).max() or 1.0)
+        units = np.eye(2 * m) * moved
+        changes = [sum(w * (action(both + k * e) - action(both - k * e)) for k, w in WEIGHTS.items()) for e in units]
+        found.append(np.array(changes) / moved)
+    best = min(range(1, len(found)), key=lambda k: float(np.abs(found[k] - found[k - 1]).max()))
+    return found[best]

@@ -1,0 +1,202 @@
+"""What is verified: the artefact, Newton's solver beside it, and states with nothing special about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.binding import SolverOptions
+from scvi_codegen.derived_step import DerivedStep, SolvedStep, derived_step
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.exact_motion import Motion, motion_of
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.stepper import Stepper
+from scvi_codegen.verification.linearisation import Linearised, linearised
+
+__all__ = ["EPSILON", "State", "Subject"]
+
+Array = NDArray[np.float64]
+
+EPSILON = 2.0**-52
+NUDGE, NUDGES = 0.05, 6
+"""Part of its size by which a state is moved off the given one; so often less, four times each, until a step works."""
+PARAMETER_NUDGE = 0.05
+LATER = 5
+"""Steps from the first state to the second."""
+LARGEST = 200
+"""Unknowns of a step whose equations are solved in 60 digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """(q, p) at t, and a step to take from there."""
+
+    q: Array
+    p: Array
+    t: float
+    h: float
+
+    @property
+    def z(self) -> Array:
+        """(2m,) q and p."""
+        return np.concatenate([self.q, self.p])
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An integrator under test.
+
+    Attributes:
+        system, method: what it integrates and how.
+        stepper: as built.
+        newton: the same with Newton's solver alone, or ``None``.
+        given: the state and the step asked for.
+    """
+
+    system: MechanicalSystem
+    method: Method
+    stepper: Stepper
+    newton: Stepper | None
+    given: State
+
+    @cached_property
+    def parameters(self) -> dict[str, float]:
+        """Values a little off the defaults, where they work: masses that are all 1 would hide which is which."""
+        moved = {
+            name.name: value * (1 + PARAMETER_NUDGE * np.sin(k + 1.0)) if value else PARAMETER_NUDGE * np.cos(k + 1.0)
+            for k, (name, value) in enumerate(self.system.constants.items())
+        }
+        kept = {name: float(moved[name] if value else 0.0) for name, value in self._defaults.items()}
+        for values in (moved, kept):
+            if self._works(values):
+                return {name: float(value) for name, value in values.items()}
+        return dict(self._defaults)
+
+    @property
+    def _defaults(self) -> dict[str, float]:
+        return {name.name: value for name, value in self.system.constants.items()}
+
+    def _works(self, parameters: Mapping[str, float]) -> bool:
+        try:
+            self.stepper.step(self.given.q, self.given.p, self.given.h, self.given.t, parameters)
+        except StepFailedError:
+            return False
+        return True
+
+    @cached_property
+    def moved(self) -> MechanicalSystem:
+        """The system with :attr:`parameters` as defaults."""
+        return self.system.with_parameters(**self.parameters)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The exact motion of :attr:`moved`."""
+        return motion_of(self.moved)
+
+    @cached_property
+    def states(self) -> tuple[State, State]:
+        """Two states off the given one, without its symmetries: a step forward from the first, back from the second."""
+        first = self._nudged()
+        now = first
+        for _ in range(LATER):
+            try:
+                q, p = self.step(now)
+            except StepFailedError:
+                break
+            now = State(q, p, now.t + now.h, now.h)
+        return first, State(now.q, now.p, now.t, -now.h / 2)
+
+    def _nudged(self) -> State:
+        given, m = self.given, len(self.given.q)
+        sizes = self.scales(given)
+        directions = np.concatenate([np.cos(1.0 + np.arange(m)), np.sin(2.0 + 1.3 * np.arange(m))])
+        for k in range(NUDGES):
+            z = given.z + NUDGE / 4**k * sizes * directions
+            state = State(z[:m], z[m:], given.t + 0.37 * given.h, given.h)
+            try:
+                self.step(state)
+            except StepFailedError:
+                continue
+            return state
+        return given
+
+    def step(
+        self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None
+    ) -> tuple[Array, Array]:
+        """(q1, p1) of the compiled step. Raises as :meth:`Stepper.step`."""
+        stepper = stepper or self.stepper
+        return stepper.step(state.q, state.p, state.h, state.t, self.parameters, options=options)
+
+    def ends(self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None) -> Array:
+        """(2m,) the same in one."""
+        return np.concatenate(self.step(state, stepper, options))
+
+    def scales(self, state: State) -> Array:
+        """(2m,) size of q, then of p: of the state or, if that is less, of what a step changes."""
+        m = len(state.q)
+        try:
+            end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t))
+        except StepFailedError:
+            end = state.z
+        change = end - state.z
+        sizes = [max(_rms(state.z[part]), _rms(change[part])) or 1.0 for part in (slice(m), slice(m, None))]
+        return np.repeat(sizes, m)
+
+    def linearised(self, state: State) -> Linearised | None:
+        """The derivative of the step at a state, by differences."""
+        m = len(state.q)
+
+        def step(z: Array) -> Array:
+            return self.ends(State(z[:m], z[m:], state.t, state.h))
+
+        return linearised(step, state.z, self.scales(state))
+
+    def rounding(self, state: State) -> Array:
+        """(2m,) what one rounding of each number that enters a step can change at its end."""
+        end, around = self.ends(state), self.linearised(state)
+        carried = np.abs(state.z) if around is None else around.carried(state.z)
+        moment = 1e-6 * state.h
+        later = self.ends(State(state.q, state.p, state.t + moment, state.h))
+        drift = np.abs(later - end) / abs(moment) * (abs(state.t) + abs(state.h))
+        longer = self.ends(State(state.q, state.p, state.t, state.h + moment))
+        stretch = np.abs(longer - end) / abs(moment) * abs(state.h)
+        total: Array = EPSILON * (carried + np.abs(end) + np.abs(end - state.z) + drift + stretch)
+        return total + np.finfo(float).tiny
+
+    def derived(self, method: Method | None = None, system: MechanicalSystem | None = None) -> DerivedStep:
+        """The equations of the step in 60 digits; of another method or system where given.
+
+        Raises:
+            StateError: if they are too many.
+        """
+        found = derived_step(system or self.moved, method or self.method)
+        if found.unknowns > LARGEST:
+            raise StateError(
+                f"{found.unknowns} unknowns a step are more than the {LARGEST} that are solved in 60 digits"
+            )
+        return found
+
+    @cached_property
+    def _solved(self) -> dict[int, SolvedStep]:
+        return {}
+
+    def solved(self, index: int) -> SolvedStep:
+        """The step from a state of :attr:`states` in 60 digits. Raises as :meth:`derived` and its solution do."""
+        if index not in self._solved:
+            state = self.states[index]
+            self._solved[index] = self.derived()(state.q, state.p, state.h, state.t)
+        return self._solved[index]
+
+    def roundings(self) -> Iterator[tuple[int, State, Array]]:
+        """Each state with its number and the size of rounding there."""
+        for index, state in enumerate(self.states):
+            yield index, state, self.rounding(state)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
