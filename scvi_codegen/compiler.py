@@ -1,6 +1,7 @@
 """The whole tour: a system and a method go in, a stepper comes out.
 
     MechanicalSystem, Method
+      -> symmetry  Symmetry        what is conserved (:mod:`scvi_codegen.symmetry`)
       -> derive    StepEquations   the equations as the paper prints them, to look at (:mod:`scvi_codegen.equations`)
       -> solvers   Sweep           a solver without a matrix, where there is one (:mod:`scvi_codegen.solvers`)
       -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)

@@ -536,7 +536,7 @@ def _latex(derived: StepEquations) -> str:
         for entry in derived.entries
     ]
     maps = [
-        rf"J &= {sympy.latex(s.momentum_map, symbol_names=_names_of_maps(s))} \tag{{{s.name}}}"
+        rf"J &= {sympy.latex(s.momentum_map, symbol_names=_names_of_maps(s))} \tag{{{_tag(s.name)}}}"
         for s in derived.symmetries
     ]
     blocks = [block for block in (lines, tables, maps) if block]
@@ -549,7 +549,7 @@ def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:
 
 def _tag(number: str) -> str:
     if not number.startswith("dG"):
-        return number
+        return number.replace("_", r"\_")
     return "$" + number.replace("dG", r"\partial G").replace("/d", r"/\partial ") + "$"
 
 

@@ -22,7 +22,7 @@ def is_exact(symmetry: Symmetry, method: Method) -> bool:
     space conserve what is linear in (t, q, p), symplectic ones what is quadratic. Of others nothing is claimed: a map
     may be conserved nevertheless.
     """
-    terms = symmetry.monomials()
+    terms = symmetry.degrees()
     if terms is None:
         return False
     if max(sum(powers) for powers in terms) <= _conserved_degree(method):

@@ -10,7 +10,7 @@ parameters. What is found is believed if its rate vanishes to 40 digits at rando
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -39,6 +39,8 @@ PIVOT = 1e-6
 ZERO = 1e-8
 RECOGNISED = 1e-7
 LARGEST_INTEGER = 1000
+AT_ONCE = 4096
+"""Points of one evaluation: so many numbers are kept for every part of the formulas."""
 MORE_POINTS = 12
 """Points beyond as many as columns."""
 MORE_PARAMETERS = 4
@@ -65,7 +67,7 @@ class Monomial:
         return total
 
 
-Polynomial: TypeAlias = Mapping[Monomial, int]
+Polynomial: TypeAlias = Mapping[Monomial, Expr | int]
 Column: TypeAlias = Polynomial | Expr
 """A function phi_c: a polynomial, or any expression in q, p, t and parameters."""
 
@@ -111,27 +113,41 @@ class _Search:
         ``None`` where the system is not defined at enough points. Parameters have the signs of their default values and
         are of size 1, or are near the default values where the system is not defined there.
         """
-        size = len(chosen) + MORE_POINTS
         for near in (False, True):
             self.drawn = _drawn(self.motion.constants, count, near=near)
-            points = 2 * size
-            parameters = {given: np.repeat(values, points) for given, values in self.drawn.items()}
-            with np.errstate(all="ignore"):
-                sample = self.motion.arrays(parameters, count * points)
-                terms = [self.terms(c, sample) for c in chosen]
+            together = max(1, AT_ONCE // (2 * (len(chosen) + MORE_POINTS)))
+            found = [
+                space
+                for first in range(0, count, together)
+                for space in self._null_spaces(chosen, slice(first, first + together))
+            ]
+            if all(space is not None for space in found):
+                break
+        return found
+
+    def _null_spaces(self, chosen: Sequence[int], part: slice) -> Iterator[Array | None]:
+        """Those for some of the values drawn."""
+        size = len(chosen) + MORE_POINTS
+        points = 2 * size  # some may lie where the system is not defined
+        parameters = {given: np.repeat(values[part], points) for given, values in self.drawn.items()}
+        count = max([len(values) // points for values in parameters.values()], default=1)
+        with np.errstate(all="ignore"):
+            sample = self.motion.arrays(parameters, count * points)
+            terms = [self.terms(c, sample) for c in chosen]
             rates = np.array([np.sum(own, axis=0) for own in terms]).T
             sizes = np.array([np.abs(own).max(axis=0) for own in terms]).T
-            good = [np.flatnonzero(np.isfinite(part).all(axis=1))[:size] for part in np.split(rates, count)]
-            if all(len(rows) == size for rows in good):
-                chosen_rows = [k * points + rows for k, rows in enumerate(good)]
-                return [_null_space(rates[rows], sizes[rows]) for rows in chosen_rows]
-        return [None] * count
+        for own_rates, own_sizes in zip(np.split(rates, count), np.split(sizes, count), strict=True):
+            good = np.flatnonzero(np.isfinite(own_rates).all(axis=1))[:size]
+            yield _null_space(own_rates[good], own_sizes[good]) if len(good) == size else None
 
     def terms(self, c: int, sample: Sample) -> list[Any]:
         """What the time derivative of a column is the sum of."""
         column = self.columns[c]
         if not isinstance(column, Expr):
-            return [factor * monomial.rate(sample) for monomial, factor in column.items()]
+            return [
+                (sample.value(factor) if isinstance(factor, Expr) else factor) * monomial.rate(sample)
+                for monomial, factor in column.items()
+            ]
         state = (*self.motion.arguments[: len(self.motion.momenta)], *self.motion.momenta, self.motion.time)
         if c not in self.slopes:
             self.slopes[c] = gradient(column, state)
@@ -248,6 +264,8 @@ def _recognised_row(
 def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[Expr, dict[Expr, Fraction]] | None:
     """The number and the powers of the factors whose product has these values."""
     if not entries.all():
+        return None
+    if not all(values.all() for _, values in factors):
         return None
     logs = [np.ones(len(entries)), *(np.log(np.abs(values)) for _, values in factors)]
     solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]

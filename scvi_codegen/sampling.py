@@ -33,6 +33,7 @@ SEED = 20250101
 SPREADS = (1.0, 0.3, 0.1)
 """Sizes of velocities or momenta: some Lagrangians exist for small ones only."""
 ATTEMPTS = 24
+LARGEST = 10**300
 LONGEST_NUMBER = 1000
 """Numerators and denominators of numbers in a formula that are as good as parameters: measured, not derived."""
 
@@ -143,7 +144,7 @@ def motion_of(system: MechanicalSystem) -> Motion:
 def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
     """A symbol for the absolute value of each."""
     found = set().union(*(expression.atoms(sympy.Rational) for expression in expressions))
-    sizes = {abs(number) for number in found if max(abs(number.p), number.q) > LONGEST_NUMBER}
+    sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}
 
 
@@ -168,7 +169,7 @@ def array_value(expression: Any, known: dict[Any, Any]) -> Any:
 
 def _array_node(expression: Any, known: dict[Any, Any]) -> Any:
     if not expression.args:
-        return float(expression)
+        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
     arguments = [array_value(argument, known) for argument in expression.args]
     if expression.is_Add:
         return functools.reduce(np.add, arguments)

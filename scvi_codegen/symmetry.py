@@ -9,16 +9,16 @@ translations, rotations, boosts, and magnetic and uniform fields; a symmetry per
 oscillator, is not among them, nor one whose f is not quadratic. Where a Hamiltonian is given L is p . v - H; if in
 addition velocities do not determine momenta (point vortices), J may be any quadratic polynomial in q and p.
 
-Symmetries hold for all values of the parameters. With more than ``MOST_COORDINATES`` coordinates only cyclic ones,
-and translations, rotations and boosts of all coordinates together, are tried. A direction that is known otherwise is
-checked by :func:`check_symmetry`.
+Symmetries hold for all values of the parameters; one that needs special values is found when these stand in the formula
+as numbers. With more than ``MOST_COORDINATES`` coordinates only cyclic ones, and translations, rotations and boosts of
+all coordinates together, are tried. A direction that is known otherwise is checked by :func:`check_symmetry`.
 
 Which are kept exactly, to round-off, by which method: :func:`~scvi_codegen.exactness.is_exact`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -29,7 +29,7 @@ from scvi_codegen.derivatives import gradient
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.expression_text import closest, evaluated, parse_expression, unsupported_part
 from scvi_codegen.hamiltonian import HamiltonianSystem
-from scvi_codegen.invariants import conserved
+from scvi_codegen.invariants import Polynomial, conserved
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import legendre_map
 from scvi_codegen.sampling import momentum_symbols, motion_of
@@ -77,21 +77,33 @@ class Symmetry:
     @property
     def formula(self) -> str:
         """The momentum map as text, factors and terms in the order in which they are usually written."""
-        variables = (*self.coordinates, *self.momenta, self.time)
-        polynomial = self.momentum_map.as_poly(*variables)
-        if polynomial is None:
+        terms = self._terms()
+        if terms is None:
             return str(self.momentum_map)
-        terms = [_term_text(x, powers, variables) for powers, x in polynomial.terms()]
-        text = " + ".join(sorted(terms, key=lambda term: term.startswith("-")))
-        return text.replace("+ -", "- ")
+        terms.sort(key=lambda term: (_sign(term[0]) < 0, [(i, -power) for i, power in term[1].items()]))
+        variables = (*self.coordinates, *self.momenta, self.time)
+        texts = [_term_text(x, [variables[i] ** power for i, power in powers.items()]) for x, powers in terms]
+        return " + ".join(texts).replace("+ -", "- ")
 
-    def monomials(self) -> list[tuple[int, int, int]] | None:
+    def degrees(self) -> set[tuple[int, int, int]] | None:
         """Degrees in (t, q, p) of the terms of the momentum map, ``None`` if it is not a polynomial."""
-        polynomial = self.momentum_map.as_poly(self.time, *self.coordinates, *self.momenta)
-        if polynomial is None:
+        terms, m = self._terms(), len(self.coordinates)
+        if terms is None:
             return None
-        m = len(self.coordinates)
-        return [(powers[0], sum(powers[1 : m + 1]), sum(powers[m + 1 :])) for powers in polynomial.monoms()]
+        return {
+            (
+                powers.get(2 * m, 0),
+                sum(power for i, power in powers.items() if i < m),
+                sum(power for i, power in powers.items() if m <= i < 2 * m),
+            )
+            for _, powers in terms
+        }
+
+    def _terms(self) -> list[tuple[Expr, dict[int, int]]] | None:
+        """Coefficient, and powers by index of (q, p, t), of each term; ``None`` if it is not a polynomial."""
+        places = {x: i for i, x in enumerate((*self.coordinates, *self.momenta, self.time))}
+        found = _monomials(self.momentum_map, places)
+        return _monomials(sympy.expand(self.momentum_map), places) if found is None else found
 
 
 @lru_cache(maxsize=64)
@@ -177,15 +189,13 @@ def _found(system: MechanicalSystem) -> list[Terms]:
     """The momentum maps as polynomials."""
     motion, curved = motion_of(system), _is_curved(system)
     if system.dimension <= MOST_COORDINATES:
-        columns = list(monomial_columns(system.dimension, curved=curved))
+        columns: list[Polynomial] = list(monomial_columns(system.dimension, curved=curved))
     else:
         columns = list(rigid_columns(system))
-        rows = conserved(system, motion, columns)
-        if not any(is_shift(columns[min(row)]) for row in rows):
-            return [combined(row, columns) for row in rows]
-        columns += boost_columns(system, columns)
+        if any(is_shift(columns[min(row)]) for row in conserved(system, motion, columns)):
+            columns += boost_columns(system, columns)
     found = [combined(row, columns) for row in conserved(system, motion, columns, fractions=curved)]
-    return independent(found) if curved else found
+    return independent(found) if curved else [terms for terms in found if terms]
 
 
 def _is_curved(system: MechanicalSystem) -> bool:
@@ -193,19 +203,32 @@ def _is_curved(system: MechanicalSystem) -> bool:
     return isinstance(system, HamiltonianSystem) and not system.is_regular
 
 
-def _term_text(coefficient: Expr, powers: Sequence[int], variables: Sequence[Symbol]) -> str:
+def _monomials(expression: Expr, places: Mapping[Symbol, int]) -> list[tuple[Expr, dict[int, int]]] | None:
+    """The terms of a sum of monomials."""
+    found = []
+    for term in sympy.Add.make_args(expression):
+        own = [factor.as_base_exp() for factor in sympy.Mul.make_args(term)]
+        powers = {places[base]: int(power) for base, power in own if base in places and power.is_Integer and power > 0}
+        rest = sympy.Mul(*(base**power for base, power in own if base not in places))
+        if len(powers) < sum(base in places for base, _ in own) or not rest.free_symbols.isdisjoint(places):
+            return None
+        found.append((rest, dict(sorted(powers.items()))))
+    return found
+
+
+def _sign(coefficient: Expr) -> int:
+    return -1 if coefficient.could_extract_minus_sign() else 1
+
+
+def _term_text(coefficient: Expr, factors: list[Expr]) -> str:
     """One term, its sign first."""
-    sign = "-" if coefficient.could_extract_minus_sign() else ""
-    size = -coefficient if sign else coefficient
-    numerator, denominator = size.as_numer_denom()
-    factors = [variable**power for variable, power in zip(variables, powers, strict=True) if power]
+    sign = _sign(coefficient)
+    numerator, denominator = (sign * coefficient).as_numer_denom()
     if numerator != 1 or not factors:
-        factors.insert(0, numerator)
+        factors = [numerator, *factors]
     text = "*".join(f"({factor})" if factor.is_Add else str(factor) for factor in factors)
-    if denominator == 1:
-        return f"{sign}{text}"
     divisor = f"({denominator})" if denominator.is_Mul or denominator.is_Add else str(denominator)
-    return f"{sign}{text}/{divisor}"
+    return ("-" if sign < 0 else "") + (text if denominator == 1 else f"{text}/{divisor}")
 
 
 def _polynomial(system: MechanicalSystem, terms: Terms) -> Expr:
@@ -220,11 +243,13 @@ def _polynomial(system: MechanicalSystem, terms: Terms) -> Expr:
 
 
 def _symmetry(system: MechanicalSystem, terms: Terms) -> Symmetry:
-    """With its name, and the sign that goes with it."""
+    """With its name, the sign that goes with it, and no fractions in the direction at t = 0."""
     m = system.dimension
     name, sign = name_of(system, terms)
-    signed = {monomial: sign * coefficient for monomial, coefficient in terms.items()}
-    degrees = {monomial: sum(i >= m for i in monomial.factors) for monomial in signed}
+    degrees = {monomial: sum(i >= m for i in monomial.factors) for monomial in terms}
+    numbers = [x.as_coeff_Mul()[0] for a, x in terms.items() if degrees[a] == 1 and a.power == 0]
+    factor = sign * sympy.ilcm(1, 1, *(number.q for number in numbers if number.is_Rational))
+    signed = {monomial: factor * coefficient for monomial, coefficient in terms.items()}
     J, p = _polynomial(system, signed), momentum_symbols(system)
     slopes = gradient(J, p)
     return Symmetry(

@@ -16,8 +16,9 @@ import sympy
 from sympy import Expr, prime
 
 from scvi_codegen.bodies import Body, bodies
-from scvi_codegen.invariants import Column, Monomial
+from scvi_codegen.invariants import Column, Monomial, Polynomial
 from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import mass_entries
 
 __all__ = [
     "Terms",
@@ -76,17 +77,24 @@ def rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
     yield {Monomial(1, ()): 1}
 
 
-def is_shift(column: Mapping[Monomial, int]) -> bool:
-    """Whether it is a sum of single momenta or positions."""
+def is_shift(column: Polynomial) -> bool:
+    """Whether it is a sum of single momenta."""
     return all(len(monomial.factors) == 1 for monomial in column)
 
 
-def boost_columns(system: MechanicalSystem, rigid: Sequence[Mapping[Monomial, int]]) -> list[dict[Monomial, int]]:
-    """The translations among the columns times t, positions to go with them, and t^2."""
-    shifts = [column for column in rigid if is_shift(column)]
-    moving = [{Monomial(1, monomial.factors): x for monomial, x in column.items()} for column in shifts]
-    positions = [{Monomial(k, (i,)): 1} for k in (0, 1) for i in range(system.dimension)]
-    return [*moving, *positions, {Monomial(2, ()): 1}]
+def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list[Polynomial]:
+    """The translations among the columns times t, less positions times the masses that they move, and t^2."""
+    m, constants = system.dimension, set(system.parameters)
+    masses = {place: x for place, x in mass_entries(system).items() if x.free_symbols <= constants}
+    boosts: list[Polynomial] = []
+    for shift in filter(is_shift, rigid):
+        moved = {monomial.factors[0] - m for monomial in shift}
+        boost: dict[Monomial, Expr | int] = {Monomial(1, monomial.factors): 1 for monomial in shift}
+        for (i, j), mass in masses.items():
+            if i in moved:
+                boost[Monomial(0, (j,))] = boost.get(Monomial(0, (j,)), 0) - mass
+        boosts.append(boost)
+    return [*boosts, {Monomial(2, ()): 1}]
 
 
 def bodies_of(system: MechanicalSystem) -> tuple[Body, ...]:

@@ -42,7 +42,8 @@ def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
             return f"angular momentum{axis}", -1 if first.could_extract_minus_sign() else 1
     q = [coordinate.name for coordinate in system.coordinates]
     touched = sorted({i % m for a in turning for i in a.factors})
-    what = "angular momentum" if all(a.factors[0] != a.factors[1] - m for a in turning) else "scaling"
+    scaled = [a.factors[0] == a.factors[1] - m for a in turning]
+    what = "scaling" if all(scaled) else "linear symmetry" if any(scaled) else "angular momentum"
     return f"{what} of {_listed([q[i] for i in touched])}", 1
 
 
