@@ -39,7 +39,7 @@ FLOORS = """
     methods.collocation methods.composition
     methods.shooting
     methods
-    exactness
+    exactness tape
     exact_motion
     derived_step
     equations lowering c_printer
