@@ -17,12 +17,13 @@ from __future__ import annotations
 import re
 
 from scvi_codegen.building import TUNED_FLAGS
+from scvi_codegen.errors import MethodError
 from scvi_codegen.lowering import lower
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
-from scvi_codegen.rendering import render, render_ensemble, workspace_size
+from scvi_codegen.rendering import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
 from scvi_codegen.solvers.choice import check_solver, sweep_of
 from scvi_codegen.solvers.splitting import splitting_of
 from scvi_codegen.source import Interface, Source
@@ -76,17 +77,37 @@ def compile_stepper(
 
 
 def generate_source(
-    system: MechanicalSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    embedded: Embedded | None = None,
 ) -> tuple[Source, Interface]:
-    """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
-    program = _program(system, method, solver=solver, prefix=prefix)
-    return render(program), describe(program, system, method)
+    """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`.
+
+    Args:
+        embedded: the precision, ``"double"`` or ``"single"``, of text for a microcontroller: explicit or Newton's
+            iteration alone, a quarter of the code and of the stack that lanes take where there are no vector registers.
+
+    Raises:
+        MethodError: for a solver that the method does not have, and for a number beyond single precision.
+    """
+    if embedded not in (None, *EMBEDDED):
+        raise MethodError(f"there is no precision {embedded!r}; choose {' or '.join(EMBEDDED)}")
+    if embedded and solver == "fixed-point":
+        raise MethodError("a fixed point needs vector registers: for a microcontroller choose 'newton' or 'explicit'")
+    program = _program(system, method, solver=solver, prefix=prefix, lanes=embedded is None)
+    text = render_embedded(program, embedded) if embedded else render(program)
+    return text, describe(program, system, method)
 
 
-def _program(system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
+def _program(
+    system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None, lanes: bool = True
+) -> Program:
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
-    swept = solver in ("auto", "fixed-point") and splitting is None
+    swept = lanes and solver in ("auto", "fixed-point") and splitting is None
     sweep = sweep_of(system, method) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))

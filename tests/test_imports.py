@@ -32,7 +32,7 @@ FLOORS = """
     methods.collocation methods.composition
     methods.shooting
     methods
-    equations lowering c_printer
+    equations lowering c_printer single_precision
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
     solvers.separable solvers.coupled solvers.collocation solvers.shooting
