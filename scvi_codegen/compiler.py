@@ -88,7 +88,7 @@ def generate_source(
 
     Args:
         embedded: the precision, ``"double"`` or ``"single"``, of text for a microcontroller: explicit or Newton's
-            iteration alone, a quarter of the code and of the stack that lanes take where there are no vector registers.
+            iteration alone, which takes half of the stack that lanes take where there are no vector registers.
 
     Raises:
         MethodError: for a solver that the method does not have, and for a number beyond single precision.

@@ -182,7 +182,7 @@ int main(void)
   double q[2], p[2];
   integrator_report report;
   const int status = integrator_step(0.0, 0.5, q0, p0, &mu, &patient, q, p, &report, workspace);
-  printf("%d %lld\n", status, report.iterations);
+  printf("%d %lld", status, report.iterations);
   return 0;
 }
 """
