@@ -18,7 +18,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors precision program source ordering
-    derivatives expression_text nodes arguments
+    derivatives expression_text nodes arguments toml_text
     symbols regularity quadrature
     mechanical_system translation
     system

@@ -38,7 +38,7 @@ ORDERS = {
 
 
 def rules(counts: list[int]) -> list[Quadrature]:
-    names = [f"{family}:{n}" for family in QUADRATURE_FAMILIES for n in counts if n > 1 or family not in NEEDS_TWO]
+    names = [f"{family}:{n}" for family in ORDERS for n in counts if n > 1 or family not in NEEDS_TWO]
     return [quadrature_by_name(name) for name in names]
 
 

@@ -92,6 +92,9 @@ def method_from_specification(specification: Specification) -> Method:
     for argument in arguments:
         if argument not in accepted:
             raise MethodError(f"{name} takes no {argument!r}; it takes {', '.join(accepted) or 'no arguments'}")
+    for argument in {"degree", "stages", "order"} & set(arguments):
+        if isinstance(arguments[argument], bool) or not isinstance(arguments[argument], int):
+            raise MethodError(f"{argument} must be an integer, not {arguments[argument]!r}")
     if name in REQUIRED and REQUIRED[name] not in arguments:
         raise MethodError(f"{name} needs {REQUIRED[name]!r}")
     if name == "composition":
