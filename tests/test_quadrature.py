@@ -14,7 +14,6 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.nodes import chebyshev_lobatto, legendre_lobatto
 from scvi_codegen.precision import mp
 from scvi_codegen.quadrature import (
-    QUADRATURE_FAMILIES,
     Quadrature,
     clenshaw_curtis,
     exact_rule,
