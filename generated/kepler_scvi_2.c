@@ -803,7 +803,7 @@ static int newton(const step_data *step, const newton_data *data, const double *
     }
     if (q1)
       add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + M) || !all_finite(increment, M))
+    if (!all_finite(data->rows, N + M) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
       return KEPLER_SCVI_2_NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);
@@ -956,14 +956,14 @@ static inline void lanes_store(const lanes *x, double *memory)
 }
 
 /* 1 / (size + a little of the largest), so that a coordinate that rests at 0 has a size too; or what makes changes of x
- * changes of q. */
+ * changes of q. An infinite size gives NaN. */
 static inline void invert_sizes(const kepler_scvi_2_options *options, double absolute, double *size)
 {
   double largest = 0.0;
   for (int i = 0; i < M; i++)
     largest = larger(largest, size[i]);
   for (int i = 0; i < M; i++)
-    size[i] = options->absolute ? absolute : 1.0 / (size[i] + DBL_EPSILON * largest + DBL_MIN);
+    size[i] = (options->absolute ? absolute : 1.0 / (size[i] + DBL_EPSILON * largest + DBL_MIN)) + 0.0 * largest;
 }
 
 /* What is kept at the points, continued into this step from the last one or from the last two. */

@@ -563,7 +563,7 @@ static int newton(const step_data *step, const newton_data *data, const double *
     }
     if (q1)
       add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + M) || !all_finite(increment, M))
+    if (!all_finite(data->rows, N + M) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
       return PENDULUM_STOERMER_VERLET_NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);

@@ -254,6 +254,11 @@ def exact_step(q: float, p: float, h: float, steps: int) -> complex:
         return complex(mpc(q, p) * factor**steps)
 
 
+def rounding(q: float, p: float, h: float) -> float:
+    """What the solver calls round-off level, of |q| + h|v| and |p| + h|L_q| as the header says, and underflow."""
+    return 5e-13 * ((abs(q) + abs(p)) * (1.0 + abs(h))) + 1e-319 * (1.0 + abs(h)) ** 2
+
+
 def check_oscillator(stepper: Stepper, random: Random) -> bool:
     """Whether a run from a random state was completed; its end must then be right."""
     q, p = (
@@ -274,8 +279,7 @@ def check_oscillator(stepper: Stepper, random: Random) -> bool:
         except REFUSED:
             return False
     expected = exact_step(q, p, h, steps)
-    rounding = (abs(q) + abs(p)) * (1.0 + abs(h))  # of |q| + h|v| and of |p| + h|L_q|, as the header says
-    allowed = steps * (1e-14 * rounding + 1e-323 * (1.0 + abs(h)) ** 2)  # and of velocities below the smallest number
+    allowed = steps * rounding(q, p, h)
     assert abs(found - expected) <= allowed, (q, p, h, steps, found, expected)
     return True
 
@@ -299,10 +303,8 @@ def test_an_ensemble_of_any_sizes_is_right_or_says_which_are_not():
         assert runs.ok.sum() > 20
         for j in np.flatnonzero(runs.ok):
             found = complex(runs.q[-1, j, 0], runs.p[-1, j, 0])
-            rounding = (abs(q[j, 0]) + abs(p[j, 0])) * (1.0 + abs(h))
-            assert abs(found - exact_step(q[j, 0], p[j, 0], h, 3)) <= 3 * (
-                1e-14 * rounding + 1e-323 * (1 + abs(h)) ** 2
-            )
+            expected = exact_step(q[j, 0], p[j, 0], h, 3)
+            assert abs(found - expected) <= 3 * rounding(q[j, 0], p[j, 0], h)
         assert np.isnan(runs.q[-1, ~runs.ok]).all()
 
 
