@@ -58,6 +58,8 @@ def _watch(event: str, arguments: tuple[Any, ...]) -> None:
         return  # SymPy imports some of its parts when they are first needed
     if event == "compile" and str(arguments[1]).endswith(".py"):
         return  # the same, where they are not yet compiled
+    if event == "compile" and str(arguments[0]).startswith("b'lambda _cls,"):
+        return  # a named tuple in one of them
     writes = event == "open" and isinstance(arguments[1], str) and not set(arguments[1]).isdisjoint("wax+")
     if writes or event.startswith(FORBIDDEN):
         _watching.append(f"{event}{arguments!r:.200}")
@@ -67,8 +69,11 @@ sys.addaudithook(_watch)
 
 
 @contextmanager
-def guarded(seconds: float = SECONDS) -> Iterator[None]:
-    """Refuse code that is run, files that are written, processes that are started, and more than some seconds."""
+def guarded(seconds: float = SECONDS, *, may_compile: bool = False) -> Iterator[None]:
+    """Refuse code that is run, files that are written, processes that are started, and more than some seconds.
+
+    SymPy's polynomials and Jinja's templates compile code of their own: behind the front end that may be.
+    """
 
     def ring(*_: object) -> None:
         raise TookTooLongError
@@ -83,6 +88,8 @@ def guarded(seconds: float = SECONDS) -> Iterator[None]:
         signal.signal(signal.SIGVTALRM, before)
         events = _watching[1:]
         _watching.clear()
+    if may_compile:
+        events = [event for event in events if not event.startswith(("compile(", "exec("))]
     if events:
         raise RanCodeError(events[0])
 

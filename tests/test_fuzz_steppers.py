@@ -256,7 +256,7 @@ def exact_step(q: float, p: float, h: float, steps: int) -> complex:
 
 def rounding(q: float, p: float, h: float) -> float:
     """What the solver calls round-off level, of |q| + h|v| and |p| + h|L_q| as the header says, and underflow."""
-    return 5e-13 * ((abs(q) + abs(p)) * (1.0 + abs(h))) + 1e-319 * (1.0 + abs(h)) ** 2
+    return 5e-13 * ((float(abs(q)) + float(abs(p))) * (1.0 + abs(h))) + 1e-319 * (1.0 + abs(h)) ** 2
 
 
 def check_oscillator(stepper: Stepper, random: Random) -> bool:

@@ -115,7 +115,7 @@ def try_system(number: int) -> bool:
         assert not re.search(r"[^\w](?:nan|inf|zoo|oo|I)[^\w(]", re.sub(r"/\*.*?\*/", "", source.code, flags=re.DOTALL))
 
     try:
-        with guarded(), warnings.catch_warnings():
+        with guarded(may_compile=True), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             compiled()
     except ScviCodegenError:
@@ -125,9 +125,6 @@ def try_system(number: int) -> bool:
 
 @pytest.mark.full
 def test_ten_thousand_systems_become_c_or_are_refused():
-    warm = LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 - q**2")
-    for method in (SVI(2), SCVI(2), Gauss(2), SVI(3, "gauss-lobatto:4")):
-        generate_source(warm, method)
     assert sum(map(try_system, range(10_000))) > 1_000
 
 
