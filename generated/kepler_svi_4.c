@@ -1037,6 +1037,15 @@ static int solve(const step_data *step, const solver_data *unused, double *memor
 }
 #endif
 
+/* Whether x + increment is a finite state. */
+static int reaches(const double *x, const double *increment)
+{
+  double sum = 0.0;
+  for (int i = 0; i < M; i++)
+    sum += 0.0 * (x[i] + increment[i]);
+  return sum == 0.0;
+}
+
 int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace)
 {
@@ -1055,6 +1064,8 @@ int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, co
   status = solve(&step, &data, memory, &guess, dq, dp, options ? options : &standard, report, memory + MEMORY);
   if (status != KEPLER_SVI_4_OK)
     return status;
+  if (!reaches(q0, dq) || !reaches(p0, dp))
+    return KEPLER_SVI_4_NOT_FINITE;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
     q1[i] = q0[i] + (dq[i] + dq[M + i]);
@@ -1126,6 +1137,8 @@ int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
+    if (status == KEPLER_SVI_4_OK && (!reaches(now.q, dq) || !reaches(now.p, dp)))
+      status = KEPLER_SVI_4_NOT_FINITE;
     if (status != KEPLER_SVI_4_OK) {
       save_state(&now, run);
       return status;
