@@ -642,7 +642,7 @@ static int newton(const step_data *step, const newton_data *data, const double *
     }
     if (q1)
       add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + M) || !all_finite(increment, M))
+    if (!all_finite(data->rows, N + M) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
       return KEPLER_SVI_4_NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);
@@ -788,14 +788,14 @@ static inline void lanes_store(const lanes *x, double *memory)
 }
 
 /* 1 / (size + a little of the largest), so that a coordinate that rests at 0 has a size too; or what makes changes of x
- * changes of q. */
+ * changes of q. An infinite size gives NaN. */
 static inline void invert_sizes(const kepler_svi_4_options *options, double absolute, double *size)
 {
   double largest = 0.0;
   for (int i = 0; i < M; i++)
     largest = larger(largest, size[i]);
   for (int i = 0; i < M; i++)
-    size[i] = options->absolute ? absolute : 1.0 / (size[i] + DBL_EPSILON * largest + DBL_MIN);
+    size[i] = (options->absolute ? absolute : 1.0 / (size[i] + DBL_EPSILON * largest + DBL_MIN)) + 0.0 * largest;
 }
 
 /* What is kept at the points, continued into this step from the last one or from the last two. */
@@ -1066,6 +1066,15 @@ static int solve(const step_data *step, const solver_data *unused, double *memor
 }
 #endif
 
+/* Whether x + increment is a finite state. */
+static int reaches(const double *x, const double *increment)
+{
+  double sum = 0.0;
+  for (int i = 0; i < M; i++)
+    sum += 0.0 * (x[i] + increment[i]);
+  return sum == 0.0;
+}
+
 int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace)
 {
@@ -1084,6 +1093,8 @@ int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, co
   status = solve(&step, &data, memory, &guess, dq, dp, options ? options : &standard, report, memory + MEMORY);
   if (status != KEPLER_SVI_4_OK)
     return status;
+  if (!reaches(q0, dq) || !reaches(p0, dp))
+    return KEPLER_SVI_4_NOT_FINITE;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
     q1[i] = q0[i] + (dq[i] + dq[M + i]);
@@ -1155,6 +1166,8 @@ int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
+    if (status == KEPLER_SVI_4_OK && (!reaches(now.q, dq) || !reaches(now.p, dp)))
+      status = KEPLER_SVI_4_NOT_FINITE;
     if (status != KEPLER_SVI_4_OK) {
       save_state(&now, run);
       return status;

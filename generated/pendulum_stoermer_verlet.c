@@ -563,7 +563,7 @@ static int newton(const step_data *step, const newton_data *data, const double *
     }
     if (q1)
       add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + M) || !all_finite(increment, M))
+    if (!all_finite(data->rows, N + M) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
       return PENDULUM_STOERMER_VERLET_NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);
@@ -653,6 +653,15 @@ static int solve(const step_data *step, const solver_data *data, double *memory,
   return PENDULUM_STOERMER_VERLET_OK;
 }
 
+/* Whether x + increment is a finite state. */
+static int reaches(const double *x, const double *increment)
+{
+  double sum = 0.0;
+  for (int i = 0; i < M; i++)
+    sum += 0.0 * (x[i] + increment[i]);
+  return sum == 0.0;
+}
+
 int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const pendulum_stoermer_verlet_options *options, double *q1, double *p1, pendulum_stoermer_verlet_report *report, double *workspace)
 {
@@ -671,6 +680,8 @@ int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const do
   status = solve(&step, &data, memory, &guess, dq, dp, options ? options : &standard, report, memory + MEMORY);
   if (status != PENDULUM_STOERMER_VERLET_OK)
     return status;
+  if (!reaches(q0, dq) || !reaches(p0, dp))
+    return PENDULUM_STOERMER_VERLET_NOT_FINITE;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
     q1[i] = q0[i] + (dq[i] + dq[M + i]);
@@ -742,6 +753,8 @@ int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long lon
     report->t = step.t = run->t0 + (double)run->step * run->h;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
+    if (status == PENDULUM_STOERMER_VERLET_OK && (!reaches(now.q, dq) || !reaches(now.p, dp)))
+      status = PENDULUM_STOERMER_VERLET_NOT_FINITE;
     if (status != PENDULUM_STOERMER_VERLET_OK) {
       save_state(&now, run);
       return status;

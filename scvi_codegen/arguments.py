@@ -3,23 +3,57 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 
-__all__ = ["checked_count", "checked_number", "checked_step"]
+__all__ = ["checked_count", "checked_number", "checked_step", "empty_array", "real_array"]
+
+MOST = 2**53
+REAL_KINDS = "iufO"
+"""Not complex numbers, which lose half of themselves when they are converted, nor dates, text and truth values."""
 
 
-def checked_number(value: float, name: str) -> float:
-    """A finite float."""
+def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
+    """A contiguous copy in binary64 of real numbers of any shape, layout and byte order; not yet checked to be finite.
+
+    Raises:
+        StateError: for anything but real numbers, and where entries are masked.
+    """
     try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise StateError(f"{name} must be a real number, not {value!r}") from error
+        given = np.asanyarray(value)
+        rows = value if isinstance(value, list | tuple) else ()
+        if np.ma.is_masked(given) or any(map(np.ma.is_masked, rows)):
+            raise StateError(f"{name} has masked entries: fill them, or leave them out")
+        if given.dtype.kind not in REAL_KINDS and given.size:
+            raise StateError(f"{name} must be real numbers, not {given.dtype.name}")
+        return np.array(given, dtype=np.float64, order="C", subok=False)
+    except (TypeError, ValueError, OverflowError) as error:
+        if isinstance(error, StateError):
+            raise
+        raise StateError(f"{name} must be real numbers: {error}") from error
+
+
+def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Room for states; StateError if there is not as much memory."""
+    try:
+        return np.empty(shape)
+    except (MemoryError, ValueError) as error:
+        raise StateError(f"{shape[0]} states do not fit into the memory: keep fewer of them (every)") from error
+
+
+def checked_number(value: Any, name: str) -> float:
+    """A finite float."""
+    array = real_array(value, name) if type(value) is not float else None
+    if array is not None and array.shape != ():
+        raise StateError(f"{name} must be a real number, not {value!r}")
+    number = value if array is None else float(array)
     if not math.isfinite(number):
         raise StateError(f"{name} is {number}")
-    return number
+    return float(number)
 
 
 def checked_step(h: float) -> float:
@@ -31,9 +65,11 @@ def checked_step(h: float) -> float:
 
 
 def checked_count(value: int, name: str, *, least: int) -> int:
-    """An integer of at least ``least``."""
+    """An integer of at least ``least``, below 2^53."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise StateError(f"{name} must be a whole number, not {value!r}")
     if value < least:
         raise StateError(f"{name} must be at least {least}, not {value}")
+    if value >= MOST:
+        raise StateError(f"{name} must be below 2^53")
     return int(value)

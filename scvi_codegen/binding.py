@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.arguments import checked_count
+from scvi_codegen.arguments import checked_count, checked_number
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.source import Interface
 from scvi_codegen.trajectory import Trajectory
 
-__all__ = ["STATUS", "Binding", "SolverOptions", "step_failure"]
+__all__ = ["STATUS", "Binding", "SolverOptions", "checked_options", "step_failure"]
 
 STATUS = {1: "not converged", 2: "singular", 3: "not finite"}
 ADVICE = {
@@ -41,11 +41,20 @@ class SolverOptions:
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0.0:
+        if not checked_number(self.tolerance, "the tolerance") > 0.0:
             raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
+        if not isinstance(self.absolute, bool):
+            raise StateError(f"absolute must be True or False, not {self.absolute!r}")
         checked_count(self.max_iterations, "max_iterations", least=1)
         if self.max_iterations > MOST_ITERATIONS:
             raise StateError(f"max_iterations must be at most {MOST_ITERATIONS}, not {self.max_iterations}")
+
+
+def checked_options(options: SolverOptions | None) -> SolverOptions | None:
+    """The options, or StateError for something else."""
+    if options is not None and not isinstance(options, SolverOptions):
+        raise StateError(f"options must be SolverOptions(...), not {options!r}")
+    return options
 
 
 class Binding:
@@ -82,7 +91,7 @@ class Binding:
 
     def options(self, options: SolverOptions | None) -> Any:
         """The C struct, NULL for the defaults."""
-        if options is None:
+        if options is None or checked_options(options) is None:
             return self._ffi.NULL
         return self._ffi.new(
             f"{self._interface.prefix}_options *",

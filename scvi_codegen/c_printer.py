@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
 from scvi_codegen.program import Constant, Expression, Kernel, Load, Operation, Sweep
 
 __all__ = [
+    "constants",
     "lane_functions",
     "print_expression",
     "print_lane_statements",
@@ -69,16 +70,24 @@ def scalar_functions(kernel: Kernel) -> set[str]:
     return _functions(kernel, lambda expression: True)
 
 
+def constants(kernel: Kernel) -> Iterator[float]:
+    """The numbers written in a kernel."""
+    return (expression.value for expression in _expressions(kernel) if isinstance(expression, Constant))
+
+
 def _functions(kernel: Kernel, wanted: Callable[[Expression], bool]) -> set[str]:
-    found: set[str] = set()
+    operations = (expression for expression in _expressions(kernel) if isinstance(expression, Operation))
+    return {each.operator for each in operations if each.operator not in PRECEDENCE and wanted(each)}
+
+
+def _expressions(kernel: Kernel) -> Iterator[Expression]:
+    """Every expression of a kernel, with those it is made of."""
     pending: list[Expression] = [*kernel.temporaries, *kernel.results]
     while pending:
         expression = pending.pop()
+        yield expression
         if isinstance(expression, Operation):
             pending.extend(expression.operands)
-            if expression.operator not in PRECEDENCE and wanted(expression):
-                found.add(expression.operator)
-    return found
 
 
 def print_statements(kernel: Kernel) -> list[str]:

@@ -20,6 +20,7 @@ import re
 from collections.abc import Sequence
 
 from scvi_codegen.building import TUNED_FLAGS
+from scvi_codegen.errors import MethodError
 from scvi_codegen.event_source import with_events
 from scvi_codegen.events import EventLike, as_events
 from scvi_codegen.lowering import lower
@@ -27,7 +28,7 @@ from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.program import Program
-from scvi_codegen.rendering import render, render_ensemble, workspace_size
+from scvi_codegen.rendering import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
 from scvi_codegen.solvers.choice import check_solver, sweep_of
 from scvi_codegen.solvers.splitting import splitting_of
 from scvi_codegen.source import Interface, Source
@@ -94,20 +95,47 @@ def generate_source(
     prefix: str | None = None,
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
+    embedded: Embedded | None = None,
 ) -> tuple[Source, Interface]:
-    """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
-    program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
-    source, interface = render(program), describe(program, system, method)
+    """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`.
+
+    Args:
+        embedded: the precision, ``"double"`` or ``"single"``, of text for a microcontroller: explicit or Newton's
+            iteration alone, which takes half of the stack that lanes take where there are no vector registers.
+
+    Raises:
+        MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
+            text for a microcontroller.
+    """
     functions = tuple(event.function for event in as_events(events))
+    _check_embedded(embedded, solver, functions)
+    program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
+    source = render_embedded(program, embedded) if embedded else render(program)
+    interface = describe(program, system, method)
     return (with_events(source, interface, functions) if functions else source), interface
 
 
+def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
+    if embedded not in (None, *EMBEDDED):
+        raise MethodError(f"there is no precision {embedded!r}; choose {' or '.join(EMBEDDED)}")
+    if embedded and solver == "fixed-point":
+        raise MethodError("a fixed point needs vector registers: for a microcontroller choose 'newton' or 'explicit'")
+    if embedded and functions:
+        raise MethodError("text for a microcontroller has no search for events: leave out one of the two")
+
+
 def _program(
-    system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None, symmetries: Sequence[Symmetry]
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    solver: str,
+    prefix: str | None,
+    symmetries: Sequence[Symmetry],
+    lanes: bool = True,
 ) -> Program:
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
-    swept = solver in ("auto", "fixed-point") and splitting is None
+    swept = lanes and solver in ("auto", "fixed-point") and splitting is None
     sweep = sweep_of(system, method) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))

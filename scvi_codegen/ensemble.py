@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen import building
-from scvi_codegen.arguments import checked_count, checked_number, checked_step
+from scvi_codegen.arguments import checked_count, checked_number, checked_step, empty_array, real_array
+from scvi_codegen.binding import checked_options
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files import write_atomically
 from scvi_codegen.trajectory import relative_changes
@@ -196,7 +197,7 @@ class Ensemble:
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
     ) -> None:
-        self.stepper, self.options = stepper, options
+        self.stepper, self.options = stepper, checked_options(options)
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
         self.steps = checked_count(steps, "steps", least=0)
         self.every = checked_count(every, "every", least=1)
@@ -206,8 +207,8 @@ class Ensemble:
         self.count = len(start_q)
         self.parameters = _parameters(stepper, parameters, self.count)
         kept = self.steps // self.every + 1
-        self.q = np.full((kept, self.count, stepper.dimension), np.nan)
-        self.p = np.full_like(self.q, np.nan)
+        self.q, self.p = (empty_array((kept, self.count, stepper.dimension)) for _ in "qp")
+        self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = start_q, start_p
         self.status = np.full(self.count, OK, dtype="<U16")
         self.done = np.zeros(self.count, dtype=np.int64)
@@ -404,7 +405,7 @@ class _Alone:
 
 def _states(stepper: Stepper, value: ArrayLike, name: str) -> Array:
     """(k, m) finite numbers."""
-    array = _numbers(value, name)
+    array = real_array(value, name)
     if array.ndim == 1:
         array = array[np.newaxis]
     if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
@@ -421,12 +422,12 @@ def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Arra
     values = np.tile(stepper.defaults, (count, 1))
     if isinstance(given, Mapping):
         for name, value in given.items():
-            column = _numbers(value, f"the parameter {name}")
+            column = real_array(value, f"the parameter {name}")
             if column.shape not in ((), (count,)):
                 raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
             values[:, stepper.parameter_index(name)] = column
     elif given is not None:
-        array = _numbers(given, "parameters")
+        array = real_array(given, "parameters")
         if array.shape not in ((len(names),), (count, len(names))):
             raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
         values[:] = array
@@ -434,10 +435,3 @@ def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Arra
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
         raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}")
     return values
-
-
-def _numbers(value: ArrayLike, name: str) -> Array:
-    try:
-        return np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise StateError(f"{name} must be an array of real numbers: {error}") from error

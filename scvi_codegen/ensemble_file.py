@@ -23,7 +23,6 @@ import csv
 import difflib
 import math
 import os
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -35,6 +34,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.model_file import Model
+from scvi_codegen.toml_text import read_toml
 
 if TYPE_CHECKING:
     from scvi_codegen.stepper import Stepper
@@ -135,10 +135,7 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
 
 
 def _read_grid(text: str, check: Check) -> dict[str, Array]:
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ModelFileError(f"this is not TOML: {error}") from error
+    document = read_toml(text)
     grid = document.get("grid")
     if set(document) != {"grid"} or not isinstance(grid, dict) or not grid:
         raise ModelFileError("the file must have one section, [grid], with a line for each quantity that varies")

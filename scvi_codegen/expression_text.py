@@ -33,6 +33,8 @@ MAX_DEPTH = 100
 MAX_EXPONENT = 64
 MAX_EXPONENT_DENOMINATOR = 10_000
 MAX_BITS = 2048
+MAX_DIGITS = 616
+"""Of a whole number of so many bits."""
 MAX_PASSES = 8
 LARGEST = 1.7976931348623157e308
 
@@ -281,12 +283,13 @@ class _Parser:
         if following.kind == "name" and following.text in ("j", "J") and following.column == column + len(text):
             self.refuse("complex numbers are not part of the grammar", column)
         mantissa, _, exponent = text.lower().partition("e")
-        if len(mantissa) > 320 or len(exponent) > 8 or abs(int(exponent or 0)) > 640:
+        whole = text.isdigit()  # perhaps half of a fraction, which may be longer
+        if len(mantissa) > (MAX_DIGITS if whole else 320) or len(exponent) > 8 or abs(int(exponent or 0)) > 640:
             self.refuse("this number has too many digits: a C double ends at 1.8e308", column)
         value = Rational(text)
-        if value > LARGEST or (value and not float(value)):
+        if not whole and _beyond_double(value):
             self.refuse("this number lies outside the range of a C double", column)
-        return value
+        return self.bounded(value, column)
 
     def name(self, name: str, column: int) -> Expr:
         if name in FUNCTIONS:
@@ -320,6 +323,12 @@ def _bits(number: Expr) -> int:
     return max(int(number.p).bit_length(), int(number.q).bit_length()) if number.is_Rational else 0
 
 
+def _beyond_double(number: Expr) -> bool:
+    """Whether a rational is an infinity as a C double, or 0 without being 0."""
+    p, q = abs(int(number.p)), int(number.q)
+    return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
+
+
 _NODES = frozenset([Add, Mul, Pow, *_NAME_OF])
 _SMOOTHER = {
     "Abs": "the absolute value is not differentiable; sqrt(x**2) is one, too",
@@ -351,10 +360,12 @@ def unsupported_part(expression: Expr) -> str | None:
 
 def _node_problem(node: Any) -> str | None:
     if not node.args:
-        if node.is_Symbol or node in (S.Pi, S.Exp1) or (node.is_Rational and _bits(node) <= MAX_BITS):
+        if node.is_Symbol or node in (S.Pi, S.Exp1):
             return None
-        if node.is_Rational:
+        if node.is_Rational and _bits(node) > MAX_BITS:
             return f"a constant grows beyond {MAX_BITS} bits, more than any C double can hold"
+        if node.is_Rational:
+            return f"the constant {_shortened(node)} lies beyond any C double" if _beyond_double(node) else None
         if node in (S.NaN, S.ComplexInfinity, S.Infinity, S.NegativeInfinity):
             return f"a part of the formula is not finite ({node})"
     elif node.func in _NODES:

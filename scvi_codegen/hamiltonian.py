@@ -287,11 +287,19 @@ def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, 
         symbol: sympy.Dummy(symbol.name, positive=True) for symbol, value in system.constants.items() if value > 0
     }
     back = {dummy: symbol for symbol, dummy in positive.items()}
-    for root in sympy.solve(sympy.Eq(slope.xreplace(positive), y), x):
+    for root in _roots(slope.xreplace(positive) - y, x):
         found = root.xreplace(back)
         if unsupported_part(found) is None and _holds(system, found, slope, x, y):
             return found
     raise SystemDefinitionError(f"SymPy does not solve {y} = {slope} for {x}; give the other function yourself")
+
+
+def _roots(expression: Expr, x: Symbol) -> list[Expr]:
+    """What SymPy finds, without the formulas of Cardano and Ferrari, on which it would spend minutes; unchecked."""
+    try:
+        return list(sympy.solve(expression, x, check=False, simplify=False, cubics=False, quartics=False))
+    except (NotImplementedError, ArithmeticError, AttributeError, TypeError, ValueError, RecursionError):
+        return []
 
 
 def _holds(system: MechanicalSystem, root: Expr, slope: Expr, x: Symbol, y: Symbol) -> bool:

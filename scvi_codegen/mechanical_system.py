@@ -97,6 +97,8 @@ class MechanicalSystem(ABC):
         """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""
         if not isinstance(self.name, str) or not self.name.strip():
             raise SystemDefinitionError(f"a system needs a name, not {self.name!r}")
+        if any("\ud800" <= character <= "\udfff" for character in self.name):
+            raise SystemDefinitionError(f"the name {self.name!r} has half of a character in it, which no file can hold")
         for given in (*self.coordinates, *self.auxiliaries, self.time, *self.parameters):
             if not isinstance(given, Symbol) or given != symbol(given.name):
                 raise SystemDefinitionError(

@@ -37,7 +37,6 @@ import difflib
 import math
 import os
 import textwrap
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -52,6 +51,7 @@ from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.problems import Problem, problem
 from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.toml_text import read_toml
 
 if TYPE_CHECKING:
     from scvi_codegen.binding import SolverOptions
@@ -199,10 +199,7 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
 
 def parse_model(text: str) -> Model:
     """The model described by TOML text; see the module's docstring. Raises as :func:`load_model`."""
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ModelFileError(f"this is not TOML: {error}") from error
+    document = read_toml(text)
     _check_keys(document, SECTIONS, "section")
     for name, content in document.items():
         if not isinstance(content, dict):

@@ -45,6 +45,8 @@ __all__ = [
 ]
 
 GUARD = 20
+MOST_POINTS = 128
+"""Of a rule or a curve: a second of 60-digit arithmetic, and far beyond what double precision has a use for."""
 
 Expressions: TypeAlias = tuple[Any, ...]
 """A tuple of SymPy expressions (SymPy is imported only where one is made)."""
@@ -117,13 +119,15 @@ def is_antisymmetric(points: Vector) -> bool:
     return all(abs(left + right) <= tolerance for left, right in zip(points, reversed(points), strict=True))
 
 
-def checked_count(value: Any, what: str, least: int) -> int:
-    """Return ``value`` as an int, or raise ``MethodError`` when it is not one or is below ``least``."""
+def checked_count(value: Any, what: str, least: int, most: int = MOST_POINTS) -> int:
+    """Return ``value`` as an int, or raise ``MethodError`` when it is not one or not between ``least`` and ``most``."""
     if isinstance(value, bool) or not hasattr(value, "__index__"):
         raise MethodError(f"{what} must be an integer, got {value!r}; give an integer of at least {least}")
     count = operator.index(value)
     if count < least:
         raise MethodError(f"{what} must be at least {least}, got {count}; give {least} or more")
+    if count > most:
+        raise MethodError(f"{what} must be at most {most}; take fewer, and more steps")
     return count
 
 

@@ -29,7 +29,7 @@ from scvi_codegen.stepper import Stepper
 
 if TYPE_CHECKING:
     from scvi_codegen.model_file import Model
-    from scvi_codegen.rendering import ExampleRun
+    from scvi_codegen.rendering import Embedded, ExampleRun
 
 __all__ = ["generate_package", "load_package"]
 
@@ -43,7 +43,12 @@ OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"
 
 
 def generate_package(
-    model: Model, folder: str | os.PathLike[str], *, solver: str = "auto", force: bool = False
+    model: Model,
+    folder: str | os.PathLike[str],
+    *,
+    solver: str = "auto",
+    force: bool = False,
+    embedded: Embedded | None = None,
 ) -> Path:
     """Write the integrator of a model into a folder, made if it is missing; other files in it are left alone.
 
@@ -52,18 +57,19 @@ def generate_package(
         folder: where to; its name becomes the prefix of the C names and the name of the Python package.
         solver: of the stage equations, as for ``compile_stepper``.
         force: overwrite files of the same names that were edited or written by someone else.
+        embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package.
 
     Returns:
         The folder.
 
     Raises:
         PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
-        MethodError: for a solver that the method does not have.
+        MethodError: for a solver that the method does not have, and for a number beyond single precision.
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
     prefix = _prefix(target)
-    texts = _texts(model, prefix, solver)
+    texts = _texts(model, prefix, solver, embedded)
     try:
         target.mkdir(parents=True, exist_ok=True)
         if not force:
@@ -87,6 +93,8 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
         if not isinstance(record, dict) or record.get("format") != FORMAT:
             raise PackageError(f"{target / INTERFACE_FILE} has another format: generate the folder again")
+        if "__init__.py" not in record["files"]:
+            raise PackageError(f"{target} is for a microcontroller: for Python generate it without --embedded")
         interface = Interface.from_json(json.dumps(record["interface"]))
         header, code = ((target / f"{interface.prefix}.{kind}").read_text(encoding="utf-8") for kind in "hc")
         declarations = "\n".join(record["declarations"])
@@ -107,7 +115,11 @@ def _prefix(folder: Path) -> str:
     """The name of the folder, fit to begin C names and to be imported."""
     from scvi_codegen.compiler import c_identifier  # here, because it imports SymPy
 
-    name = folder.resolve().name
+    try:
+        name = folder.resolve().name
+        name.encode()
+    except ValueError as error:
+        raise PackageError(f"{str(folder)!r} cannot be the name of a folder: {error}") from error
     cleaned = c_identifier(name)
     if name != cleaned:
         raise PackageError(
@@ -119,19 +131,20 @@ def _prefix(folder: Path) -> str:
     return name
 
 
-def _texts(model: Model, prefix: str, solver: str) -> dict[str, str]:
+def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None) -> dict[str, str]:
     """Text by file name, ``interface.json`` last."""
     from scvi_codegen.compiler import generate_source
     from scvi_codegen.rendering import render_example
 
-    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
+    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix, embedded=embedded)
     texts = {f"{prefix}.h": source.header, f"{prefix}.c": source.code}
-    texts |= render_example(interface, _example(model))
+    texts |= render_example(interface, _example(model), embedded or "double")
     described = _model_text(model)
     if described is not None:
         texts["model.toml"] = described
-    texts["README.md"] = _readme(interface, with_model=described is not None)
-    texts["__init__.py"] = _template("__init__.py")
+    texts["README.md"] = _readme(interface, with_model=described is not None, embedded=embedded)
+    if not embedded:
+        texts["__init__.py"] = _template("__init__.py")
     return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
 
 
@@ -181,12 +194,13 @@ def _model_text(model: Model) -> str | None:
         return None
 
 
-def _readme(interface: Interface, *, with_model: bool) -> str:
+def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None) -> str:
     defaults = zip(interface.parameters, interface.defaults, strict=True)
     listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
     return (
-        Template(_template("README.md"))
+        Template(_template("README_embedded.md" if embedded else "README.md"))
         .substitute(
+            real="float" if embedded == "single" else "double",
             prefix=interface.prefix,
             macro=interface.prefix.upper(),
             title=" ".join(interface.title.split()),

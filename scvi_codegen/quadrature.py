@@ -48,6 +48,10 @@ __all__ = [
 GUARD = 20
 COMPUTED_TOLERANCE = mp.mpf("1e-12")
 CLAIMED_TOLERANCE = mp.mpf("1e-8")
+MOST_ORDER = 10**6
+MOST_CONDITIONS = 64
+"""Of a rule with derivatives, whose weights solve as many equations."""
+MOST_DIGITS = 9
 
 Item = TypeVar("Item")
 
@@ -81,7 +85,7 @@ class Quadrature:
                     f"quadrature {self.name!r} has {len(self.points)} points and {len(weights)} weights; "
                     "give one weight for each point, and at least one point"
                 )
-        claimed = checked_count(self.order, "the order of a quadrature", 0)
+        claimed = checked_count(self.order, "the order of a quadrature", 0, MOST_ORDER)
         tolerance = CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE
         found = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
         if found == 0:
@@ -272,7 +276,8 @@ def hermite(n: int, derivatives: int = 1) -> Quadrature:
     """
     n = checked_count(n, "the number of Hermite points", 2)
     kinds = 1 + checked_count(derivatives, "the number of derivatives of a Hermite rule", 1)
-    points, count = legendre_lobatto_points(n), n * kinds
+    count = checked_count(n * kinds, "the number of values and derivatives of a Hermite rule", 4, MOST_CONDITIONS)
+    points = legendre_lobatto_points(n)
     with mp.workdps(DIGITS + GUARD + 2 * count):
         rows = mp.matrix(
             [[mp.ff(j, k) * x ** max(j - k, 0) for k in range(kinds) for x in points] for j in range(count)]
@@ -306,7 +311,7 @@ def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item
     """Read ``"family:count"`` and return the family and the count; ``MethodError`` says what is wrong with either."""
     family, _, count = str(name).partition(":")
     found = family_named(family, families, what)
-    if not (count.isascii() and count.isdigit()):
+    if not (count.isascii() and count.isdigit() and len(count) <= MOST_DIGITS):
         raise MethodError(f"{what} {name!r} lacks its number of points; write {family!r} as '{family}:3', say")
     return found, int(count)
 

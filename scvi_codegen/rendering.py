@@ -7,13 +7,17 @@ over the program's tables and the C that does not depend on it. Arithmetic arriv
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
+from typing import Literal, TypeAlias, get_args
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from scvi_codegen.c_printer import (
+    constants,
     lane_functions,
     print_lane_statements,
     print_number,
@@ -21,24 +25,34 @@ from scvi_codegen.c_printer import (
     scalar_functions,
 )
 from scvi_codegen.program import CoupledSweep, Family, Kernel, Program, SeparableSweep, Sweep
+from scvi_codegen.single_precision import SINGLE_UNIT, check_single, to_single
 from scvi_codegen.source import Interface, Source
 
 __all__ = [
     "DEFAULT_TOLERANCE",
+    "EMBEDDED",
     "MAX_ITERATIONS",
+    "Embedded",
     "EventSearch",
     "ExampleRun",
     "render",
+    "render_embedded",
     "render_events",
     "render_example",
     "template_folder",
 ]
+
+Embedded: TypeAlias = Literal["double", "single"]
+"""The precision of C text for a microcontroller."""
+
+EMBEDDED: tuple[Embedded, ...] = get_args(Embedded)
 
 DEFAULT_TOLERANCE = 2.0**-52
 """Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
 
 MAX_ITERATIONS = 50
 ROUNDOFF_LEVEL = 1e-11
+SINGLE_ROUNDOFF_LEVEL = 1e-4
 KEEP_CHANGE = 1e-2
 KEEP_RATE = 0.1
 GOOD_GUESS = 1e-3
@@ -107,10 +121,36 @@ def template_folder() -> Path:
 
 def render(program: Program) -> Source:
     """Header and source of a program; equal programs give equal bytes."""
-    context = _context(program)
+    return _render(program.prefix, _context(program))
+
+
+def render_embedded(program: Program, precision: Embedded) -> Source:
+    """The same for a microcontroller: iterations bounded when it is compiled, in the precision of its registers.
+
+    Raises:
+        MethodError: for a number that single precision cannot hold.
+    """
+    bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
+    context = _context(program) | {
+        "embedded": True,
+        "most_iterations": MAX_ITERATIONS,
+        "max_iterations": bound,
+        "iteration_limit": f"least(options->max_iterations, {bound})",
+        "halvings": 52,
+    }
+    if precision == "double":
+        return _render(program.prefix, context)
+    check_single((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program)))))
+    levels = {"real": "float", "halvings": 23, "tolerance": SINGLE_UNIT, "roundoff_level": SINGLE_ROUNDOFF_LEVEL}
+    source = _render(program.prefix, context | levels)
+    header, code, declarations = map(to_single, (source.header, source.code, source.declarations))
+    return Source(prefix=source.prefix, header=header, code=code, declarations=declarations)
+
+
+def _render(prefix: str, context: Mapping[str, object]) -> Source:
     environment = _environment()
     return Source(
-        prefix=program.prefix,
+        prefix=prefix,
         header=environment.get_template("stepper.h.jinja").render(context),
         code=environment.get_template("stepper.c.jinja").render(context),
         declarations=environment.get_template("parts/declarations.h.jinja").render(context),
@@ -168,11 +208,15 @@ def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
     )
 
 
-def render_example(interface: Interface, start: ExampleRun) -> dict[str, str]:
+def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
     """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     context = {"interface": interface, "prefix": interface.prefix, "start": start}
     environment = _environment()
-    return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
+    texts = {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
+    if precision == "single":
+        check_single((*start.q, *start.p, *start.parameters, start.t, start.h))
+        texts["main.c"] = to_single(texts["main.c"])
+    return texts
 
 
 def workspace_size(program: Program) -> int:
@@ -191,23 +235,29 @@ def scratch_size(program: Program) -> int:
 
 
 def _context(program: Program) -> dict[str, object]:
-    scalar_kernels = (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
     return {
         "program": program,
         "prefix": program.prefix,
         "kernels": program.kernels,
-        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalar_kernels))),
+        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, _scalar_kernels(program)))),
         "purpose": _purposes(program),
         "legendre": program.legendre,
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
         "tolerance": DEFAULT_TOLERANCE,
         "max_iterations": MAX_ITERATIONS,
+        "iteration_limit": "options->max_iterations",
+        "embedded": False,
+        "real": "double",
         "roundoff_level": ROUNDOFF_LEVEL,
         "keep_change": KEEP_CHANGE,
         "keep_rate": KEEP_RATE,
         **_lane_context(program.sweep),
     }
+
+
+def _scalar_kernels(program: Program) -> tuple[Kernel, ...]:
+    return (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
 
 
 def _purposes(program: Program) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.arguments import checked_count
+from scvi_codegen.arguments import checked_count, empty_array
 from scvi_codegen.binding import SolverOptions, step_failure
 from scvi_codegen.events import Crossings
 from scvi_codegen.observation import Observation
@@ -108,7 +108,7 @@ class Run:
         first = self.steps
         capacity = (first + steps) // every - first // every
         m = self.stepper.dimension
-        t, q, p = np.empty(capacity + 1), np.empty((capacity + 1, m)), np.empty((capacity + 1, m))
+        t, q, p = (empty_array((capacity + 1, *shape)) for shape in ((), (m,), (m,)))
         iterations = np.zeros(capacity + 1, dtype=np.int32)
         t[0], q[0], p[0] = self.t, self.q, self.p
         filled, done, portion = 1, 0, every * max(1, 256 // every)

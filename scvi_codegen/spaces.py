@@ -21,6 +21,8 @@ from scvi_codegen.quadrature import Quadrature, gauss_legendre
 __all__ = ["CurveSpace", "Polynomials", "Splines", "Trigonometric", "space_by_name"]
 
 MOST_POINTS = 64
+BETTER = 4
+"""By how many points the rule is better that tells whether one is good enough."""
 GUARD_DIGITS = 200
 """Trigonometric functions of a small frequency are nearly polynomials: their cardinal combinations cancel."""
 
@@ -151,11 +153,13 @@ class Trigonometric(CurveSpace):
             """The steepest of the products; the point 1 makes it uneven."""
             return (1 + x) ** powers * mp.cos(count * mp.mpf(self.frequency) * (1 + x))
 
-        rules = [gauss_legendre(n) for n in range(degree + 1, MOST_POINTS + 1)]
-        sums = [mp.fdot(rule.weights, map(product, rule.points)) for rule in rules]
-        for rule, found, better in zip(rules, sums, sums[4:], strict=False):
-            if abs(found - better) < mp.ldexp(1, powers - 56):
-                return rule
+        sums: list[Number] = []
+        enough = count * self.frequency < MOST_POINTS
+        for n in range(degree + 1, MOST_POINTS + 1) if enough else ():
+            rule = gauss_legendre(n)
+            sums.append(mp.fdot(rule.weights, map(product, rule.points)))
+            if len(sums) > BETTER and abs(sums[-1 - BETTER] - sums[-1]) < mp.ldexp(1, powers - 56):
+                return gauss_legendre(n - BETTER)
         raise MethodError(f"{self.name} turns too often in a step for {MOST_POINTS} points: take a smaller step")
 
     def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
@@ -228,6 +232,8 @@ class Splines(CurveSpace):
     def __post_init__(self) -> None:
         if isinstance(self.pieces, bool) or self.pieces < 1:
             raise MethodError(f"splines have at least one piece, not {self.pieces}")
+        if self.pieces > MOST_POINTS:
+            raise MethodError(f"splines have at most {MOST_POINTS} pieces: take fewer, and more steps")
         inner = tuple(float(to_number(x)) for x in self.breakpoints)
         if any(not a < b for a, b in pairwise((0.0, *inner, 1.0))):
             raise MethodError(f"breakpoints must ascend between 0 and 1, not {', '.join(map(str, inner))}")
@@ -254,7 +260,13 @@ class Splines(CurveSpace):
         """Of the velocities: continuous, of one degree less."""
         if degree < 2:
             raise MethodError("splines with a continuous slope have degree 2 at least")
-        return self.pieces * (degree - 1) + 1
+        velocities = self.pieces * (degree - 1) + 1
+        if velocities > MOST_POINTS:
+            raise MethodError(
+                f"{self.name} of degree {degree} has {velocities} velocities, of at most {MOST_POINTS}: take fewer "
+                "pieces, and more steps"
+            )
+        return velocities
 
     def points(self, degree: int, rule: Quadrature) -> Vector:
         """Equispaced on each piece, its ends included."""
@@ -336,7 +348,10 @@ def space_by_name(name: str) -> CurveSpace:
         if family == "trigonometric" and len(words) <= 2:
             return Trigonometric(float(words[0]), *map(int, words[1:]))
         if family == "splines":
-            return Splines(int(rest)) if rest.isdecimal() else Splines(breakpoints=tuple(map(float, words)))
+            whole = rest.isascii() and rest.isdigit()
+            return Splines(int(rest)) if whole else Splines(breakpoints=tuple(map(float, words)))
+    except MethodError:
+        raise
     except ValueError:
         pass
     raise MethodError(

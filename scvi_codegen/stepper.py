@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen import building
-from scvi_codegen.arguments import checked_number, checked_step
+from scvi_codegen.arguments import checked_number, checked_step, real_array
 from scvi_codegen.binding import STATUS, Binding, SolverOptions, step_failure
 from scvi_codegen.dense_output import checked_times, states_at, times_of_run
 from scvi_codegen.errors import MethodError, StateError
@@ -277,9 +277,12 @@ class Stepper:
         """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have."""
         memory = self.binding.new("run *")
         buffer = self.binding.buffer(memory)
+        if not isinstance(saved, bytes):
+            raise StateError(f"a saved run is bytes, not {type(saved).__name__}")
         if len(saved) != len(buffer):
             raise StateError(f"{len(saved)} bytes are not a saved run of this stepper, which has {len(buffer)}")
         buffer[:] = saved
+        _check_run(memory)
         return Run(self, memory, self._parameters(parameters), options)
 
     def momentum(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
@@ -449,7 +452,7 @@ class Stepper:
 
     def _states(self, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
         """(n,) times and (n, m) positions and momenta, contiguous, of one state or many."""
-        positions, momenta = np.asarray(q, dtype=float), np.asarray(p, dtype=float)
+        positions, momenta = real_array(q, "q"), real_array(p, "p")
         if positions.ndim == 1:
             positions, momenta = self._vector(q, "q"), self._vector(p, "p")
         elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != self.dimension:
@@ -457,7 +460,9 @@ class Stepper:
                 f"states must have shape (n, {self.dimension}), not q {positions.shape} and p {momenta.shape}"
             )
         count = positions.size // self.dimension
-        times = np.asarray(t, dtype=float)
+        times = real_array(t, "the time t")
+        if not np.isfinite(times).all():
+            raise StateError("a time t is not finite")
         if times.shape not in ((), (count,)):
             raise StateError(f"there are {count} states, but the time has shape {times.shape}")
         times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
@@ -465,10 +470,7 @@ class Stepper:
 
     def _vector(self, value: ArrayLike, name: str) -> Array:
         """A finite, contiguous (m,) copy."""
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise StateError(f"{name} must be {self.dimension} real numbers: {error}") from error
+        array = real_array(value, name)
         if array.shape != (self.dimension,):
             names = ", ".join(self.coordinates[:6]) + (", ..." if self.dimension > 6 else "")
             raise StateError(f"{name} must have shape ({self.dimension},) for ({names}), not {array.shape}")
@@ -485,10 +487,7 @@ class Stepper:
             for name, value in parameters.items():
                 values[self.parameter_index(name)] = checked_number(value, f"the parameter {name}")
         else:
-            try:
-                given = np.array(parameters, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise StateError(f"parameters must be real numbers: {error}") from error
+            given = real_array(parameters, "parameters")
             if given.shape != values.shape:
                 names = ", ".join(self.parameters) or "none"
                 raise StateError(f"there are {len(values)} parameters ({names}), not {given.size}")
@@ -506,6 +505,15 @@ class Stepper:
         near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise StateError(f"there is no parameter {name!r} among {', '.join(self.parameters) or 'none'}{hint}")
+
+
+def _check_run(memory: Any) -> None:
+    """Raise :class:`StateError` for bytes that no run has."""
+    numbers = [memory.t0, memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
+    counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
+    sound = np.isfinite(numbers).all() and memory.h != 0.0 and all(0 <= count < 2**53 for count in counts.values())
+    if not sound or memory.guess > 2:
+        raise StateError(f"these bytes are not a saved run: h = {memory.h:g}, {counts}")
 
 
 def _watching(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:

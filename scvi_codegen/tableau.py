@@ -46,6 +46,7 @@ __all__ = [
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
 ZERO_TOLERANCE = mp.mpf("1e-30")
+MOST_STAGES = 64
 
 Polynomial: TypeAlias = list[Number]
 """Coefficients in ascending powers; the last is not zero, and the zero polynomial is empty."""
@@ -315,6 +316,8 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
     ``MethodError`` when the abscissae are not ascending.
     """
     c = tuple(map(to_number, abscissae))
+    if len(c) > MOST_STAGES:
+        raise MethodError(f"{len(c)} abscissae are too many: take at most {MOST_STAGES}, and more steps")
     for index, (left, right) in enumerate(pairwise(c), start=1):
         if left >= right:
             raise MethodError(

@@ -57,10 +57,9 @@ def test_steppers_work_on_lesser_processors(tmp_path, level):
 @pytest.mark.skipif(sys.platform != "linux", reason="the sanitizers are preloaded")
 def test_sanitizers_find_nothing(tmp_path):
     libraries = " ".join(map(sanitizer_library, ("libasan.so", "libubsan.so")))
-    options = "detect_leaks=0"  # the interpreter keeps what it has at its end
-    run_stepper_tests(
-        tmp_path, SANITIZERS, "tests/test_stepper.py", CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options
-    )
+    options = "detect_leaks=0:allocator_may_return_null=1"  # the interpreter keeps what it has; too much is refused
+    files = ("tests/test_stepper.py", "tests/test_fuzz_steppers.py")
+    run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
 
 
 def test_a_build_with_wanted_flags_is_another_one(tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 FLOORS = """
     version
     errors precision program source ordering bodies files
-    derivatives expression_text nodes arguments export cache
+    derivatives expression_text nodes arguments export cache toml_text
     events
     symbols regularity quadrature
     mechanical_system translation
@@ -42,7 +42,7 @@ FLOORS = """
     exactness tape
     exact_motion
     derived_step
-    equations lowering c_printer
+    equations lowering c_printer single_precision
     solvers.velocity_tables solvers.padding solvers.splitting rendering building
     solvers.curve_tables
     solvers.separable solvers.coupled solvers.collocation solvers.shooting

@@ -14,7 +14,6 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.nodes import chebyshev_lobatto, legendre_lobatto
 from scvi_codegen.precision import mp
 from scvi_codegen.quadrature import (
-    QUADRATURE_FAMILIES,
     Quadrature,
     clenshaw_curtis,
     exact_rule,
@@ -38,7 +37,7 @@ ORDERS = {
 
 
 def rules(counts: list[int]) -> list[Quadrature]:
-    names = [f"{family}:{n}" for family in QUADRATURE_FAMILIES for n in counts if n > 1 or family not in NEEDS_TWO]
+    names = [f"{family}:{n}" for family in ORDERS for n in counts if n > 1 or family not in NEEDS_TWO]
     return [quadrature_by_name(name) for name in names]
 
 

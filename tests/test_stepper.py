@@ -179,7 +179,7 @@ def test_bytes_of_another_length_are_refused(kepler):
         (([[1.0, 0.0]], [0.0, 0.0], 0.1), r"not \(1, 2\)"),
         (([1.0, np.nan], [0.0, 0.0], 0.1), r"q\[1\] \(q2\) is nan"),
         (([1.0, 0.0], [np.inf, 0.0], 0.1), r"p\[0\] \(q1\) is inf"),
-        (("ab", [0.0, 0.0], 0.1), "q must be 2 real numbers"),
+        (("ab", [0.0, 0.0], 0.1), "q must be real numbers"),
         (([1j, 0.0], [0.0, 0.0], 0.1), "real"),
         (([1.0, 0.0], [0.0, 1.0], 0.0), "the step h is 0"),
         (([1.0, 0.0], [0.0, 1.0], np.nan), "the step h is nan"),

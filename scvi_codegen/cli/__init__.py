@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from scvi_codegen.cli.recording import RecordedOutcome
     from scvi_codegen.cli.running import Outcome
     from scvi_codegen.model_file import Model
+    from scvi_codegen.rendering import Embedded
 
 __all__ = ["main"]
 
@@ -234,8 +235,15 @@ def export(folder: str, output: str | None) -> None:
 )
 @SOLVER_OPTION
 @click.option("--force", is_flag=True, help="Overwrite files of the same names that were edited or are not ours.")
-def generate(model_name: str, output: str, solver: str, force: bool, **choices: Any) -> None:
+@click.option(
+    "--embedded",
+    type=click.Choice(["double", "single"]),
+    help="C for a microcontroller, in this precision, without a Python package.",
+)
+def generate(model_name: str, output: str, solver: str, force: bool, embedded: Embedded | None, **choices: Any) -> None:
     """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
+
+    With --embedded the C is small: Newton's iteration alone, or an explicit method, iterations bounded by a macro.
 
     \b
     Example:
@@ -246,9 +254,10 @@ def generate(model_name: str, output: str, solver: str, force: bool, **choices: 
     model = read_model(model_name, Choices(**choices))
     from scvi_codegen.package import generate_package
 
-    folder = generate_package(model, output, solver=solver, force=force)
+    folder = generate_package(model, output, solver=solver, force=force, embedded=embedded)
     click.echo(f"{model.system.name}: {model.method.title}")
-    click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run', or 'import {folder.resolve().name}'")
+    python = "" if embedded else f", or 'import {folder.resolve().name}'"
+    click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}")
 
 
 @main.command(short_help="Print the equations of one step of MODEL.")

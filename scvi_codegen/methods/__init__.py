@@ -92,6 +92,11 @@ def method_from_specification(specification: Specification) -> Method:
     for argument in arguments:
         if argument not in accepted:
             raise MethodError(f"{name} takes no {argument!r}; it takes {', '.join(accepted) or 'no arguments'}")
+    for argument in {"degree", "stages", "order"} & set(arguments):
+        if isinstance(arguments[argument], bool) or not isinstance(arguments[argument], int):
+            raise MethodError(f"{argument} must be an integer, not {arguments[argument]!r}")
+    if not isinstance(arguments.get("abscissae", ""), str | list | tuple):
+        raise MethodError(f"abscissae must be a list of numbers or a name, not {arguments['abscissae']!r}")
     if name in REQUIRED and REQUIRED[name] not in arguments:
         raise MethodError(f"{name} needs {REQUIRED[name]!r}")
     if name == "composition":

@@ -13,6 +13,7 @@ from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
 from scvi_codegen.precision import Number, Vector, mp
 from scvi_codegen.stage_system import PointFamily, Scatter, StageSystem, dyadic
+from scvi_codegen.tableau import MOST_STAGES
 
 __all__ = ["Method", "Specification", "check_count", "check_regular", "lagrangian_scatters", "unit_sum"]
 
@@ -77,12 +78,14 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
         )
 
 
-def check_count(value: int, what: str, *, least: int = 1) -> None:
-    """Raise :class:`MethodError` unless ``value`` is an integer of at least ``least``."""
+def check_count(value: int, what: str, *, least: int = 1, most: int = MOST_STAGES) -> None:
+    """Raise :class:`MethodError` unless ``value`` is an integer between ``least`` and ``most``."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise MethodError(f"{what} must be an integer, not {value!r}")
     if value < least:
         raise MethodError(f"{what} must be at least {least}, not {value}")
+    if value > most:
+        raise MethodError(f"{what} must be at most {most}: take a lower one, and more steps")
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:

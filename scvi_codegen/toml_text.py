@@ -1,0 +1,51 @@
+"""TOML text of any origin to plain data: what would fill the memory, run for hours or end the parser is refused."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from typing import Any
+
+from scvi_codegen.errors import ModelFileError
+
+__all__ = ["read_toml"]
+
+MAX_CHARACTERS = 1_000_000
+MAX_BITS = 4096
+"""Of a whole number: Python does not print longer ones. TOML's have 64."""
+LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
+"""The parser takes a time that grows with the square of the number of words between dots."""
+
+
+def read_toml(text: str) -> dict[str, Any]:
+    """The document in a text.
+
+    Raises:
+        ModelFileError: for what is not TOML, or longer or deeper than any file of this program.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise ModelFileError(f"the file has {len(text)} characters: the limit is {MAX_CHARACTERS}")
+    if LONG_KEY.search(text):
+        raise ModelFileError("this is not a file of this program: a key has more than 32 words between dots")
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ModelFileError(f"this is not TOML: {error}") from error
+    except RecursionError:
+        raise ModelFileError("this is not a file of this program: lists or tables are nested too deeply") from None
+    except ValueError as error:  # Python's limit for the digits of a whole number
+        raise ModelFileError(f"this is not TOML: a number is too long ({error})") from error
+    _check_whole_numbers(document)
+    return document
+
+
+def _check_whole_numbers(document: dict[str, Any]) -> None:
+    pending: list[Any] = [document]
+    while pending:
+        item = pending.pop()
+        if isinstance(item, dict):
+            pending.extend(item.values())
+        elif isinstance(item, list):
+            pending.extend(item)
+        elif isinstance(item, int) and item.bit_length() > MAX_BITS:
+            raise ModelFileError(f"this is not TOML: a whole number of {item.bit_length()} bits, of {MAX_BITS} at most")

@@ -1,0 +1,2 @@
+void put_text(const char *text);
+void leave(int status);
