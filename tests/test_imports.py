@@ -17,7 +17,7 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source ordering
+    errors precision program source ordering c_outline mathml
     derivatives expression_text nodes arguments
     symbols regularity quadrature
     mechanical_system translation
@@ -45,8 +45,8 @@ FLOORS = """
     compiler
     problems pilot
     model_file
-    package plotting advice distributed ensemble_file
-    exact mathml
+    package plotting advice distributed ensemble_file page
+    exact
     __init__
     benchmark
     reproduce
@@ -61,7 +61,7 @@ A folder stands here by its own name where its rooms have no floors of their own
 FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for room in floor.split()}
 
 OWNERS = {
-    "jinja2": ["rendering", "reproduce"],
+    "jinja2": ["rendering", "page"],
     "cffi": ["building"],
     "platformdirs": ["building"],
     "matplotlib": ["plotting", "benchmark", "reproduce"],
