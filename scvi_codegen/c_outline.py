@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-__all__ = ["Function", "functions_of", "outline"]
+__all__ = ["Function", "functions_of", "outline", "reached"]
 
 HEAD = re.compile(
     r"(?:^/\*(?P<comment>(?:[^*]|\*(?!/))*)\*/\n)?"
@@ -66,6 +66,18 @@ def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Funct
 def _last_word(argument: str) -> str:
     words: list[str] = re.findall(r"\w+", re.sub(r"\[.*?\]|\)", "", argument))
     return words[-1]
+
+
+def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ...]:
+    """``start`` and what it calls, each once, each before what it calls itself."""
+    found: dict[str, Function] = {}
+    pending = [start]
+    while pending:
+        name = pending.pop()
+        if name not in found:
+            found[name] = functions[name]
+            pending.extend(reversed(functions[name].calls))
+    return tuple(found.values())
 
 
 def outline(functions: Mapping[str, Function], start: str) -> str:

@@ -29,7 +29,7 @@ from scvi_codegen.source import Interface, Source
 from scvi_codegen.stepper import Stepper
 from scvi_codegen.text_cache import Texts, remembered_texts
 
-__all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
+__all__ = ["c_identifier", "compile_stepper", "describe", "generate_source", "program_of"]
 
 LONGEST_PREFIX = 64
 C_HEADERS = frozenset(
@@ -68,7 +68,7 @@ def compile_stepper(
     """
 
     def make() -> Texts:
-        program = _program(system, method, solver=solver, prefix=prefix)
+        program = program_of(system, method, solver=solver, prefix=prefix)
         return render(program), describe(program, system, method), render_ensemble(program)
 
     source, interface, ensemble = remembered_texts(system, method, solver, prefix, make)
@@ -79,11 +79,12 @@ def generate_source(
     system: MechanicalSystem, method: Method, *, solver: str = "auto", prefix: str | None = None
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`."""
-    program = _program(system, method, solver=solver, prefix=prefix)
+    program = program_of(system, method, solver=solver, prefix=prefix)
     return render(program), describe(program, system, method)
 
 
-def _program(system: MechanicalSystem, method: Method, *, solver: str, prefix: str | None) -> Program:
+def program_of(system: MechanicalSystem, method: Method, *, solver: str = "auto", prefix: str | None = None) -> Program:
+    """The integrator without syntax; arguments as of :func:`compile_stepper`."""
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = solver in ("auto", "fixed-point") and splitting is None

@@ -33,7 +33,7 @@ from scvi_codegen.quadrature import exact_rule
 from scvi_codegen.stage_system import Block, PointFamily, StageSystem, Table
 from scvi_codegen.tableau import exact_tableau
 
-__all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive"]
+__all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive", "table_entries"]
 
 LARGEST_BASIS = 8
 LARGEST_COEFFICIENT = 10**5
@@ -327,6 +327,22 @@ def _entries(values: Mapping[sympy.Symbol, Number], basis: tuple[sympy.Expr, ...
     return tuple(
         TableEntry(symbol, value, _exact(value, basis, known)) for symbol, value in sorted(values.items(), key=_by_name)
     )
+
+
+def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
+    """The named numbers of all tables of a method's equations; those that do not occur in the equations, too."""
+    tables = [stages.end_position]
+    values: dict[sympy.Symbol, Number] = {}
+    for family in stages.families:
+        tables += [gather.table for gather in family.gathers] + [scatter.table for scatter in family.scatters]
+        tables.append(Table(entries=(family.weights,), names=(family.weight_names,)))
+    for table in tables:
+        for names, numbers in zip(table.names, table.entries, strict=True):
+            for name, value in zip(names, numbers, strict=True):
+                base, _, divisor = name.partition("/")
+                if base:
+                    values[sympy.Symbol(base, real=True)] = value * int(divisor or 1)
+    return _entries(values, _radical_basis(method))
 
 
 def _by_name(item: tuple[sympy.Symbol, Number]) -> tuple[object, ...]:

@@ -27,6 +27,7 @@ FLOORS = """
     spaces
     auxiliaries
     tableau
+    number_tables
     methods.method
     methods.galerkin
     methods.collocation methods.composition
@@ -46,7 +47,7 @@ FLOORS = """
     problems pilot
     model_file
     package plotting advice distributed ensemble_file page
-    exact
+    exact derivation
     __init__
     benchmark
     reproduce

@@ -32,7 +32,9 @@ TALL = "2.2em"
 CARDINAL = {"l": "", "dl": "dot"}
 """Tables of cardinal functions at points, with their accent: l_1_0 is l_0(tau_1)."""
 PRODUCTS = {"DD": ("D_hat", "D_tilde"), "aa": ("A__2",), "bA": ("b", "A")}
-"""Tables that are products of matrices: DD_1_0 is entry (1, 0) of the product."""
+"""Tables that are products of matrices: DD_1_0 is entry (1, 0) of the product, DD_n_j any."""
+RUNNING = ("i", "j", "n")
+"""Indices of sums."""
 SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
 """Functions whose power is written at their name."""
 TYPESET = str.maketrans({"-": "\N{MINUS SIGN}", "ⅆ": "d", "ⅇ": "e", "ⅈ": "i"})
@@ -263,7 +265,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         if prefix in CARDINAL and len(indices) == 2 and all(map(str.isdigit, indices)):
             function = self._typeset(Name("l", CARDINAL[prefix], below=(indices[1],)))
             return self._row(function, self._fenced(self._typeset(Name("τ", below=(indices[0],)))))
-        if prefix in PRODUCTS and indices and all(map(str.isdigit, indices)):
+        if prefix in PRODUCTS and indices and all(index.isdigit() or index in RUNNING for index in indices):
             matrices = [self._typeset(parsed(matrix)) for matrix in PRODUCTS[prefix]]
             return self._element("msub", self._fenced(*matrices), self._indices(indices))
         return self._typeset(parsed(name))

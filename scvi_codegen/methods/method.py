@@ -11,6 +11,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
+from scvi_codegen.number_tables import Part
 from scvi_codegen.precision import Number, Vector, mp
 from scvi_codegen.stage_system import PointFamily, Scatter, StageSystem, dyadic
 
@@ -53,6 +54,11 @@ class Method(ABC):
     @abstractmethod
     def title(self) -> str:
         """One line for people."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The nodes, quadrature and tableau that its numbers are made from."""
+        return ()
 
     @abstractmethod
     def specification(self) -> Specification:

@@ -60,6 +60,8 @@ def column_class(table: Table, index: int) -> str:
     """``"number"`` for what is set to the right, ``"text"`` for what needs several lines."""
     cells = [row[index] for row in table.rows]
     texts = [value for value in cells if isinstance(value, str)]
+    if any(isinstance(value, sympy.Symbol) for value in cells):
+        return "word"
     if not texts:
         return "number"
     return "text" if max(map(len, texts)) > LONGEST_LINE else "word"

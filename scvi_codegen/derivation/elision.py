@@ -1,0 +1,53 @@
+"""What is too long to be read is left out, and how much that is stands in its place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import sympy
+
+from scvi_codegen.page.blocks import Code, Content, Formula, Paragraph
+
+__all__ = ["MOST_FORMULAS", "formulas", "lines", "operations"]
+
+MOST_FORMULAS = 12
+"""Equations of one kind that are written out."""
+MOST_OPERATIONS = 240
+"""Of an equation that is written out."""
+MOST_LINES = 70
+"""Of a C function that are shown."""
+
+
+def operations(expression: sympy.Basic) -> int:
+    """As SymPy counts them: every function, power, product, quotient and sum of the formula as it stands."""
+    return int(sympy.count_ops(expression))
+
+
+def formulas(given: Sequence[Formula], what: str) -> Iterator[Content]:
+    """The first of them, and of the others how many they are; ``what`` names one of them."""
+    long = 0
+    for formula in given[:MOST_FORMULAS]:
+        if operations(formula.right) <= MOST_OPERATIONS:
+            yield formula
+        else:
+            long += 1
+    if long:
+        largest = max(operations(formula.right) for formula in given[:MOST_FORMULAS])
+        yield Paragraph(
+            f"{_counted(long, what)} of more than {MOST_OPERATIONS} operations (the longest: {largest}) left out here."
+        )
+    if len(given) > MOST_FORMULAS:
+        yield Paragraph(f"The first {MOST_FORMULAS} of {_counted(len(given), what)}.")
+
+
+def lines(text: str) -> Code:
+    """C text, its end left out where it is long."""
+    given = text.splitlines()
+    if len(given) <= MOST_LINES:
+        return Code(text)
+    kept = "\n".join(given[:MOST_LINES])
+    return Code(f"{kept}\n/* .. {len(given) - MOST_LINES} more lines */")
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
