@@ -356,6 +356,8 @@ def _high_precision(expression: sympy.Expr) -> Number:
 
 def _exact(value: Number, basis: tuple[sympy.Expr, ...], known: Sequence[Number]) -> sympy.Expr | None:
     """The combination of basis elements with small rational coefficients that equals ``value`` to 54 digits (PSLQ)."""
+    if value == 0:
+        return sympy.S.Zero
     if not basis:
         return None
     tolerance = mp.mpf(10) ** (PSLQ_SLACK - DIGITS)

@@ -17,6 +17,8 @@ __all__ = ["Column", "column_of"]
 
 CARDINAL = {"l": "l", "dl": "l_dot"}
 """Tables of functions at points tau_n."""
+LINES = ("b", "bA", "beta", "gamma")
+"""Tables of one line, q_(k+1), whose entries have one index."""
 ANY_POINT = "n"
 
 
@@ -47,10 +49,10 @@ class Column:
         if self.kind in ("constant", "single", "leading"):
             return self.factor
         own = [] if self.index is None else [str(index)]
-        if self.prefix in CARDINAL and self.points > 1:
-            name = "_".join([CARDINAL[self.prefix], *own])
-            return self.factor * sympy.Function(name)(Symbol(f"tau_{ANY_POINT}"))
-        row = [ANY_POINT] if self.points > 1 else []
+        point = ANY_POINT if self.points > 1 else "1"
+        if self.prefix in CARDINAL:
+            return self.factor * sympy.Function("_".join([CARDINAL[self.prefix], *own]))(Symbol(f"tau_{point}"))
+        row = [] if self.points == 1 and self.prefix in LINES else [point]
         indices = [*own, *row] if self.transposed else [*row, *own]
         return self.factor * Symbol("_".join([self.prefix, *indices]))
 

@@ -66,5 +66,5 @@ def _sections(system: MechanicalSystem, method: Method, solver: str) -> Iterator
     yield written_out_section(derived)
     yield jacobian_section(system, stages, derived, program)
     yield operations_section(program)
-    yield kernels_section(program, functions)
+    yield kernels_section(system, program, functions)
     yield functions_section(system, method, program, functions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 import sympy
 
@@ -12,12 +13,13 @@ __all__ = ["MOST_FORMULAS", "formulas", "lines", "operations"]
 
 MOST_FORMULAS = 12
 """Equations of one kind that are written out."""
-MOST_OPERATIONS = 240
+MOST_OPERATIONS = 400
 """Of an equation that is written out."""
 MOST_LINES = 70
 """Of a C function that are shown."""
 
 
+@lru_cache(maxsize=4096)
 def operations(expression: sympy.Basic) -> int:
     """As SymPy counts them: every function, power, product, quotient and sum of the formula as it stands."""
     return int(sympy.count_ops(expression))

@@ -9,7 +9,9 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.c_outline import Function
-from scvi_codegen.derivation.elision import formulas, lines, operations
+from scvi_codegen.derivation.elision import MOST_FORMULAS, formulas, lines, operations
+from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics import auxiliary_multipliers, multipliers
 from scvi_codegen.page.blocks import Beside, Content, Formula, Paragraph, Section, Table
 from scvi_codegen.program import Kernel, Program, SeparableSweep
 
@@ -54,9 +56,10 @@ def operations_section(program: Program) -> Section:
     return Section(name="operations", title="Operation counts", contents=contents)
 
 
-def kernels_section(program: Program, functions: Mapping[str, Function]) -> Section:
+def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Function]) -> Section:
     """One pair a kernel: formulas at the left, C at the right."""
-    pairs = tuple(_pair(program, kernel, functions[kernel.name]) for kernel in kernels_of(program))
+    names = _names(system)
+    pairs = tuple(_pair(program, kernel, functions[kernel.name], names) for kernel in kernels_of(program))
     text = (
         "A kernel is all that depends on the system: arithmetic in a straight line, at one point. Those called _lanes "
         "do the same for all points at once."
@@ -64,17 +67,29 @@ def kernels_section(program: Program, functions: Mapping[str, Function]) -> Sect
     return Section(name="kernels", title="The kernels: formulas and C", contents=(Paragraph(text), *pairs))
 
 
-def _pair(program: Program, kernel: Kernel, function: Function) -> Beside:
+def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
+    """Short symbols for the multipliers, lambda and nu with the name of their coordinate."""
+    named = ((multipliers(system), "lambda"), (auxiliary_multipliers(system), "nu"))
+    return {
+        symbol: Symbol(f"{letter}_{q.name}")
+        for symbols, letter in named
+        for symbol, q in zip(symbols, system.coordinates, strict=False)
+    }
+
+
+def _pair(program: Program, kernel: Kernel, function: Function, names: Mapping[Symbol, Symbol]) -> Beside:
     values, slopes = (
-        [Formula(formula, Symbol(f"{name}_{k}")) for k, formula in enumerate(given)]
+        [
+            Formula(formula.xreplace(names) if k < MOST_FORMULAS else formula, Symbol(f"{name}_{k}"))
+            for k, formula in enumerate(given)
+        ]
         for name, given in (("value", kernel.formulas[: kernel.values]), ("slope", kernel.formulas[kernel.values :]))
     )
     left: list[Content] = [Paragraph(COUNTS.sub("", function.comment))] if function.comment else []
     if kernel.uses_arguments:
-        left.append(Formula(sympy.Tuple(*kernel.symbols), Symbol("u")))
+        left.append(Formula(sympy.Tuple(*kernel.symbols).xreplace(names), Symbol("u")))
     if kernel.uses_parameters:
-        names = (Symbol(name) for name in program.parameter_names)
-        left.append(Formula(sympy.Tuple(*names), Symbol("parameters")))
+        left.append(Formula(sympy.Tuple(*map(Symbol, program.parameter_names)), Symbol("parameters")))
     left += [*formulas(values, "value"), *formulas(slopes, "slope")]
     title = f"{kernel.name}({', '.join(function.arguments)})"
     return Beside(title=title, left=tuple(left), right=(lines(function.text),))

@@ -48,7 +48,7 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
     yield from formulas([Formula(value, Symbol(f"p_{q.name}")) for q, value in pairs], "momentum formula")
     yield Paragraph(
         "The Euler-Lagrange equations (2), d/dt dL/dv - dL/dq = 0, by the chain rule. They are linear in the "
-        "accelerations, and nobody solves for these: neither the derivation nor the C does."
+        "accelerations; neither the derivation nor the C solves for these."
     )
     yield from formulas([Formula(value, sympy.S.Zero, "2") for value in euler_lagrange(system)], "equation")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from sympy import Symbol
 
-from scvi_codegen.derivatives import gradient
 from scvi_codegen.lowering import argument_name
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import constitutive, euler_lagrange, force, momentum
@@ -36,21 +35,17 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Sym
 
 
 def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
-    """What a scatter takes from the kernel at a point."""
-    known = {
-        force(system): "L_q",
-        momentum(system): "L_v",
-        euler_lagrange(system): "E",
-        constitutive(system): "L_p",
-    }
+    """What a scatter takes from the kernel at a point; of a scalar's gradient, scatters are parallel to gathers."""
     if family.scalar is None:
+        known = {
+            force(system): "L_q",
+            momentum(system): "L_v",
+            euler_lagrange(system): "E",
+            constitutive(system): "L_p",
+        }
         return Symbol(f"{known[scatter.results]}_{place}")
-    for gather in family.gathers:
-        slopes = gradient(family.scalar, gather.arguments)
-        if scatter.results == tuple(slopes.get(i, 0) for i in range(len(gather.arguments))):
-            name = argument_name(system, gather)
-            return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(family)}_{name}_{place}")
-    raise ValueError(f"no argument of '{family.name}' belongs to {scatter.results}")
+    name = argument_name(system, family.gathers[family.scatters.index(scatter)])
+    return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(family)}_{name}_{place}")
 
 
 def scalar_name(family: PointFamily) -> str:

@@ -123,7 +123,7 @@ def jacobian_section(
     drawing = pattern_drawing(pattern)
     text = (
         f"Derivatives of the {pattern.size} equations with respect to the {pattern.size} unknowns: {pattern.entries} "
-        f"of {pattern.size**2} entries are not zero by structure. Nobody writes it out: it is summed over the points "
+        f"of {pattern.size**2} entries are not zero by structure. It is not written out but summed over the points "
         "from the slopes of the kernels, the same expressions at every point."
     )
     contents: list[Content] = [Paragraph(text)]
@@ -135,8 +135,8 @@ def jacobian_section(
         contents.append(
             Paragraph(
                 f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations a "
-                f"coordinate, {program.unknowns} numbers. Coordinates that meet are at most {program.bandwidth} places "
-                "apart in the order chosen, and the matrix is the band that follows, or full if that is smaller."
+                f"coordinate, {program.unknowns} numbers. In the order chosen, coordinates that meet are at most "
+                f"{program.bandwidth} apart, and the matrix is the band that follows, or full if that is smaller."
             )
         )
     else:

@@ -65,7 +65,11 @@ def end_formulas(system: MechanicalSystem, stages: StageSystem) -> tuple[Formula
 def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
     """One line of a table times q_k and the unknowns, which are summed where they are of one kind."""
     columns = [column_of(table, c) for c in range(len(blocks) + 1)]
-    terms = [columns[0].entry(0) * Symbol("q_k")] if columns[0].kind != "zero" else []
+    first = columns[0]
+    if first.kind == "single" and [column.index for column in columns] == list(range(1, len(columns) + 1)):
+        return _unknown(_letter(blocks[0]), "n-1")  # the points are the nodes, and number 0 is q_k
+    entry = Symbol("G_n_0") if first.kind in ("single", "other") and first.points > 1 else first.entry(0)
+    terms = [entry * Symbol("q_k")] if first.kind != "zero" else []
     numbered = list(zip(columns[1:], blocks, strict=True))
     for letter, group in groupby(numbered, key=lambda pair: _letter(pair[1])):
         terms += _group_terms(letter, list(group))
@@ -205,7 +209,7 @@ class _Line:
             index = placed(part.index)
             product = part.product(index)
             if part.column.points == 1:
-                terms.append(product)
+                terms.append(part.weight(part.first) * product)
             elif part.column.kind == "single":
                 terms.append(part.weight(index) * product)
             else:
@@ -226,7 +230,7 @@ def _momentum(stages: StageSystem, r: int) -> sympy.Expr | Column:
         return _small(stages.end_momentum)
     value = stages.rows[r].momentum
     column = column_of(stages.end_position, r + 1)
-    if column.kind == "named" and value == stages.end_position.entries[0][r + 1]:
+    if column.prefix == "beta" and value == stages.end_position.entries[0][r + 1]:
         return column
     return _small(value)
 
