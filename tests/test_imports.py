@@ -47,9 +47,9 @@ FLOORS = """
     problems pilot
     model_file
     package plotting advice distributed ensemble_file page
-    exact derivation
+    exact
     __init__
-    benchmark
+    benchmark derivation
     reproduce
     cli
     __main__
