@@ -21,8 +21,10 @@ import sympy
 
 from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.basis import differentiation_matrix
+from scvi_codegen.cards import Html, card, listed, plain
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mathml import mathml_terms
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import accelerations, euler_lagrange, force, momentum
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
@@ -38,6 +40,8 @@ __all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive", "t
 LARGEST_BASIS = 8
 LARGEST_COEFFICIENT = 10**5
 PSLQ_SLACK = 6
+MOST_SHOWN, MOST_SHOWN_OPERATIONS = 12, 4800
+"""Equations, and operations of all equations, that a notebook shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +75,7 @@ class Equation:
         return f"({self.number}) 0 = {self.residual}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class StepEquations:
     """The equations of one step, for looking at and for calculating with.
 
@@ -139,8 +143,24 @@ class StepEquations:
         """LaTeX: an ``align*`` environment with the paper's numbers as tags, and the tables."""
         return _latex(self)
 
-    def _repr_latex_(self) -> str:
-        return _latex(self)
+    def __repr__(self) -> str:
+        count = len(self.equations)
+        return f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>"
+
+    def _repr_latex_(self) -> str | None:
+        """LaTeX of all equations, nothing where a notebook could not show them."""
+        size = sympy.count_ops(self.equations[0].residual) * len(self.equations)
+        return _latex(self) if size <= MOST_SHOWN_OPERATIONS else None
+
+    def _repr_html_(self) -> str:
+        shown = [_equation_html(equation) for equation in self.equations[:MOST_SHOWN]]
+        left_out = len(self.equations) - len(shown)
+        more = [plain(f"and {left_out} more: to_text and to_latex have all")] if left_out else []
+        facts = (
+            ("unknown", listed([symbol.name for symbol in self.unknowns])),
+            ("table entries", listed([entry.symbol.name for entry in self.entries])),
+        )
+        return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -402,6 +422,14 @@ def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
     if rule is not None:
         exact_points_and_weights = exact_rule(rule)
         yield None if exact_points_and_weights is None else [x for part in exact_points_and_weights for x in part]
+
+
+def _equation_html(equation: Equation) -> Html:
+    size = sympy.count_ops(equation.residual)
+    if size > MOST_SHOWN_OPERATIONS // MOST_SHOWN:
+        return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
+    pieces = [piece for term in mathml_terms(equation.residual, sympy.S.Zero) for piece in term]
+    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(pieces)}</div>")
 
 
 def _with_radicals(derived: StepEquations) -> StepEquations:

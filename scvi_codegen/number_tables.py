@@ -8,18 +8,22 @@ from typing import TypeAlias
 
 import sympy
 
+from scvi_codegen.cards import Html, grid, plain
+from scvi_codegen.mathml import mathml
 from scvi_codegen.nodes import Nodes, exact_points
 from scvi_codegen.precision import Number, Vector, mp
 from scvi_codegen.quadrature import Quadrature, exact_rule
 from scvi_codegen.tableau import Tableau, exact_tableau
 
-__all__ = ["NumberTable", "Part", "decimal", "number_table", "positions", "short"]
+__all__ = ["NumberTable", "Part", "decimal", "number_table", "numbers_html", "positions", "short"]
 
 Part: TypeAlias = Nodes | Quadrature | Tableau
 """What the numbers of a method are made from."""
 SHORT = 40
 """Characters of an exact form that is shown."""
 SIGNIFICANT = 17
+MOST_ROWS = 12
+"""Of a table in a notebook."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +61,18 @@ def number_table(part: Part) -> NumberTable:
         columns=("", *(name for name, _ in written)),
         rows=tuple((str(number), *(cells[k] for _, cells in written)) for k, number in enumerate(series)),
     )
+
+
+def numbers_html(table: NumberTable) -> Html:
+    """The first rows of a table for a notebook."""
+    rows = [[_cell(cell) for cell in row] for row in table.rows[:MOST_ROWS]]
+    left_out = len(table.rows) - len(rows)
+    title = f"{table.title} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.title
+    return grid(rows, head=table.columns, caption=title)
+
+
+def _cell(cell: str | sympy.Expr) -> Html:
+    return plain(cell) if isinstance(cell, str) else Html(mathml(cell))
 
 
 def positions(part: Part) -> Vector:
@@ -99,6 +115,6 @@ def _tableau_table(tableau: Tableau) -> NumberTable:
     labels = [*(str(i) for i in range(1, tableau.stages + 1)), "b"]
     return NumberTable(
         title=f"Runge-Kutta tableau: {tableau.name}, of order {tableau.order}",
-        columns=("", "c", *(f"a_{{i,{k}}}" for k in range(1, tableau.stages + 1))),
+        columns=("", "c", *(f"a_{{i{k}}}" for k in range(1, tableau.stages + 1))),
         rows=tuple((label, *row) for label, row in zip(labels, rows, strict=True)),
     )

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen import building
 from scvi_codegen.arguments import checked_number, checked_step
 from scvi_codegen.binding import STATUS, Binding, SolverOptions, step_failure
+from scvi_codegen.cards import card, listed, plain
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.run import Run
 from scvi_codegen.source import Interface, Source
@@ -58,6 +59,19 @@ class Stepper:
 
     def __repr__(self) -> str:
         return f"<Stepper {self.title}>"
+
+    def _repr_html_(self) -> str:
+        interface = self.interface
+        parameters = zip(interface.parameters, interface.defaults, strict=True)
+        return card(
+            interface.title,
+            (
+                ("method", plain(", ".join(interface.notes))),
+                ("coordinates", listed(interface.coordinates)),
+                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
+                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
+            ),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_rebuild, (self.source, self.interface, self.ensemble, self.flags))

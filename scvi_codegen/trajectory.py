@@ -12,6 +12,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.cards import Html, card, grid, listed, plain, sparkline
 from scvi_codegen.errors import StateError
 
 if TYPE_CHECKING:
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 __all__ = ["Trajectory", "write_atomically"]
 
 Array = NDArray[np.float64]
+
+MOST_DRAWN, MOST_CURVES = 400, 6
+"""States, and coordinates, that a notebook draws."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,6 +54,31 @@ class Trajectory:
     def energy(self) -> Array:
         """(n,) energies p.v - L, constant along exact trajectories when L does not depend on time."""
         energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
+        return energies
+
+    def _repr_html_(self) -> str:
+        every = max(1, -(-len(self) // MOST_DRAWN))
+        series = list(zip(self.stepper.coordinates, self.q[::every].T, strict=True))[:MOST_CURVES]
+        energies = self._energies(every)
+        rows = [(plain(name), sparkline(values.tolist(), name), _range(values)) for name, values in series]
+        if energies is not None:
+            rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
+        names = zip(self.stepper.parameters, self.parameters, strict=True)
+        facts = (
+            ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, h = {self.h:g}")),
+            ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
+            ("coordinates", listed(self.stepper.coordinates)),
+            ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
+            ("iterations", plain(f"{self.iterations.sum()}")),
+        )
+        return card(self.stepper.title, facts, grid(rows))
+
+    def _energies(self, every: int) -> Array | None:
+        """Of each so many states, ``None`` where a state has no energy."""
+        try:
+            energies: Array = self.stepper.energy(self.q[::every], self.p[::every], self.t[::every], self.parameters)
+        except StateError:
+            return None
         return energies
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -86,6 +115,12 @@ class Trajectory:
         table = np.column_stack([self.t, self.q, self.p, self.iterations])
         formats = ["%.17g"] * (1 + 2 * len(names)) + ["%d"]
         np.savetxt(file, table, delimiter=",", header=header, comments="", fmt=formats)
+
+
+def _range(values: Array) -> Html:
+    """From the least to the greatest value, and by how much they differ."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return plain(f"{low:.10g} to {high:.10g}, a difference of {high - low:.2g}")
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:

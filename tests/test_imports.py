@@ -17,7 +17,7 @@ from scvi_codegen.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors precision program source ordering c_outline mathml
+    errors precision program source ordering c_outline mathml cards
     derivatives expression_text nodes arguments
     symbols regularity quadrature
     mechanical_system translation
