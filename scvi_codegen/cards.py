@@ -41,7 +41,11 @@ def card(title: str, facts: Iterable[tuple[str, Html]], *parts: Html) -> str:
 
 def grid(rows: Iterable[Sequence[Html]], *, head: Sequence[str] = (), caption: str = "") -> Html:
     """A table; the first cell of a row is its heading."""
-    lines = [f'<caption style="text-align:left;white-space:nowrap;padding:0.5em 0 0.1em">{plain(caption)}</caption>'] if caption else []
+    lines = (
+        [f'<caption style="text-align:left;white-space:nowrap;padding:0.5em 0 0.1em">{plain(caption)}</caption>']
+        if caption
+        else []
+    )
     if any(head):
         lines.append("<tr>" + "".join(f'<th scope="col" style="{CELL}">{plain(name)}</th>' for name in head) + "</tr>")
     for first, *others in rows:

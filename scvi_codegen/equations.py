@@ -25,6 +25,7 @@ from scvi_codegen.cards import Html, card, listed, plain
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mathml import mathml_terms
+from scvi_codegen.mathml.names import latex_name
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import accelerations, euler_lagrange, force, momentum
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
@@ -551,7 +552,7 @@ def _text_lines(derived: StepEquations) -> Iterator[str]:
 
 
 def _latex(derived: StepEquations) -> str:
-    names = {symbol: _latex_name(symbol.name) for symbol in _all_symbols(derived)}
+    names = {symbol: latex_name(symbol.name) for symbol in _all_symbols(derived)}
 
     def written(expression: sympy.Expr) -> str:
         return str(sympy.latex(expression, symbol_names=names))
@@ -559,7 +560,7 @@ def _latex(derived: StepEquations) -> str:
     lines = [rf"0 &= {written(e.residual)} \tag{{{_tag(e.number)}}}" for e in derived.equations]
     q, p = derived.state
     for symbol, equation in zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True):
-        new = _latex_name(symbol.name).replace("{k}", "{k+1}")
+        new = latex_name(f"{symbol.name}+1")
         lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
     tables = [
         rf"{names[entry.symbol]} &= "
@@ -582,30 +583,3 @@ def _all_symbols(derived: StepEquations) -> set[sympy.Symbol]:
     for equation in (*derived.equations, *derived.end_position, *derived.end_momentum):
         symbols |= equation.residual.free_symbols
     return symbols | set(derived.state[0]) | set(derived.state[1])
-
-
-TABLE_LATEX = {
-    "l": r"l_{%(b)s}(\tau_{%(n)s})",
-    "dl": r"\dot{l}_{%(b)s}(\tau_{%(n)s})",
-    "D": r"D_{%(n)s%(b)s}",
-    "DD": r"(\hat{D}\tilde{D})_{%(n)s%(b)s}",
-    "aa": r"(A^2)_{%(n)s%(b)s}",
-    "bA": r"(bA)_{%(b)s}",
-}
-
-
-def _latex_name(name: str) -> str:
-    """LaTeX of a derived symbol: l_1_0 -> l_0(tau_1), Q_2_x -> Q^2_x, p_x_k -> p_{x,k}."""
-    prefix, *indices = name.lstrip("_").split("_")
-    if prefix in TABLE_LATEX and len(indices) == 2 and all(index.isdigit() for index in indices):
-        return TABLE_LATEX[prefix] % {"n": indices[0], "b": indices[1]}
-    greek = sympy.latex(sympy.Symbol(prefix))
-    if not indices:
-        return str(greek)
-    if prefix in ("Q", "V") and indices[0].isdigit():
-        rest = f"_{{{','.join(indices[1:])}}}" if indices[1:] else ""
-        return f"{prefix}^{{{indices[0]}}}{rest}"
-    if "dot" in indices:
-        indices.remove("dot")
-        greek = rf"\dot{{{greek}}}"
-    return f"{greek}_{{{','.join(indices)}}}"
