@@ -115,6 +115,6 @@ def _tableau_table(tableau: Tableau) -> NumberTable:
     labels = [*(str(i) for i in range(1, tableau.stages + 1)), "b"]
     return NumberTable(
         title=f"Runge-Kutta tableau: {tableau.name}, of order {tableau.order}",
-        columns=("", "c", *(f"a_{{i{k}}}" for k in range(1, tableau.stages + 1))),
+        columns=("", "c", *(f"a_i{k}" for k in range(1, tableau.stages + 1))),
         rows=tuple((label, *row) for label, row in zip(labels, rows, strict=True)),
     )
