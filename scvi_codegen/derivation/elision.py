@@ -15,6 +15,8 @@ MOST_FORMULAS = 12
 """Equations of one kind that are written out."""
 MOST_OPERATIONS = 400
 """Of an equation that is written out."""
+MOST_TOGETHER = 600
+"""Of equations of one kind that are written out."""
 MOST_LINES = 70
 """Of a C function that are shown."""
 
@@ -25,21 +27,31 @@ def operations(expression: sympy.Basic) -> int:
     return int(sympy.count_ops(expression))
 
 
-def formulas(given: Sequence[Formula], what: str) -> Iterator[Content]:
-    """The first of them, and of the others how many they are; ``what`` names one of them."""
-    long = 0
+def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
+    """The first of them, and of the others how many they are.
+
+    Args:
+        given: all of them.
+        what: the word for one of them.
+        together: operations of those shown.
+    """
+    shown, large, total = 0, [], 0
     for formula in given[:MOST_FORMULAS]:
-        if operations(formula.right) <= MOST_OPERATIONS:
+        size = operations(formula.right)
+        total += min(size, MOST_OPERATIONS)
+        if shown and total > together:
+            break
+        shown += 1
+        if size <= MOST_OPERATIONS:
             yield formula
         else:
-            long += 1
-    if long:
-        largest = max(operations(formula.right) for formula in given[:MOST_FORMULAS])
+            large.append(size)
+    if large:
         yield Paragraph(
-            f"{_counted(long, what)} of more than {MOST_OPERATIONS} operations (the longest: {largest}) left out here."
+            f"{_counted(len(large), what)} of more than {MOST_OPERATIONS} operations left out, the longest of {max(large)}."
         )
-    if len(given) > MOST_FORMULAS:
-        yield Paragraph(f"The first {MOST_FORMULAS} of {_counted(len(given), what)}.")
+    if shown < len(given):
+        yield Paragraph(f"The first {shown} of {_counted(len(given), what)}.")
 
 
 def lines(text: str) -> Code:

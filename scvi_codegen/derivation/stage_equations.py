@@ -104,11 +104,13 @@ def written_out_section(derived: StepEquations | None) -> Section:
         Paragraph("The same equations component by component, positions and velocities put in, nothing simplified:")
     ]
     for _, group in groupby(derived.equations, key=lambda equation: equation.kind):
-        contents += formulas([_formula(equation) for equation in group], "equation")
+        contents += formulas([_formula(equation) for equation in group], "equation", together=MOST_OPERATIONS)
     q, p = derived.state
     ends = zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True)
     contents += formulas(
-        [Formula(e.residual, Symbol(f"{symbol.name.lstrip('_')}+1"), e.number) for symbol, e in ends], "end value"
+        [Formula(e.residual, Symbol(f"{symbol.name.lstrip('_')}+1"), e.number) for symbol, e in ends],
+        "end value",
+        together=MOST_OPERATIONS,
     )
     contents.append(Paragraph("Newton's iteration begins on the straight line with the velocity that belongs to p_k:"))
     contents += formulas([Formula(value, symbol) for symbol, value in derived.initial_guess.items()], "first guess")
