@@ -47,9 +47,8 @@ def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETH
         else:
             large.append(size)
     if large:
-        yield Paragraph(
-            f"{_counted(len(large), what)} of more than {MOST_OPERATIONS} operations left out, the longest of {max(large)}."
-        )
+        count = _counted(len(large), what)
+        yield Paragraph(f"{count} of more than {MOST_OPERATIONS} operations left out, the longest of {max(large)}.")
     if shown < len(given):
         yield Paragraph(f"The first {shown} of {_counted(len(given), what)}.")
 
