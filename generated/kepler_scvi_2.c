@@ -229,7 +229,7 @@ static void quadrature_slope(const double *u, const double *parameters, double *
   slope[2] = w6;
 }
 
-/* Derivatives of d^1L/dt^1 at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
+/* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5. */
 static void node_value(const double *u, const double *parameters, double *value)
 {
   value[2] = 0.0;

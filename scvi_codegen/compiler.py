@@ -36,7 +36,7 @@ from scvi_codegen.stepper import Stepper
 from scvi_codegen.symmetry import Symmetry, all_symmetries
 from scvi_codegen.text_cache import Texts, remembered_texts
 
-__all__ = ["c_identifier", "compile_stepper", "describe", "generate_source"]
+__all__ = ["c_identifier", "compile_stepper", "describe", "generate_source", "program_of"]
 
 LONGEST_PREFIX = 64
 C_HEADERS = frozenset(
@@ -80,7 +80,7 @@ def compile_stepper(
     """
 
     def make() -> Texts:
-        program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
+        program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
         return render(program), describe(program, system, method), render_ensemble(program)
 
     source, interface, ensemble = remembered_texts(system, method, (solver, prefix, *map(repr, symmetries)), make)
@@ -109,7 +109,7 @@ def generate_source(
     """
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
-    program = _program(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
+    program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     source = render_embedded(program, embedded) if embedded else render(program)
     interface = describe(program, system, method)
     return (with_events(source, interface, functions) if functions else source), interface
@@ -124,15 +124,20 @@ def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[
         raise MethodError("text for a microcontroller has no search for events: leave out one of the two")
 
 
-def _program(
+def program_of(
     system: MechanicalSystem,
     method: Method,
     *,
-    solver: str,
-    prefix: str | None,
-    symmetries: Sequence[Symmetry],
+    solver: str = "auto",
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
     lanes: bool = True,
 ) -> Program:
+    """The integrator without syntax; arguments as of :func:`compile_stepper`.
+
+    Args:
+        lanes: whether there may be a solver with vector lanes.
+    """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = lanes and solver in ("auto", "fixed-point") and splitting is None

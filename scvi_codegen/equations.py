@@ -21,9 +21,12 @@ import sympy
 
 from scvi_codegen.auxiliaries import with_auxiliaries
 from scvi_codegen.basis import differentiation_matrix
+from scvi_codegen.cards import Html, card, listed, plain
 from scvi_codegen.derivatives import jacobian
 from scvi_codegen.errors import MethodError
 from scvi_codegen.exactness import is_exact
+from scvi_codegen.mathml import mathml_terms
+from scvi_codegen.mathml.names import latex_name
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import accelerations, euler_lagrange, force, momentum
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
@@ -35,11 +38,13 @@ from scvi_codegen.stage_system import Block, PointFamily, StageSystem, Table
 from scvi_codegen.symmetry import Symmetry, symmetries
 from scvi_codegen.tableau import exact_tableau
 
-__all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive"]
+__all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive", "table_entries"]
 
 LARGEST_BASIS = 8
 LARGEST_COEFFICIENT = 10**5
 PSLQ_SLACK = 6
+MOST_SHOWN, MOST_SHOWN_OPERATIONS = 12, 4800
+"""Equations, and operations of all equations, that a notebook shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +78,7 @@ class Equation:
         return f"({self.number}) 0 = {self.residual}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class StepEquations:
     """The equations of one step, for looking at and for calculating with.
 
@@ -146,8 +151,24 @@ class StepEquations:
         """LaTeX: an ``align*`` environment with the paper's numbers as tags, and the tables."""
         return _latex(self)
 
-    def _repr_latex_(self) -> str:
-        return _latex(self)
+    def __repr__(self) -> str:
+        count = len(self.equations)
+        return f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>"
+
+    def _repr_latex_(self) -> str | None:
+        """LaTeX of all equations, nothing where a notebook could not show them."""
+        size = sympy.count_ops(self.equations[0].residual) * len(self.equations)
+        return _latex(self) if size <= MOST_SHOWN_OPERATIONS else None
+
+    def _repr_html_(self) -> str:
+        shown = [_equation_html(equation) for equation in self.equations[:MOST_SHOWN]]
+        left_out = len(self.equations) - len(shown)
+        more = [plain(f"and {left_out} more: to_text and to_latex have all")] if left_out else []
+        facts = (
+            ("unknown", listed([symbol.name for symbol in self.unknowns])),
+            ("table entries", listed([entry.symbol.name for entry in self.entries])),
+        )
+        return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -336,6 +357,22 @@ def _entries(values: Mapping[sympy.Symbol, Number], basis: tuple[sympy.Expr, ...
     )
 
 
+def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
+    """The named numbers of all tables of a method's equations; those that do not occur in the equations, too."""
+    tables = [stages.end_position]
+    values: dict[sympy.Symbol, Number] = {}
+    for family in stages.families:
+        tables += [gather.table for gather in family.gathers] + [scatter.table for scatter in family.scatters]
+        tables.append(Table(entries=(family.weights,), names=(family.weight_names,)))
+    for table in tables:
+        for names, numbers in zip(table.names, table.entries, strict=True):
+            for name, value in zip(names, numbers, strict=True):
+                base, _, divisor = name.partition("/")
+                if base:
+                    values[sympy.Symbol(base, real=True)] = value * int(divisor or 1)
+    return _entries(values, _radical_basis(method))
+
+
 def _by_name(item: tuple[sympy.Symbol, Number]) -> tuple[object, ...]:
     prefix, *indices = item[0].name.lstrip("_").split("_")
     return (prefix, *(int(index) for index in indices))
@@ -347,6 +384,8 @@ def _high_precision(expression: sympy.Expr) -> Number:
 
 def _exact(value: Number, basis: tuple[sympy.Expr, ...], known: Sequence[Number]) -> sympy.Expr | None:
     """The combination of basis elements with small rational coefficients that equals ``value`` to 54 digits (PSLQ)."""
+    if value == 0:
+        return sympy.S.Zero
     if not basis:
         return None
     tolerance = mp.mpf(10) ** (PSLQ_SLACK - DIGITS)
@@ -391,6 +430,14 @@ def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
     if rule is not None:
         exact_points_and_weights = exact_rule(rule)
         yield None if exact_points_and_weights is None else [x for part in exact_points_and_weights for x in part]
+
+
+def _equation_html(equation: Equation) -> Html:
+    size = sympy.count_ops(equation.residual)
+    if size > MOST_SHOWN_OPERATIONS // MOST_SHOWN:
+        return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
+    pieces = [piece for term in mathml_terms(equation.residual, sympy.S.Zero) for piece in term]
+    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(pieces)}</div>")
 
 
 def _with_radicals(derived: StepEquations) -> StepEquations:
@@ -519,7 +566,7 @@ def _exactness(derived: StepEquations, symmetry: Symmetry) -> str:
 
 
 def _latex(derived: StepEquations) -> str:
-    names = {symbol: _latex_name(symbol.name) for symbol in _all_symbols(derived)}
+    names = {symbol: latex_name(symbol.name) for symbol in _all_symbols(derived)}
 
     def written(expression: sympy.Expr) -> str:
         return str(sympy.latex(expression, symbol_names=names))
@@ -527,7 +574,7 @@ def _latex(derived: StepEquations) -> str:
     lines = [rf"0 &= {written(e.residual)} \tag{{{_tag(e.number)}}}" for e in derived.equations]
     q, p = derived.state
     for symbol, equation in zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True):
-        new = _latex_name(symbol.name).replace("{k}", "{k+1}")
+        new = latex_name(f"{symbol.name}+1")
         lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
     tables = [
         rf"{names[entry.symbol]} &= "
@@ -544,7 +591,7 @@ def _latex(derived: StepEquations) -> str:
 
 
 def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:
-    return {symbol: _latex_name(symbol.name) for symbol in symmetry.momentum_map.free_symbols}
+    return {symbol: latex_name(symbol.name) for symbol in symmetry.momentum_map.free_symbols}
 
 
 def _tag(number: str) -> str:
@@ -558,30 +605,3 @@ def _all_symbols(derived: StepEquations) -> set[sympy.Symbol]:
     for equation in (*derived.equations, *derived.end_position, *derived.end_momentum):
         symbols |= equation.residual.free_symbols
     return symbols | set(derived.state[0]) | set(derived.state[1])
-
-
-TABLE_LATEX = {
-    "l": r"l_{%(b)s}(\tau_{%(n)s})",
-    "dl": r"\dot{l}_{%(b)s}(\tau_{%(n)s})",
-    "D": r"D_{%(n)s%(b)s}",
-    "DD": r"(\hat{D}\tilde{D})_{%(n)s%(b)s}",
-    "aa": r"(A^2)_{%(n)s%(b)s}",
-    "bA": r"(bA)_{%(b)s}",
-}
-
-
-def _latex_name(name: str) -> str:
-    """LaTeX of a derived symbol: l_1_0 -> l_0(tau_1), Q_2_x -> Q^2_x, p_x_k -> p_{x,k}."""
-    prefix, *indices = name.lstrip("_").split("_")
-    if prefix in TABLE_LATEX and len(indices) == 2 and all(index.isdigit() for index in indices):
-        return TABLE_LATEX[prefix] % {"n": indices[0], "b": indices[1]}
-    greek = sympy.latex(sympy.Symbol(prefix))
-    if not indices:
-        return str(greek)
-    if prefix in ("Q", "V") and indices[0].isdigit():
-        rest = f"_{{{','.join(indices[1:])}}}" if indices[1:] else ""
-        return f"{prefix}^{{{indices[0]}}}{rest}"
-    if "dot" in indices:
-        indices.remove("dot")
-        greek = rf"\dot{{{greek}}}"
-    return f"{greek}_{{{','.join(indices)}}}"

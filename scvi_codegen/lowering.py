@@ -48,7 +48,7 @@ from scvi_codegen.program import (
 from scvi_codegen.stage_system import Gather, PointFamily, StageSystem
 from scvi_codegen.symmetry import Symmetry
 
-__all__ = ["lower", "lower_kernel", "lower_matrix", "lower_vector"]
+__all__ = ["argument_name", "lower", "lower_kernel", "lower_matrix", "lower_vector"]
 
 FUNCTIONS = {
     sympy.sin: "sin",
@@ -227,7 +227,15 @@ def lower_kernel(
     graph = _Graph(loads)
     roots = [graph.read(expression) for expression in (*values, *slopes)]
     temporaries, results = _linearise(graph, roots)
-    return Kernel(name=name, arguments=len(arguments), temporaries=temporaries, results=results, values=len(values))
+    return Kernel(
+        name=name,
+        arguments=len(arguments),
+        temporaries=temporaries,
+        results=results,
+        values=len(values),
+        symbols=tuple(arguments),
+        formulas=(*values, *slopes),
+    )
 
 
 def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, ...], tuple[Expression, ...]]:
@@ -400,7 +408,7 @@ def _family(system: MechanicalSystem, family: PointFamily) -> Family:
     slopes, blocks = _slope_blocks(family)
     return Family(
         name=family.name,
-        arguments=tuple(_argument(system, gather) for gather in family.gathers),
+        arguments=tuple(argument_name(system, gather) for gather in family.gathers),
         abscissae=lower_vector(family.abscissae),
         weights=lower_vector(family.weights),
         gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
@@ -419,7 +427,7 @@ def _action(family: PointFamily, common: dict[str, Any]) -> Kernel:
     return lower_kernel(name, values=(family.scalar,), **common)
 
 
-def _argument(system: MechanicalSystem, gather: Gather) -> str:
+def argument_name(system: MechanicalSystem, gather: Gather) -> str:
     """What a gather gives, as the formulas call it."""
     names = {
         system.coordinates: "q",

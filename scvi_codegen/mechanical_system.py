@@ -16,13 +16,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
+import sympy
 from sympy import Expr, Symbol
 
+from scvi_codegen.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.expression_text import closest, format_expression, unsupported_part
+from scvi_codegen.mathml import mathml_terms
 from scvi_codegen.symbols import DOT, TIME, check_names, given_name, number, symbol
 
 __all__ = ["MechanicalSystem", "named_parameters"]
+
+MOST_OPERATIONS = 200
+"""Of a formula that a notebook shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +98,22 @@ class MechanicalSystem(ABC):
                 )
         changed = dict(zip(names, self.defaults, strict=True)) | values
         return replace(self, defaults=tuple(number(key, value) for key, value in changed.items()))
+
+    def _repr_html_(self) -> str:
+        letter = "H" if self.auxiliaries else "L"
+        size = sympy.count_ops(self.formula)
+        formula = mathml_terms(self.formula, Symbol(letter)) if size <= MOST_OPERATIONS else ()
+        written = " ".join(piece for term in formula for piece in term) or plain(f"{letter}: {size} operations")
+        parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
+        return card(
+            self.name,
+            (
+                ("coordinates", listed([q.name for q in self.coordinates])),
+                *([("momenta", listed([p.name for p in self.auxiliaries]))] if self.auxiliaries else []),
+                ("parameters", listed(parameters)),
+            ),
+            Html(f"<div>{written}</div>"),
+        )
 
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""

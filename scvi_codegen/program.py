@@ -9,8 +9,11 @@ Newton, sweeps, the run) is a loop over tables, the same for every method and sy
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
+
+if TYPE_CHECKING:
+    import sympy
 
 __all__ = [
     "CollocationSweep",
@@ -81,6 +84,8 @@ class Kernel:
         arguments: length of ``u``.
         temporaries, results: expressions.
         values: how many of the results are values; the rest are slopes.
+        symbols: what ``u`` holds, in the symbols of the formulas.
+        formulas: what the results were before their common parts were found.
     """
 
     name: str
@@ -88,6 +93,8 @@ class Kernel:
     temporaries: tuple[Expression, ...]
     results: tuple[Expression, ...]
     values: int
+    symbols: tuple[sympy.Symbol, ...] = field(default=(), repr=False, compare=False)
+    formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
 
     @property
     def uses_arguments(self) -> bool:

@@ -291,10 +291,10 @@ def _purposes(program: Program) -> dict[str, str]:
 
 
 def _results(family: Family) -> str:
-    if family.action_power:
-        return f"Derivatives of d^{family.action_power}L/dt^{family.action_power}"
     if family.name == "node":
         return "Derivatives of lambda . E" if "lambda" in family.arguments else "The Euler-Lagrange residual E"
+    if family.action_power:
+        return f"Derivatives of d^{family.action_power}L/dt^{family.action_power}"
     slopes = " and ".join(f"L_{name}" for name in family.arguments)
     return slopes if len(family.scatters) == len(family.gathers) else "L_v"
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import count
 
 import sympy
 
@@ -263,7 +264,7 @@ def stationary_increments(
     beta_b G_n0 - G_nb with the gather's own G. The map has a generating function whatever the numbers in the tables,
     rounded ones included (paper (5); see :func:`dyadic` for why the differences lose nothing).
     """
-    beta = tuple(end_position)
+    beta, number = tuple(end_position), count(1)
     built = []
     for family in families:
         tables = []
@@ -272,7 +273,7 @@ def stationary_increments(
                 [*(beta[b] * line[0] - line[b + 1] for b in range(len(blocks))), line[0]]
                 for line in gather.table.entries
             ]
-            tables.append(Table.named("s", lines))
+            tables.append(Table.named(f"s{next(number)}", lines))
         built.append(family.point_family(tables))
     return StageSystem(
         blocks=blocks,

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen import building
 from scvi_codegen.arguments import checked_number, checked_step, real_array
 from scvi_codegen.binding import STATUS, Binding, SolverOptions, step_failure
+from scvi_codegen.cards import card, listed, plain
 from scvi_codegen.dense_output import checked_times, states_at, times_of_run
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.event_search import crossings_of
@@ -67,6 +68,19 @@ class Stepper:
 
     def __repr__(self) -> str:
         return f"<Stepper {self.title}>"
+
+    def _repr_html_(self) -> str:
+        interface = self.interface
+        parameters = zip(interface.parameters, interface.defaults, strict=True)
+        return card(
+            interface.title,
+            (
+                ("method", plain(", ".join(interface.notes))),
+                ("coordinates", listed(interface.coordinates)),
+                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
+                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
+            ),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_rebuild, (self._plain, self.interface, self.ensemble, self.flags, self.events))

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.cards import Html, card, grid, listed, plain, sparkline
+from scvi_codegen.errors import StateError
 from scvi_codegen.export import States, to_dataframe, to_xarray, write_states
 
 if TYPE_CHECKING:
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["Trajectory", "relative_changes"]
 
 Array = NDArray[np.float64]
+
+MOST_DRAWN, MOST_CURVES = 400, 6
+"""States, and coordinates, that a notebook draws."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +119,31 @@ class Trajectory:
         """
         return self.stepper.with_events(events).crossings(self)
 
+    def _repr_html_(self) -> str:
+        every = max(1, -(-len(self) // MOST_DRAWN))
+        series = list(zip(self.stepper.coordinates, self.q[::every].T, strict=True))[:MOST_CURVES]
+        energies = self._energies(every)
+        rows = [(plain(name), sparkline(values.tolist(), name), _range(values)) for name, values in series]
+        if energies is not None:
+            rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
+        names = zip(self.stepper.parameters, self.parameters, strict=True)
+        facts = (
+            ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, h = {self.h:g}")),
+            ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
+            ("coordinates", listed(self.stepper.coordinates)),
+            ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
+            ("iterations", plain(f"{self.iterations.sum()}")),
+        )
+        return card(self.stepper.title, facts, grid(rows))
+
+    def _energies(self, every: int) -> Array | None:
+        """Of each so many states, ``None`` where a state has no energy."""
+        try:
+            energies: Array = self.stepper.energy(self.q[::every], self.p[::every], self.t[::every], self.parameters)
+        except StateError:
+            return None
+        return energies
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, atomically.
 
@@ -149,3 +179,9 @@ def relative_changes(values: Array, sizes: Array) -> Array:
         scales = np.fmax.reduce(sizes, axis=0)
         changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
     return np.where(np.isinf(scales), np.nan, changes)
+
+
+def _range(values: Array) -> Html:
+    """From the least to the greatest value, and by how much they differ."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return plain(f"{low:.10g} to {high:.10g}, a difference of {high - low:.2g}")

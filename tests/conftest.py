@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import pytest
+from browsing import chromium
 from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen.building import TUNED_FLAGS
@@ -131,3 +133,10 @@ def compiled() -> Callable[..., Stepper]:
 def quickly_compiled() -> Callable[[LagrangianSystem, Method], Stepper]:
     """For systems without a name."""
     return compile_quickly
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A headless Chromium, for a module: its event loop is in the way of other tests that have one."""
+    with chromium() as started:
+        yield started

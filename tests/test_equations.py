@@ -1,5 +1,7 @@
 """The closed form: the paper's own example, and agreement with the compiled steps, which solve other unknowns."""
 
+import re
+
 import mpmath
 import numpy as np
 import pytest
@@ -190,3 +192,15 @@ def test_explicit_time_appears_with_the_points():
     assert cos(sympy.Symbol("omega", real=True) * (derived.time + sympy.Symbol("d_1", real=True) * derived.step)) in (
         derived.equations[0].residual.atoms(cos)
     )
+
+
+@pytest.mark.parametrize("method", [SVI(2), SVI(2, "hermite:2"), SCVI(2)], ids=lambda method: method.name)
+def test_latex_has_one_index_and_one_exponent_at_a_letter_and_names_the_new_state(method):
+    text = derive(kepler(), method).to_latex()
+    assert not re.search(r"_\{[^{}]*\}_|\^\{[^{}]*\}\^", text)
+    assert text.count("p_{q_{2},k+1} &=") == text.count("q_{1,k+1} &=") == 1
+
+
+def test_a_weight_that_is_zero_is_shown_as_such():
+    derived = derive(planar_pendulum(), SpectralCollocation(2, form="phase-space"))
+    assert {entry.symbol.name: entry.exact for entry in derived.entries}["b_2"] == 0

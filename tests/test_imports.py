@@ -18,7 +18,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     version
-    errors precision program source ordering bodies files
+    errors precision program source ordering bodies files c_outline mathml cards
     derivatives expression_text nodes arguments export cache toml_text
     events
     symbols regularity quadrature
@@ -34,6 +34,7 @@ FLOORS = """
     spaces
     auxiliaries
     tableau
+    number_tables
     methods.method
     methods.galerkin
     methods.collocation methods.composition
@@ -60,15 +61,15 @@ FLOORS = """
     compiler
     problems pilot recording
     model_file
-    package plotting advice distributed ensemble_file
+    package plotting advice distributed ensemble_file page
     motion
     verification.certificate verification.linearisation
     verification.subject
     verification.stepping verification.structure verification.convergence verification.identities
     verification
-    exact mathml
+    exact
     __init__
-    benchmark
+    benchmark derivation
     reproduce
     cli
     __main__
@@ -81,7 +82,7 @@ A folder stands here by its own name where its rooms have no floors of their own
 FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for room in floor.split()}
 
 OWNERS = {
-    "jinja2": ["rendering", "reproduce"],
+    "jinja2": ["rendering", "page"],
     "cffi": ["building"],
     "platformdirs": ["cache"],
     "matplotlib": ["plotting", "benchmark", "reproduce"],

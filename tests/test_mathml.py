@@ -14,6 +14,7 @@ from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp,
 
 from scvi_codegen.equations import derive
 from scvi_codegen.mathml import mathml, mathml_terms
+from scvi_codegen.mathml.names import latex_name
 from scvi_codegen.mathml.printer import ONE_LINE
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.problems import problem
@@ -282,3 +283,21 @@ def test_reading_back_finds_a_wrong_sign():
     assert reader.value(mathml(x - y)) == -1.0
     assert reader.value(mathml(x - y).replace("\N{MINUS SIGN}", "+")) == 5.0
     assert math.isclose(reader.value(mathml(sin(x) ** 2)), math.sin(2.0) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "latex"),
+    [
+        ("theta_1_dot", r"\dot{\theta}_{1}"),
+        ("q1_dot_k", r"\dot{q}_{1,k}"),
+        ("Q_2_x", "Q_{x}^{2}"),
+        ("p_q1_k+1", "p_{q_{1},k+1}"),
+        ("l_1_0", r"l_{0}(\tau_{1})"),
+        ("dl_3_2", r"\dot{l}_{2}(\tau_{3})"),
+        ("DD_1_0", r"(\hat{D}\tilde{D})_{1,0}"),
+        ("aa_n_j", "(A^{2})_{n,j}"),
+        ("bA_2", "(bA)_{2}"),
+    ],
+)
+def test_names_are_read_the_same_way_in_latex(name, latex):
+    assert latex_name(name) == latex

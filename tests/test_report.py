@@ -23,11 +23,11 @@ from toy_experiments import EXPERIMENTS, GOOD
 from scvi_codegen.cli import main
 from scvi_codegen.cli.reproducing import Reproduction, experiments_table
 from scvi_codegen.errors import StateError
+from scvi_codegen.page.typesetting import cell, prose
 from scvi_codegen.reproduce.experiment import Picture, Result
 from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import Failure, run_experiments, with_needs
 from scvi_codegen.reproduce.svg import DARK_PAPER, color_variables, contrast, inline_svg
-from scvi_codegen.reproduce.typesetting import cell, prose
 from scvi_codegen.reproduce.writing import draw
 
 if TYPE_CHECKING:

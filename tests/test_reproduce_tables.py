@@ -7,10 +7,10 @@ import pickle
 import pytest
 import sympy
 
+from scvi_codegen import c_outline
 from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.precision import mp
 from scvi_codegen.reproduce import (
-    c_outline,
     claims,
     costs,
     full_newton,

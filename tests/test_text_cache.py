@@ -13,13 +13,13 @@ def made(tmp_path, monkeypatch) -> list[str]:
     """The methods derived from here on, with an empty cache."""
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
     names: list[str] = []
-    derive = compiler._program
+    derive = compiler.program_of
 
     def counted(system, method, **options):
         names.append(method.name)
         return derive(system, method, **options)
 
-    monkeypatch.setattr(compiler, "_program", counted)
+    monkeypatch.setattr(compiler, "program_of", counted)
     return names
 
 

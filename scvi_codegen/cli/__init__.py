@@ -40,6 +40,7 @@ Examples:
   scvi-codegen run mine.toml --span 1e4 --every 1000 -o long.run    a folder: the run can be interrupted
   scvi-codegen run --resume long.run                                and goes on where it was
   scvi-codegen derive planar-pendulum --method svi --degree 2 --quadrature gauss-legendre:2
+  scvi-codegen derive kepler --html kepler.html        from L to the C on one page
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
   scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
   scvi-codegen verify mine_svi                         measure whether it keeps what it promises
@@ -265,14 +266,30 @@ def generate(model_name: str, output: str, solver: str, force: bool, embedded: E
 @click.option("--latex", is_flag=True, help="LaTeX instead of text.")
 @click.option("--radicals", is_flag=True, help="Table entries as rationals and radicals where they are short.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write here instead of to the screen.")
-def derive(model_name: str, latex: bool, radicals: bool, output: str | None, **choices: Any) -> None:
+@click.option(
+    "--html", type=click.Path(), metavar="FILE", help="Write a page: everything from L to the C, side by side."
+)
+def derive(model_name: str, latex: bool, radicals: bool, output: str | None, html: str | None, **choices: Any) -> None:
     """Print the equations of one step of MODEL: unknowns, stage equations, end state.
 
+    With --html everything between the Lagrangian and the C goes to a page that needs no network: equations of motion,
+    trial curve, tables, equations with the paper's numbers, Jacobian, operation counts, C beside its formulas.
+
     \b
-    Example:
+    Examples:
       scvi-codegen derive planar-pendulum --method svi --degree 1 --quadrature gauss-lobatto:2 --radicals
+      scvi-codegen derive kepler --html kepler.html
     """  # noqa: D301  (click wants the character \b)
+    if html is not None:
+        if latex or radicals or output is not None:
+            raise click.UsageError("--html writes a page of its own: leave out --latex, --radicals and -o")
+        _check_writable(Path(html), "'--html'")
     model = read_model(model_name, Choices(**choices))
+    if html is not None:
+        from scvi_codegen.derivation import derivation_html
+
+        _emit(derivation_html(model.system, model.method), html)
+        return
     from scvi_codegen.equations import derive as derive_equations
 
     equations = derive_equations(model.system, model.method, radicals=radicals)

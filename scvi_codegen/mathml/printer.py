@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import re
 from collections.abc import Iterator, Sequence
 from itertools import chain, takewhile
 from typing import Any, TypeAlias
@@ -15,7 +14,7 @@ from sympy.core.function import AppliedUndef
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.precedence import PRECEDENCE, precedence_traditional
 
-from scvi_codegen.mathml.names import ACCENTS, Name, parsed
+from scvi_codegen.mathml.names import ACCENTS, TOKEN, Name, parsed, table_name
 
 __all__ = ["ONE_LINE", "Printer", "length"]
 
@@ -29,10 +28,6 @@ WIDE = 80
 """Characters of a factor that is broken within its brackets."""
 TALL = "2.2em"
 """Height of brackets whose contents are in other pieces."""
-CARDINAL = {"l": "", "dl": "dot"}
-"""Tables of cardinal functions at points, with their accent: l_1_0 is l_0(tau_1)."""
-PRODUCTS = {"DD": ("D_hat", "D_tilde"), "aa": ("A__2",), "bA": ("b", "A")}
-"""Tables that are products of matrices: DD_1_0 is entry (1, 0) of the product."""
 SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
 """Functions whose power is written at their name."""
 TYPESET = str.maketrans({"-": "\N{MINUS SIGN}", "ⅆ": "d", "ⅇ": "e", "ⅈ": "i"})
@@ -259,14 +254,13 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
 
     def _named(self, name: str) -> Element:
         """A symbol: letter, accent, indices; an entry of a derived table as the function or matrix it comes from."""
-        prefix, *indices = name.lstrip("_").split("_")
-        if prefix in CARDINAL and len(indices) == 2 and all(map(str.isdigit, indices)):
-            function = self._typeset(Name("l", CARDINAL[prefix], below=(indices[1],)))
-            return self._row(function, self._fenced(self._typeset(Name("τ", below=(indices[0],)))))
-        if prefix in PRODUCTS and indices and all(map(str.isdigit, indices)):
-            matrices = [self._typeset(parsed(matrix)) for matrix in PRODUCTS[prefix]]
-            return self._element("msub", self._fenced(*matrices), self._indices(indices))
-        return self._typeset(parsed(name))
+        entry = table_name(name)
+        if entry is None:
+            return self._typeset(parsed(name))
+        factors = [self._typeset(factor) for factor in entry.factors]
+        if entry.point is not None:
+            return self._row(*factors, self._fenced(self._typeset(entry.point)))
+        return self._element("msub", self._fenced(*factors), self._indices(entry.indices))
 
     def _typeset(self, name: Name) -> Element:
         letter = self._element("mi", name.letter)
@@ -282,7 +276,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         elements: list[Element] = []
         for number, part in enumerate(parts):
             elements += [self._comma()] if number else []
-            for token in re.findall(r"[^\W\d]+\d*|\d+|\S", part.strip("{}()")):
+            for token in TOKEN.findall(part.strip("{}()")):
                 if token[0].isalpha():
                     elements.append(self._typeset(parsed(token)))
                 else:

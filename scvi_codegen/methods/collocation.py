@@ -32,6 +32,7 @@ from scvi_codegen.methods.galerkin import (
 )
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters
 from scvi_codegen.nodes import Nodes
+from scvi_codegen.number_tables import Part
 from scvi_codegen.precision import Matrix, Number, Vector, mp
 from scvi_codegen.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
 from scvi_codegen.tableau import Tableau
@@ -103,6 +104,11 @@ class RungeKutta(Method):
     def needs_regular(self) -> bool:
         """In position form."""
         return self.form == "position"
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The tableau."""
+        return (self.tableau,)
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
@@ -195,6 +201,11 @@ class SpectralCollocation(Method):
     def needs_regular(self) -> bool:
         """In position form."""
         return self.form == "position"
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The nodes; in phase space also the tableau, in which it is written."""
+        return (self.node_set,) if self.form == "position" else (self.node_set, self.tableau)
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
@@ -397,7 +408,7 @@ def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int =
         Table.named("DD", matrix_product(inner, inner)),
         Table(
             entries=tuple((x / 2,) for (x,) in first),
-            names=tuple((f"{name}/2",) for (name, *_) in slope.names),
+            names=tuple((f"D_{n}_0/2",) for n in range(1, size + 1)),
         ),
     )
     return (

@@ -24,6 +24,7 @@ from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import curve_rates, lagrangian_rates
 from scvi_codegen.methods.method import Method, Specification, check_count, unit_sum
 from scvi_codegen.nodes import Nodes, nodes_by_name
+from scvi_codegen.number_tables import Part
 from scvi_codegen.precision import Matrix, Vector, mp
 from scvi_codegen.quadrature import Quadrature, gauss_legendre, quadrature_by_name
 from scvi_codegen.spaces import CurveSpace, Polynomials, space_by_name
@@ -159,6 +160,11 @@ class SVI(Method):
         """With more (or fewer) points than the degree: velocities at the points are then not independent."""
         return len(self.rule) != self.curves.dimension(self.degree) or bool(self.rule.derivative_weights)
 
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Nodes of polynomials, and the quadrature along the step."""
+        return (self.node_set, self.rule) if isinstance(self.curves, Polynomials) else (self.rule,)
+
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
         assert isinstance(self.quadrature, Quadrature)
@@ -243,6 +249,11 @@ class StoermerVerlet(Method):
     def symplectic(self) -> bool:
         """Yes."""
         return True
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The tableau of positions."""
+        return (lobatto_iiia(2),)
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""

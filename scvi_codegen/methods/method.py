@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import sympy
 
+from scvi_codegen.cards import card, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanical_system import MechanicalSystem
 from scvi_codegen.mechanics import force, momentum
+from scvi_codegen.number_tables import Part, number_table, numbers_html
 from scvi_codegen.precision import Number, Vector, mp
 from scvi_codegen.stage_system import PointFamily, Scatter, StageSystem, dyadic
 from scvi_codegen.tableau import MOST_STAGES
@@ -54,6 +56,20 @@ class Method(ABC):
     @abstractmethod
     def title(self) -> str:
         """One line for people."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The nodes, quadrature and tableau that its numbers are made from."""
+        return ()
+
+    def _repr_html_(self) -> str:
+        facts = (
+            ("name", plain(self.name)),
+            ("order", plain("none claimed" if self.order is None else self.order)),
+            ("symplectic", plain("yes" if self.symplectic else "no")),
+            ("symmetric", plain("yes" if self.symmetric else "no")),
+        )
+        return card(self.title, facts, *(numbers_html(number_table(part)) for part in self.parts))
 
     @abstractmethod
     def specification(self) -> Specification:

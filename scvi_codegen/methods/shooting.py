@@ -34,6 +34,7 @@ from scvi_codegen.methods.collocation import (
 from scvi_codegen.methods.galerkin import SVI, nodal_quadrature_family, resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters, unit_sum
 from scvi_codegen.nodes import Nodes
+from scvi_codegen.number_tables import Part
 from scvi_codegen.precision import Matrix, Vector, mp
 from scvi_codegen.quadrature import Quadrature
 from scvi_codegen.stage_system import (
@@ -162,6 +163,11 @@ class SCVI(Method):
     def needs_regular(self) -> bool:
         """The Euler-Lagrange equations are collocated, but for degree 1 with one point."""
         return self.degree > 1 or len(self.rule) > 1
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Nodes or the tableau of the abscissae, and the quadrature."""
+        return (self.node_set if self.abscissae is None else self.tableau, self.rule)
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""

@@ -7,17 +7,18 @@ Everything is plain data that travels between processes: a picture is a module-l
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-import sympy
+from scvi_codegen.page.blocks import Block, Cell, Formula, Listing, Paragraph, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
     "Block",
+    "Cell",
     "Check",
     "Experiment",
     "Formula",
@@ -30,8 +31,6 @@ __all__ = [
     "common_verdict",
     "holds",
 ]
-
-Cell: TypeAlias = float | int | str | None
 
 
 class Verdict(Enum):
@@ -75,63 +74,12 @@ def common_verdict(checks: Iterable[Check]) -> Verdict:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
-    """Numbers, written as CSV in full precision.
-
-    Attributes:
-        name: ``""`` for the main table of a result, else what is appended to the file's name.
-        columns: headings.
-        rows: as many cells as columns; ``None`` where there is no number.
-        formats: format specification by column, for the report; ``".3g"`` where none is given.
-        shown: whether the report prints it; long series of a curve are only drawn.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    name: str = ""
-    formats: Mapping[str, str] = field(default_factory=dict)
-    shown: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
     """``draw`` fills an empty Matplotlib figure of ``width`` x ``height`` inches."""
 
     draw: Callable[[Figure], None]
     width: float = 9.0
     height: float = 4.2
-
-
-@dataclass(frozen=True, slots=True)
-class Paragraph:
-    """Prose."""
-
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Formula:
-    """A typeset equation, ``left = right``, or an expression alone.
-
-    Attributes:
-        right: SymPy; symbols called ``Q__2_x`` are set as Q with superscript 2 and subscript x.
-        left: SymPy or ``None``.
-        number: the paper's, or ``""``.
-    """
-
-    right: sympy.Basic
-    left: sympy.Basic | None = None
-    number: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Listing:
-    """Text in a fixed-width font: C, an outline, output."""
-
-    text: str
-
-
-Block: TypeAlias = Paragraph | Formula | Listing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from scvi_codegen.c_outline import Function, functions_of, outline
 from scvi_codegen.compiler import generate_source
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.problems import planar_pendulum
-from scvi_codegen.reproduce.c_outline import Function, functions_of, outline
 from scvi_codegen.reproduce.experiment import Check, Experiment, Listing, Paragraph, Result, Table, holds
 
 __all__ = ["EXPERIMENTS"]

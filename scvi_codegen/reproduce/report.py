@@ -1,24 +1,21 @@
 """All results as one page of HTML that needs nothing else: pictures inline, formulas as MathML, no script, no network.
 
 It adapts to light and dark, to narrow screens and to paper. The page is ``templates/report.html.jinja`` with
-``templates/report.css``; here is what turns results into text for it.
+``templates/report.css`` on the base of all pages; here is what turns results into text for it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from scvi_codegen import __version__
-from scvi_codegen.mathml import mathml_terms
-from scvi_codegen.rendering import template_folder
-from scvi_codegen.reproduce.experiment import Formula, Listing, Result, Table, Verdict
+from scvi_codegen.page.environment import page_template, style_sheet
+from scvi_codegen.reproduce.experiment import Result, Table, Verdict
+from scvi_codegen.reproduce.labels import label, linked
 from scvi_codegen.reproduce.svg import color_variables, inline_svg
-from scvi_codegen.reproduce.typesetting import cell, column_class, label, linked, prose
 from scvi_codegen.reproduce.writing import draw
 
 __all__ = ["report_html", "tally"]
@@ -34,16 +31,17 @@ def report_html(results: Sequence[Result]) -> str:
     """
     pictures = {result.name: _picture(result) for result in results}
     alone = len(results) == 1
-    page = _environment().get_template("report.html.jinja")
+    page = page_template("report.html.jinja", label=label, heading=_heading, caption=_caption, linked=linked)
     return page.render(
         title=_heading(results[0]) if alone else TITLE,
         alone=alone,
+        body_class="alone" if alone else "",
         results=results,
         names=[] if alone else list(pictures),
         counts=tally([result.verdict for result in results]),
         check_counts=tally([check.verdict for result in results for check in result.checks]),
         pictures=pictures,
-        css=Markup((template_folder() / "report.css").read_text(encoding="utf-8")),
+        css=style_sheet("page.css", "report.css"),
         colors=_color_rules([*pictures.values()]),
         version=__version__,
     )
@@ -57,32 +55,6 @@ def tally(verdicts: Sequence[Verdict]) -> list[tuple[Verdict, str]]:
         for verdict in Verdict
         if counts[verdict]
     ]
-
-
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(template_folder()),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        autoescape=True,
-    )
-    environment.filters |= {
-        "label": label,
-        "heading": _heading,
-        "caption": _caption,
-        "prose": prose,
-        "linked": linked,
-        "cell": cell,
-        "column": column_class,
-        "equation": _equation,
-    }
-    environment.tests |= {
-        "formula": lambda block: isinstance(block, Formula),
-        "listing": lambda block: isinstance(block, Listing),
-    }
-    return environment
 
 
 def _picture(result: Result) -> Markup:
@@ -111,9 +83,3 @@ def _heading(result: Result) -> str:
 
 def _caption(result: Result, table: Table) -> str:
     return f"Data of {label(result.name)}{table.name and ': '}{table.name.replace('-', ' ')}"
-
-
-def _equation(formula: Formula) -> Markup:
-    """Terms that stay together where they fit a line."""
-    terms = mathml_terms(formula.right, formula.left)
-    return Markup(" ".join(f'<span class="term">{" ".join(pieces)}</span>' for pieces in terms))

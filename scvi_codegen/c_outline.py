@@ -11,11 +11,12 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-__all__ = ["Function", "functions_of", "outline"]
+__all__ = ["Function", "functions_of", "outline", "reached"]
 
 HEAD = re.compile(
     r"(?:^/\*(?P<comment>(?:[^*]|\*(?!/))*)\*/\n)?"
-    r"^(?!typedef|struct|enum)[a-z_][\w *()]*?[ *](?P<name>\w+)\((?P<arguments>[^;{}]*)\)\n\{\n(?P<body>.*?)^\}$",
+    r"^(?P<text>(?!typedef|struct|enum)[a-z_](?:[\w *]|__attribute__\(\(\w+\)\))*?[ *](?P<name>(?!__attribute__)\w+)"
+    r"\((?P<arguments>[^;{}]*)\)\n\{\n(?P<body>.*?)^\})$",
     re.MULTILINE | re.DOTALL,
 )
 WIDTH = 100
@@ -29,7 +30,8 @@ class Function:
         name: as it is called.
         arguments: their names in order.
         comment: the one above it, on one line, or nothing.
-        body: its text.
+        body: what stands between its braces.
+        text: all of it, without the comment.
         calls: the functions of the same text that it calls, in order of first call.
     """
 
@@ -37,12 +39,15 @@ class Function:
     arguments: tuple[str, ...]
     comment: str
     body: str
+    text: str
     calls: tuple[str, ...]
 
 
 def functions_of(code: str) -> dict[str, Function]:
-    """Every function with a body, by name, in the order of the text."""
-    found = {match["name"]: match for match in HEAD.finditer(code)}
+    """Every function with a body, by name, in the order of the text; of alternatives of the preprocessor the first."""
+    found: dict[str, re.Match[str]] = {}
+    for match in HEAD.finditer(code):
+        found.setdefault(match["name"], match)
     return {name: _function(match, found) for name, match in found.items()}
 
 
@@ -53,6 +58,7 @@ def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Funct
         arguments=tuple(_last_word(argument) for argument in match["arguments"].split(",") if argument != "void"),
         comment=" ".join((match["comment"] or "").replace("\n *", " ").split()),
         body=match["body"],
+        text=match["text"],
         calls=tuple(name for name in called if name in known and name != match["name"]),
     )
 
@@ -60,6 +66,18 @@ def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Funct
 def _last_word(argument: str) -> str:
     words: list[str] = re.findall(r"\w+", re.sub(r"\[.*?\]|\)", "", argument))
     return words[-1]
+
+
+def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ...]:
+    """``start`` and what it calls, each once, each before what it calls itself."""
+    found: dict[str, Function] = {}
+    pending = [start]
+    while pending:
+        name = pending.pop()
+        if name not in found:
+            found[name] = functions[name]
+            pending.extend(reversed(functions[name].calls))
+    return tuple(found.values())
 
 
 def outline(functions: Mapping[str, Function], start: str) -> str:

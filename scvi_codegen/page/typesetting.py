@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 
+import sympy
 from markupsafe import Markup, escape
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
-from scvi_codegen.reproduce.experiment import Cell, Table
+from scvi_codegen.mathml import mathml
+from scvi_codegen.page.blocks import Cell, Table
 
-__all__ = ["cell", "column_class", "label", "linked", "prose"]
+__all__ = ["SPACE", "cell", "column_class", "prose"]
 
 FORMAT = ".3g"
 LONGEST_LINE = 32
@@ -41,21 +42,6 @@ def prose(text: str) -> Markup:
     return Markup(NEGATIVE.sub(MINUS, typeset))
 
 
-def label(name: str) -> str:
-    """The name of an experiment as the paper writes it: ``figure-4`` as Figure 4, ``tables-6-7`` as Tables 6-7."""
-    first, *rest = name.split("-", 1)
-    return " ".join([first.capitalize(), *rest])
-
-
-def linked(text: Markup, names: Collection[str]) -> Markup:
-    """Text with links to the sections of the experiments that it names; names without a digit are just words."""
-    numbered = sorted((re.escape(name) for name in names if re.search(r"\d", name)), key=len, reverse=True)
-    if not numbered:
-        return text
-    pattern = re.compile(rf"(?<![\w-])({'|'.join(numbered)})(?![\w-]|\.\d)")
-    return Markup(pattern.sub(lambda match: f'<a href="#{match[0]}">{label(match[0]).replace(" ", SPACE)}</a>', text))
-
-
 def cell(value: Cell, specification: str | None = None) -> Markup:
     """An entry of a table; numbers in the format given, a dash where there is none."""
     match value:
@@ -63,6 +49,8 @@ def cell(value: Cell, specification: str | None = None) -> Markup:
             return Markup("\N{EN DASH}")
         case str():
             return prose(value)
+        case sympy.Basic():
+            return Markup(mathml(value))
         case float():
             return prose(format(value, specification or FORMAT))
     return prose(format(value, specification or ""))
@@ -72,6 +60,8 @@ def column_class(table: Table, index: int) -> str:
     """``"number"`` for what is set to the right, ``"text"`` for what needs several lines."""
     cells = [row[index] for row in table.rows]
     texts = [value for value in cells if isinstance(value, str)]
+    if any(isinstance(value, sympy.Symbol) for value in cells):
+        return "word"
     if not texts:
         return "number"
     return "text" if max(map(len, texts)) > LONGEST_LINE else "word"

@@ -1,0 +1,97 @@
+"""What tests of pages do in a headless Chromium: open a file as a phone or a desk, ask what the eye would see."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+WIDTHS = {"phone": 390, "desk": 1200}
+STICKING_OUT = """width => [...document.querySelectorAll('body *')].filter(element => {
+    const box = element.getBoundingClientRect();
+    return !element.parentElement.closest('.scroll, svg, math') && !element.closest('.unseen')
+        && (box.right > width + 0.5 || box.left < -0.5);
+}).map(element => element.outerHTML.slice(0, 100))"""
+UNREADABLE = """() => {
+    const channels = color => color.match(/[\\d.]+/g).map(Number);
+    const light = c => { c /= 255; return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4; };
+    const luminance = ([r, g, b]) => 0.2126 * light(r) + 0.7152 * light(g) + 0.0722 * light(b);
+    const behind = element => {
+        for (let e = element; e; e = e.parentElement) {
+            const c = channels(getComputedStyle(e).backgroundColor);
+            if (c.length === 3 || c[3] === 1) return c;
+        }
+    };
+    const found = [];
+    for (const element of document.querySelectorAll('body *')) {
+        if (![...element.childNodes].some(node => node.nodeType === 3 && node.data.trim())) continue;
+        const style = getComputedStyle(element);
+        const color = channels(element.closest('svg') ? style.fill : style.color);
+        const [low, high] = [luminance(color), luminance(behind(element))].sort((a, b) => a - b);
+        const contrast = (high + 0.05) / (low + 0.05);
+        if (!(contrast >= 4.5)) found.push([contrast, element.outerHTML.slice(0, 100)]);
+    }
+    return found;
+}"""
+FORMULAS = """() => [...document.querySelectorAll('math')].map(math => {
+    const {width, height} = math.getBoundingClientRect();
+    return [width, height];
+})"""
+FRACTIONS = """() => [...document.querySelectorAll('mfrac')].map(fraction => {
+    const [above, below] = [...fraction.children].map(child => child.getBoundingClientRect());
+    return [fraction.getBoundingClientRect().height, above.bottom, below.top];
+})"""
+VIEWS = [(size, scheme) for size in WIDTHS for scheme in ("light", "dark")]
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """A headless Chromium; the test is skipped where there is none."""
+    if importlib.util.find_spec("playwright") is None:
+        pytest.skip("playwright is not installed: pip install 'scvi-codegen[test]'")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        path = next(filter(None, map(shutil.which, (*BROWSERS, own))), None)
+        if path is None:
+            pytest.skip(f"there is no browser: none of {', '.join(BROWSERS)} is installed")
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield started
+        started.close()
+
+
+@contextmanager
+def opened(browser: Any, page: str, path: Path, size: str, scheme: str) -> Iterator[Any]:
+    """The page on a phone or a desk, by day or by night; ``view.asked`` is what it asked for."""
+    path.write_text(page, encoding="utf-8")
+    view = browser.new_page(color_scheme=scheme)
+    phone = {"width": WIDTHS[size], "height": 844, "deviceScaleFactor": 2, "mobile": size == "phone"}
+    view.context.new_cdp_session(view).send("Emulation.setDeviceMetricsOverride", phone)
+    view.asked, view.said = [], []
+    view.on("request", lambda request: view.asked.append(request.url))
+    view.on("console", lambda message: view.said.append(message.text))
+    view.goto(path.as_uri())
+    view.wait_for_load_state("networkidle")
+    view.own, view.width = path.as_uri(), WIDTHS[size]
+    yield view
+    view.close()
+
+
+def assert_it_asks_for_nothing(view: Any) -> None:
+    """No request leaves the page, and the browser complains of nothing."""
+    assert [url for url in view.asked if not url.startswith("data:")] == [view.own]
+    assert view.said == []
+
+
+def assert_nothing_sticks_out(view: Any) -> None:
+    """Everything is within the width of the screen, or scrolls within what is."""
+    assert view.evaluate(STICKING_OUT, view.width) == []
+    assert view.evaluate("document.documentElement.scrollWidth") <= view.width
+    assert view.evaluate("innerWidth") == view.width
