@@ -219,7 +219,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     Examples:
       scvi-codegen verify kepler --method scvi --degree 3
       scvi-codegen verify mine.toml
-      scvi-codegen generate mine.toml -o mine_svi && scvi-codegen verify mine_svi
+      scvi-codegen verify mine_svi
     """  # noqa: D301  (click wants the character \b)
     from scvi_codegen.cli.verifying import certificate_path, verified
 

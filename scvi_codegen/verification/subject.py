@@ -28,6 +28,8 @@ NUDGE, NUDGES = 0.05, 6
 PARAMETER_NUDGE = 0.05
 LATER = 5
 """Steps from the first state to the second."""
+MOST_COORDINATES = 24
+"""Whose exact motion is computed."""
 LARGEST = 200
 """Unknowns of a step whose equations are solved in 60 digits."""
 
@@ -95,7 +97,15 @@ class Subject:
 
     @cached_property
     def motion(self) -> Motion:
-        """The exact motion of :attr:`moved`."""
+        """The exact motion of :attr:`moved`.
+
+        Raises:
+            StateError: if it has too many coordinates.
+        """
+        if self.system.dimension > MOST_COORDINATES:
+            raise StateError(
+                f"{self.system.dimension} coordinates are more than the {MOST_COORDINATES} followed in 60 digits"
+            )
         return motion_of(self.moved)
 
     @cached_property
@@ -174,7 +184,7 @@ class Subject:
         Raises:
             StateError: if they are too many.
         """
-        found = derived_step(system or self.moved, method or self.method)
+        found = derived_step(system or self.motion.system, method or self.method)
         if found.unknowns > LARGEST:
             raise StateError(
                 f"{found.unknowns} unknowns a step are more than the {LARGEST} that are solved in 60 digits"
