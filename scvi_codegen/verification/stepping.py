@@ -218,9 +218,9 @@ def _discrete(subject: Subject) -> Finding | None:
         slopes = _slopes_of_action(subject, state, q1)
     except StepFailedError as failure:
         raise BrokenError(f"the step has a curve from q0 to q1, but looking for it {failure}") from failure
-    size = max(np.abs(state.p).max(), np.abs(p1).max()) or 1.0
-    wrong = np.concatenate([slopes + np.concatenate([state.p, -p1]), p0 - state.p, end - p1])
-    return Finding(float(np.abs(wrong).max() / size), SLOPES, "relative")
+    sizes = subject.scales(state)[len(q1) :]
+    wrong = np.array([*(slopes + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
+    return Finding(float(np.max(np.abs(wrong) / sizes)), SLOPES, "relative")
 
 
 def _slopes_of_action(subject: Subject, state: State, q1: Array) -> Array:

@@ -147,7 +147,10 @@ class Subject:
         return np.concatenate(self.step(state, stepper, options))
 
     def scales(self, state: State) -> Array:
-        """(2m,) size of q, then of p: of the state or, if that is less, of what a step changes."""
+        """(2m,) size of q, then of p: of the state or, if that is less, of what a step changes.
+
+        One size serves all coordinates; momenta have the size that a common velocity gives each, whatever its mass.
+        """
         m = len(state.q)
         try:
             end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t))
@@ -155,7 +158,19 @@ class Subject:
             end = state.z
         change = end - state.z
         sizes = [max(_rms(state.z[part]), _rms(change[part])) or 1.0 for part in (slice(m), slice(m, None))]
-        return np.repeat(sizes, m)
+        return np.concatenate([np.full(m, sizes[0]), self._momentum_sizes(state, sizes[1])])
+
+    def _momentum_sizes(self, state: State, size: float) -> Array:
+        """(m,) what each momentum changes by if its velocity does by their mean; ``size`` where none has any."""
+        m = len(state.q)
+        try:
+            v = self.stepper.velocity(state.q, state.p, state.t)
+            moved = 0.1 * (_rms(v) or 1.0) * np.eye(m)
+            changes = [self.stepper.momentum(state.q, v + unit, state.t) - state.p for unit in moved]
+        except StateError:
+            return np.full(m, size)
+        own: Array = 10.0 * np.abs(np.diag(np.array(changes)))
+        return np.where(own > 0.0, own, size)
 
     def linearised(self, state: State) -> Linearised | None:
         """The derivative of the step at a state, by differences."""
