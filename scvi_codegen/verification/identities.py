@@ -160,9 +160,10 @@ def _oscillator(method: Method) -> Finding | None:
 
 def _euler(subject: Subject) -> Finding | None:
     """Explicit Euler written out: order 1 and nothing else would also be kept by the implicit one."""
-    what, state, motion = subject.method.specification(), subject.states[0], subject.motion
+    what = subject.method.specification()
     if what["method"] != "explicit-euler":
         return None
+    state, motion = subject.states[0], subject.motion
     q, p, h, t = numbers(state.q), numbers(state.p), mp.mpf(state.h), mp.mpf(state.t)
     v, force = motion.rates(q, p, t)
     if what["form"] == "phase-space":

@@ -34,7 +34,8 @@ for the first and the last one."""
 FALLBACK = "solve_again"
 """The C function that calls Newton's iteration where sweeps fail."""
 MOST_TRIED = 30
-RUN_STEPS = 12
+RUN_STEPS, LOOKED_AT = 12, (0, 1, 2, 5, 11)
+"""Of a run: the first steps have less to remember."""
 STATIONARY = 1e-25
 TRANSFORM = 1e-11
 SLOPES = 1e-6
@@ -46,6 +47,7 @@ def step_checks(subject: Subject) -> Iterator[Check]:
     for name, promise, measure in (
         ("stage equations", "a step solves the paper's equations (60 digits)", _artefact),
         ("Newton's solver", "it solves the same equations", _newton),
+        ("solvers", "the artefact and Newton's solver alone give the same step", _agree),
         ("Newton's matrix", "its first update is that of the exact one (finite differences, 60 digits)", _matrix),
         ("fallback", "where sweeps fail, Newton's iteration solves the same equations", _fallback),
         ("contraction", f"iterations shrink errors in proportion to h or better (count at h/{SMALLER})", _contraction),
@@ -78,6 +80,17 @@ def _solves(subject: Subject, stepper: Stepper) -> Finding:
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
+def _agree(subject: Subject) -> Finding | None:
+    """What can be said of large systems, too."""
+    if subject.newton is None or subject.newton is subject.stepper:
+        return None
+    worst = 0.0
+    for _, state, rounding in subject.roundings():
+        change = np.abs(subject.ends(state) - subject.ends(state, subject.newton))
+        worst = max(worst, float(np.max(change / rounding)))
+    return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
+
+
 def _apart(subject: Subject, state: State, end: Array, expected: SolvedStep) -> float:
     """Largest distance from the step in 60 digits in units of rounding."""
     return float(np.max(np.abs(end - _joined(expected).astype(float)) / subject.rounding(state)))
@@ -91,10 +104,11 @@ def _matrix(subject: Subject) -> Finding | None:
     """The first update from the straight line, a way that an exact matrix and a wrong one go differently."""
     if subject.newton is None:
         return None
+    end = _joined(subject.solved(0))
     state, equations = subject.states[0], compiled_equations(subject.moved, subject.method)
     if equations.unknowns > LARGEST:
         raise StateError(f"{equations.unknowns} unknowns are more than the {LARGEST} that are solved in 60 digits")
-    end, scales = _joined(subject.solved(0)), subject.scales(state)
+    scales = subject.scales(state)
     exact = _joined(equations.first_update(state.q, state.p, state.h, state.t))
     v = subject.motion.velocity(numbers(state.q), numbers(state.p), mp.mpf(state.t))
     straight = np.concatenate([numbers(state.q) + v * state.h, numbers(state.p)])
@@ -154,7 +168,7 @@ def _run(subject: Subject) -> Finding:
 def _run_of(subject: Subject, stepper: Stepper) -> float:
     first, worst = subject.states[0], 0.0
     run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=subject.parameters)
-    for k in range(RUN_STEPS):
+    for k in LOOKED_AT:
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
         change = np.abs(subject.ends(state) - np.concatenate([run.q[k + 1], run.p[k + 1]]))
         worst = max(worst, float(np.max(change / subject.rounding(state))))
@@ -204,9 +218,9 @@ def _discrete(subject: Subject) -> Finding | None:
         slopes = _slopes_of_action(subject, state, q1)
     except StepFailedError as failure:
         raise BrokenError(f"the step has a curve from q0 to q1, but looking for it {failure}") from failure
-    size = max(np.abs(state.p).max(), np.abs(p1).max()) or 1.0
-    wrong = np.concatenate([slopes + np.concatenate([state.p, -p1]), p0 - state.p, end - p1])
-    return Finding(float(np.abs(wrong).max() / size), SLOPES, "relative")
+    sizes = subject.scales(state)[len(q1) :]
+    wrong = np.array([*(slopes + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
+    return Finding(float(np.max(np.abs(wrong) / sizes)), SLOPES, "relative")
 
 
 def _slopes_of_action(subject: Subject, state: State, q1: Array) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
+from scvi_codegen.verification.linearisation import Linearised
 from scvi_codegen.verification.subject import EPSILON, State, Subject
 
 __all__ = ["largest_step", "structure_checks"]
@@ -41,21 +42,29 @@ def structure_checks(subject: Subject) -> Iterator[Check]:
 
 
 def _symplecticity(subject: Subject) -> Finding:
-    m = subject.system.dimension
-    omega = np.kron([[0, 1], [-1, 0]], np.eye(m))
     worst = Finding(0.0, np.inf)
     for state in subject.states:
         around = subject.linearised(state)
         if around is None:
             raise StateError("steps from nearby states fail")
-        J = around.matrix
-        noise = 2 * m * SPREAD * float(np.abs(J).max()) * (around.uncertainty + EPSILON * ROUNDINGS)
-        if noise > TOO_ROUGH:
-            raise StateError(f"differences are good to {noise:.1g} only: try a smaller step")
-        defect = float(np.abs(J.T @ omega @ J - omega).max())
-        found = Finding(defect, noise, "the bound is the noise of the differences")
+        defect, noise = _defect(around)
+        if noise.max() > TOO_ROUGH:
+            raise StateError(f"differences are good to {noise.max():.1g} only: try a smaller step")
+        place = np.unravel_index(np.argmax(defect / noise), defect.shape)
+        found = Finding(float(defect[place]), float(noise[place]), "the bound is the noise of the differences")
         worst = max(worst, found, key=lambda finding: finding.measured / finding.bound)
     return worst
+
+
+def _defect(around: Linearised) -> tuple[Array, Array]:
+    """(2m, 2m) sizes of J^T Omega J - Omega, and of their noise, each in units of the areas of its two coordinates."""
+    m, J = len(around.scales) // 2, around.matrix
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(around.scales, around.scales)
+    areas = np.tile(around.scales[:m] * around.scales[m:], 2)
+    units = np.sqrt(np.outer(areas, areas))
+    error = np.full_like(J, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
+    half = error.T @ np.abs(omega) @ np.abs(J)
+    return np.abs(J.T @ omega @ J - omega) / units, (half + half.T) / units
 
 
 def _reversal(subject: Subject) -> Finding:

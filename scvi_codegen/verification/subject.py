@@ -28,6 +28,8 @@ NUDGE, NUDGES = 0.05, 6
 PARAMETER_NUDGE = 0.05
 LATER = 5
 """Steps from the first state to the second."""
+MOST_COORDINATES = 12
+"""Whose exact motion is computed: with 18, six bodies in space, it takes minutes."""
 LARGEST = 200
 """Unknowns of a step whose equations are solved in 60 digits."""
 
@@ -95,7 +97,15 @@ class Subject:
 
     @cached_property
     def motion(self) -> Motion:
-        """The exact motion of :attr:`moved`."""
+        """The exact motion of :attr:`moved`.
+
+        Raises:
+            StateError: if it has too many coordinates.
+        """
+        if self.system.dimension > MOST_COORDINATES:
+            raise StateError(
+                f"{self.system.dimension} coordinates are more than the {MOST_COORDINATES} followed in 60 digits"
+            )
         return motion_of(self.moved)
 
     @cached_property
@@ -137,7 +147,10 @@ class Subject:
         return np.concatenate(self.step(state, stepper, options))
 
     def scales(self, state: State) -> Array:
-        """(2m,) size of q, then of p: of the state or, if that is less, of what a step changes."""
+        """(2m,) size of q, then of p: of the state or, if that is less, of what a step changes.
+
+        One size serves all coordinates; momenta have the size that a common velocity gives each, whatever its mass.
+        """
         m = len(state.q)
         try:
             end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t))
@@ -145,7 +158,19 @@ class Subject:
             end = state.z
         change = end - state.z
         sizes = [max(_rms(state.z[part]), _rms(change[part])) or 1.0 for part in (slice(m), slice(m, None))]
-        return np.repeat(sizes, m)
+        return np.concatenate([np.full(m, sizes[0]), self._momentum_sizes(state, sizes[1])])
+
+    def _momentum_sizes(self, state: State, size: float) -> Array:
+        """(m,) what each momentum changes by if its velocity does by their mean; ``size`` where none has any."""
+        m = len(state.q)
+        try:
+            v = self.stepper.velocity(state.q, state.p, state.t)
+            moved = 0.1 * (_rms(v) or 1.0) * np.eye(m)
+            changes = [self.stepper.momentum(state.q, v + unit, state.t) - state.p for unit in moved]
+        except StateError:
+            return np.full(m, size)
+        own: Array = 10.0 * np.abs(np.diag(np.array(changes)))
+        return np.where(own > 0.0, own, size)
 
     def linearised(self, state: State) -> Linearised | None:
         """The derivative of the step at a state, by differences."""
@@ -174,7 +199,7 @@ class Subject:
         Raises:
             StateError: if they are too many.
         """
-        found = derived_step(system or self.moved, method or self.method)
+        found = derived_step(system or self.motion.system, method or self.method)
         if found.unknowns > LARGEST:
             raise StateError(
                 f"{found.unknowns} unknowns a step are more than the {LARGEST} that are solved in 60 digits"
