@@ -283,9 +283,9 @@ class TestArguments:
             ({"threads": 1.5}, "threads must be a whole number"),
             ({"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),
             ({"parameters": {"mu": [1.0, 2.0]}}, r"the parameter mu must be one number or 3, not of shape \(2,\)"),
-            ({"parameters": {"mu": "heavy"}}, "the parameter mu must be an array of real numbers"),
+            ({"parameters": {"mu": "heavy"}}, "the parameter mu must be real numbers"),
             ({"parameters": np.ones((3, 2))}, r"parameters must have shape \(3, 1\), not \(3, 2\)"),
-            ({"parameters": ["heavy"]}, "parameters must be an array of real numbers"),
+            ({"parameters": ["heavy"]}, "parameters must be real numbers"),
             ({"parameters": {"mu": [1.0, np.nan, 1.0]}}, "the parameter mu of trajectory 1 is nan"),
         ],
     )
