@@ -696,6 +696,7 @@ static inline lanes lanes_estimate_inverse_root(lanes x)
 }
 #endif
 
+#if !defined(__AVX512F__) || 4 % 8 != 0
 static inline lanes lanes_sqrt(lanes x)
 {
   lane_view view = {x};
@@ -703,6 +704,7 @@ static inline lanes lanes_sqrt(lanes x)
     view.lane[j] = sqrt(view.lane[j]);
   return view.all;
 }
+#endif
 
 /* x^(-3/2). AVX-512 has the inverse root to 14 bits; with e = 1 - x y^2 the rest is the series of (1 - e)^(-3/2). */
 static inline lanes lanes_inverse_root_3(lanes x)

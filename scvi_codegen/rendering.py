@@ -324,6 +324,7 @@ def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]
         "lane_kernels": kernels,
         "lane_functions": sorted(functions - {f"{INVERSE_ROOT}{k}" for k in roots} | ({"sqrt"} if roots else set())),
         "inverse_roots_in_lanes": roots,
+        "root_for_inverses": "sqrt" not in functions,
         "series": _binomial_series,
         "good_guess": GOOD_GUESS**2,
         "vector_library": VECTOR_LIBRARY,

@@ -228,7 +228,7 @@ def test_text_is_the_same_in_every_process(tmp_path):
         for seed in (0, 1, 4242)
     ]
     first, *others = [process.communicate()[0] for process in processes]
-    assert first.count("\n") == 4 * len(systems())
+    assert first.count("\n") == 4 * len(systems()) - 2  # two of the methods do not take the singular Hamiltonian
     assert others == [first] * len(others)
 
 
@@ -418,4 +418,5 @@ def test_every_method_passes_the_sanitizers_for_every_system(command, method, tm
 
 def test_every_method_has_a_name_of_its_own():
     assert all(isinstance(method, Method) for method in METHODS.values())
-    assert len({pair[1].prefix for method in METHODS for pair in generated(method).values()}) == 14 * 6
+    prefixes = [interface.prefix for method in METHODS for _, interface in generated(method).values()]
+    assert len(set(prefixes)) == len(prefixes)

@@ -149,8 +149,8 @@ class TestTrust:
         changed = record["entry"].replace("return", "return  ", 1)
         path.write_text(json.dumps(record | {"entry": changed}))
         made = []
-        derive = compiler._program
-        monkeypatch.setattr(compiler, "_program", lambda *args, **more: made.append(1) or derive(*args, **more))
+        derive = compiler.program_of
+        monkeypatch.setattr(compiler, "program_of", lambda *args, **more: made.append(1) or derive(*args, **more))
         assert spring().source == first.source
         assert made == [1]
 

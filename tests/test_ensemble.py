@@ -278,7 +278,7 @@ class TestArguments:
             ({"steps": 1.5}, "steps must be a whole number"),
             ({"steps": -1}, "steps must be at least 0"),
             ({"every": 0}, "every must be at least 1"),
-            ({"t": "noon"}, "the time t must be a real number"),
+            ({"t": "noon"}, "the time t must be real numbers"),
             ({"threads": -1}, "threads must be at least 1"),
             ({"threads": 1.5}, "threads must be a whole number"),
             ({"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),

@@ -130,7 +130,7 @@ def test_orders_names_and_a_stability_of_every_family(tableau: Tableau) -> None:
     family, _, count = tableau.name.partition(":")
     assert tableau.stages == int(count)
     assert tableau.order == ORDERS[family](int(count))
-    assert tableau_by_name(tableau.name) is tableau
+    assert tableau_by_name(tableau.name) == tableau
     assert tableau.is_a_stable
 
 
