@@ -39,6 +39,8 @@ PIVOT = 1e-6
 ZERO = 1e-8
 RECOGNISED = 1e-7
 LARGEST_INTEGER = 1000
+HIGHEST_POWER = 16
+"""Of a parameter in a coefficient; beyond, a fit of logarithms has recognised nothing."""
 AT_ONCE = 4096
 """Points of one evaluation: so many numbers are kept for every part of the formulas."""
 MORE_POINTS = 12
@@ -270,6 +272,8 @@ def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[
     logs = [np.ones(len(entries)), *(np.log(np.abs(values)) for _, values in factors)]
     solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]
     halves = np.rint(2.0 * solution[1:])
+    if np.abs(halves).max(initial=0.0) > 2 * HIGHEST_POWER:
+        return None
     quotients = entries.copy()
     for (_, values), twice in zip(factors, halves, strict=True):
         quotients /= values ** int(twice / 2) if twice % 2 == 0 else np.abs(values) ** (twice / 2.0)
