@@ -109,8 +109,8 @@ class Polynomials(CurveSpace):
 class Trigonometric(CurveSpace):
     """1, cos(k f c), sin(k f c) for k = 1 .. K, and powers of c for what is left of the degree: s = 2 K + powers.
 
-    An even degree with all its harmonics leaves no power: straight lines are then not among the curves, and for a fixed f
-    the method does not converge as h goes to 0. Let f shrink with the step, or take an odd degree or fewer harmonics.
+    An even degree with all its harmonics leaves no power: straight lines are then not among the curves, and for a fixed
+    f the method does not converge as h goes to 0. Let f shrink with the step, or take an odd degree or fewer harmonics.
 
     With the frequency f of an oscillator times the step the method is exact on the oscillator, whatever the step, as
     soon as the quadrature is: by default it has enough Gauss points. Vanden Berghe et al., J. Comput. Appl. Math. 125
