@@ -1,17 +1,18 @@
 """The whole tour: a system and a method go in, a stepper comes out.
 
     MechanicalSystem, Method
-      -> symmetry  Symmetry        what is conserved (:mod:`scvi_codegen.symmetry`)
-      -> derive    StepEquations   the equations as the paper prints them, to look at (:mod:`scvi_codegen.equations`)
-      -> solvers   Sweep           a solver without a matrix, where there is one (:mod:`scvi_codegen.solvers`)
-      -> lower     Program         kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering`)
-      -> render    Source          header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering`)
-         (with events, the search for them behind it: :mod:`scvi_codegen.event_source`)
-      -> build     module          compiled, bound and cached (:mod:`scvi_codegen.building`)
-      -> Stepper                   step, integrate (:mod:`scvi_codegen.stepper`)
+      -> symmetry  Symmetry        what is conserved (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
+      -> derive    StepEquations   the equations as the paper prints them, to look at
+      (:mod:`scvi_codegen.derivation.equations`) -> solvers   Sweep           a solver without a matrix, where there is
+      one (:mod:`scvi_codegen.lowering.solvers`) -> lower     Program         kernels, tables, loops: C without syntax
+      (:mod:`scvi_codegen.lowering.program`) -> render    Source          header and source text, from ``templates/``
+      (:mod:`scvi_codegen.rendering.text`)
+         (with events, the search for them behind it: :mod:`scvi_codegen.rendering.events`)
+      -> build     module          compiled, bound and cached (:mod:`scvi_codegen.native.building`)
+      -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.stepper`)
 
 Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
-kept in the user's cache folder (:mod:`scvi_codegen.text_cache`), so the second time is quick.
+kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so the second time is quick.
 """
 
 from __future__ import annotations
@@ -19,22 +20,22 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.errors import MethodError
-from scvi_codegen.event_source import with_events
-from scvi_codegen.events import EventLike, as_events
-from scvi_codegen.lowering import lower
-from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.ir.program import Program
+from scvi_codegen.lowering.program import lower
+from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
+from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
-from scvi_codegen.program import Program
-from scvi_codegen.rendering import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
-from scvi_codegen.solvers.choice import check_solver, sweep_of
-from scvi_codegen.solvers.splitting import splitting_of
-from scvi_codegen.source import Interface, Source
-from scvi_codegen.stepper import Stepper
-from scvi_codegen.symmetry import Symmetry, all_symmetries
-from scvi_codegen.text_cache import Texts, remembered_texts
+from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.rendering.events import with_events
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.text import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
+from scvi_codegen.rendering.text_cache import Texts, remembered_texts
+from scvi_codegen.runtime.events import EventLike, as_events
+from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source", "program_of"]
 
@@ -70,7 +71,8 @@ def compile_stepper(
             where it fails.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
-        symmetries: known beside those that are found (:func:`~scvi_codegen.symmetry.check_symmetry`): their momentum
+        symmetries: known beside those that are found
+        (:func:`~scvi_codegen.mechanics.symmetry.symmetry.check_symmetry`): their momentum
             maps are tracked, too.
         events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
 

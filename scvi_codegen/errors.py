@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from scvi_codegen.trajectory import Trajectory
+    from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = [
     "BuildError",

@@ -1,122 +1,17 @@
-"""Systems beyond the catalogue, generic states, and compiled steppers shared between tests."""
+"""Fixtures of all tests; what they are made from is in ``tools/samples.py``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cache, cached_property
 from typing import Any
 
-import numpy as np
 import pytest
 from browsing import chromium
-from oracle import Mechanics, numbers, oracle_step
+from samples import Sample, compile_quickly, sample_named, stepper_for
 
-from scvi_codegen.building import TUNED_FLAGS
-from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.problems import problem
-from scvi_codegen.stepper import Stepper
-from scvi_codegen.system import LagrangianSystem
-
-
-def driven_duffing() -> LagrangianSystem:
-    return problem("duffing").system.with_parameters(gamma=0.7, omega=1.3)
-
-
-def pumped_cart_pole() -> LagrangianSystem:
-    """A cart and a pendulum whose rod is shortened and lengthened: the mass matrix depends on theta and on time."""
-    return LagrangianSystem.from_text(
-        name="pumped cart and pole",
-        coordinates=["x", "theta"],
-        lagrangian="""
-            M*x_dot**2/2 - k*x**2/2 + m*g*l*(1 + a*sin(w*t))*cos(theta)
-            + m*(x_dot + l*a*w*cos(w*t)*sin(theta) + l*(1 + a*sin(w*t))*cos(theta)*theta_dot)**2/2
-            + m*(l*(1 + a*sin(w*t))*sin(theta)*theta_dot - l*a*w*cos(w*t)*cos(theta))**2/2
-        """,
-        parameters={"M": 2.0, "m": 1.0, "l": 0.8, "g": 3.0, "a": 0.2, "w": 1.7, "k": 0.5},
-    )
-
-
-def three_bodies() -> LagrangianSystem:
-    """Three masses in the plane, each pair joined by a spring that is stiffer the longer it is."""
-    pairs = (("a", "b"), ("b", "c"), ("a", "c"))
-    kinetic = " + ".join(f"m_{body}*(x_{body}_dot**2 + y_{body}_dot**2)/2" for body in "abc")
-    springs = [f"((x_{i} - x_{j})**2 + (y_{i} - y_{j})**2)" for i, j in pairs]
-    return LagrangianSystem.from_text(
-        name="three bodies",
-        coordinates=[f"{axis}_{body}" for body in "abc" for axis in "xy"],
-        lagrangian=kinetic + "".join(f" - k*{square}/2 - k*{square}**2/8" for square in springs),
-        parameters={"m_a": 1.0, "m_b": 0.7, "m_c": 1.6, "k": 0.9},
-    )
-
-
-def runaway() -> LagrangianSystem:
-    """q'' = q^2."""
-    return LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-
-
-OWN_SYSTEMS: dict[str, Callable[[], LagrangianSystem]] = {
-    "driven-duffing": driven_duffing,
-    "pumped-cart-pole": pumped_cart_pole,
-    "three-bodies": three_bodies,
-    "runaway": runaway,
-}
-
-GENERIC = {
-    "harmonic-oscillator": ((0.7,), (0.4,)),
-    "planar-pendulum": ((0.7,), (0.4,)),
-    "driven-duffing": ((0.6,), (-0.3,)),
-    "relativistic-particle": ((0.5,), (0.6,)),
-    "kepler": ((0.3, 0.8), (-1.1, 0.4)),
-    "double-pendulum": ((0.9, -0.6), (0.5, 1.2)),
-    "cart-pole": ((0.2, 0.9), (0.4, -0.7)),
-    "pumped-cart-pole": ((0.2, 0.9), (0.4, -0.7)),
-    "henon-heiles": ((0.1, -0.2), (0.3, 0.25)),
-    "spherical-pendulum": ((0.9, 0.3), (0.4, 1.3)),
-    "charged-particle": ((0.2, -0.1, 0.3), (1.0, 0.4, 0.1)),
-    "three-bodies": ((0.1, 0.0, 1.1, 0.2, 0.3, 0.9), (0.2, -0.1, 0.0, 0.4, -0.3, 0.1)),
-}
-"""Coordinates and velocities with no symmetry and no turning point in them."""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """A system, its oracle, and one generic state."""
-
-    name: str
-    system: LagrangianSystem
-
-    @cached_property
-    def mechanics(self) -> Mechanics:
-        return Mechanics(self.system)
-
-    @cached_property
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """(q, p) at t = 0."""
-        q, v = map(numbers, GENERIC[self.name])
-        return q.astype(float), self.mechanics.momentum([0], q[None], v[None])[0].astype(float)
-
-    def oracle(self, method: Method, q: np.ndarray, p: np.ndarray, h: float, t: float = 0.0) -> np.ndarray:
-        return np.array(oracle_step(self.mechanics, method.specification(), q, p, h, t))
-
-
-@cache
-def sample_named(name: str) -> Sample:
-    return Sample(name, OWN_SYSTEMS[name]() if name in OWN_SYSTEMS else problem(name).system)
-
-
-QUICK_FLAGS = ("-O1", *(flag for flag in TUNED_FLAGS if flag != "-O3"))
-"""What users get, but for the optimisation of which most of the compilation time is made."""
-
-
-@cache
-def stepper_for(name: str, method: Method, *, solver: str = "auto", flags: tuple[str, ...] = QUICK_FLAGS) -> Stepper:
-    return compile_stepper(sample_named(name).system, method, solver=solver, flags=flags)
-
-
-def compile_quickly(system: LagrangianSystem, method: Method) -> Stepper:
-    return compile_stepper(system, method, flags=QUICK_FLAGS)
+from scvi_codegen.runtime.stepper import Stepper
 
 
 @pytest.fixture(scope="session")

@@ -29,18 +29,18 @@ from typing import Any
 
 from scvi_codegen.benchmark.cases import CASES
 from scvi_codegen.benchmark.compositions import run_compositions
+from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.hand_written import run_hand_written
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
-from scvi_codegen.benchmark.peers import PEERS
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.tables import Table
 from scvi_codegen.errors import ScviCodegenError, StateError
-from scvi_codegen.expression_text import closest
+from scvi_codegen.formulas.grammar import closest
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
@@ -116,7 +116,7 @@ def benchmark(
                 f"there is nothing called '{name}' to measure{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}"
             )
     if plot_path is not None:
-        from scvi_codegen.plotting import check_plot_path
+        from scvi_codegen.results.plotting import check_plot_path
 
         check_plot_path(plot_path)
     report = _measured(names or tuple(SECTIONS), plan or Plan(), say)

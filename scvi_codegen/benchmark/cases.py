@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.expression_text import closest
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.problems import problem
+from scvi_codegen.formulas.grammar import closest
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.models.problems import problem
 
 __all__ = ["CASES", "STATES", "Case", "Formulation", "case"]
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Case, case
+from scvi_codegen.benchmark.contenders.ours import momenta_of
 from scvi_codegen.benchmark.curves import Point, time_at
-from scvi_codegen.benchmark.ours import momenta_of
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
 from scvi_codegen.benchmark.tables import Table

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Array, Case, case
+from scvi_codegen.benchmark.contenders.taylor import heyoka_states
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import Table
-from scvi_codegen.benchmark.taylor import heyoka_states
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["DRIFTS", "fitted_slope", "run_drift"]
 

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen import building
-from scvi_codegen.basis import continuation, extrapolation, matrix_product
 from scvi_codegen.benchmark.cases import Array, Case, case
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import Table
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.precision import Matrix, mp
-from scvi_codegen.quadrature import gauss_legendre
-from scvi_codegen.source import Source
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
+from scvi_codegen.tables.precision import Matrix, mp
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = ["HAND_WRITTEN", "hand_written_source", "run_hand_written"]
 

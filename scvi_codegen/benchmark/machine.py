@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import scvi_codegen
-from scvi_codegen.building import TUNED_FLAGS, find_compiler
+from scvi_codegen.native.building import TUNED_FLAGS, find_compiler
 
 __all__ = ["machine"]
 

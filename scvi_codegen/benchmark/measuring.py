@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from scvi_codegen.benchmark.cases import STATES, Array
-from scvi_codegen.benchmark.contenders import Contender
+from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.curves import Point
 from scvi_codegen.benchmark.references import Reference, rms_error
 from scvi_codegen.errors import ScviCodegenError

@@ -20,12 +20,12 @@ from scvi_codegen.benchmark.cases import Case, case
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
 from scvi_codegen.benchmark.tables import Table
-from scvi_codegen.binding import SolverOptions
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["run_paper_tables"]
 

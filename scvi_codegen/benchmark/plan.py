@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from scvi_codegen.benchmark.peers import PEERS
+from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods.method import Method
 

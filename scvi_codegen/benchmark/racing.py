@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.benchmark.cases import STATES, Case, case
-from scvi_codegen.benchmark.contenders import Contender
+from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
+from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
+from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
 from scvi_codegen.benchmark.measuring import measure
-from scvi_codegen.benchmark.ours import our_contenders, our_ensembles
-from scvi_codegen.benchmark.peers import PEERS, missing_module, peer_contenders
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult
-from scvi_codegen.benchmark.taylor import heyoka_ensembles
 
 __all__ = ["ENSEMBLES", "run_case", "run_ensemble"]
 

@@ -19,11 +19,11 @@ import numpy as np
 from mpmath import mp, polyroots, taylor
 from numpy.typing import NDArray
 
-from scvi_codegen import building
 from scvi_codegen.benchmark.cases import Array, Case
-from scvi_codegen.benchmark.tracing import rates_text
+from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.errors import StateError
-from scvi_codegen.files import write_atomically
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.native import building
 
 __all__ = ["Reference", "final_states", "gauss_tables", "reference", "rms_error"]
 

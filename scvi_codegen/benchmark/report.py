@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from scvi_codegen.benchmark.contenders import OURS
+from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, time_at
 from scvi_codegen.benchmark.measuring import Measurement
 from scvi_codegen.benchmark.tables import finite, lines_of

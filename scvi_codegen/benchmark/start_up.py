@@ -11,9 +11,9 @@ import tempfile
 import time
 from typing import Any
 
-from scvi_codegen import building
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.native import building
 
 __all__ = ["run_start_up"]
 

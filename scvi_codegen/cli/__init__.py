@@ -15,11 +15,11 @@ import click
 from scvi_codegen.cli.choices import Choices, model_arguments, read_model
 
 if TYPE_CHECKING:
-    from scvi_codegen.binding import SolverOptions
     from scvi_codegen.cli.recording import RecordedOutcome
     from scvi_codegen.cli.running import Outcome
-    from scvi_codegen.model_file import Model
-    from scvi_codegen.rendering import Embedded
+    from scvi_codegen.models.model_file import Model
+    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.rendering.text import Embedded
 
 __all__ = ["main"]
 
@@ -186,7 +186,7 @@ def run(
     _check_outputs(output, plot, ensemble)
     _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
-    from scvi_codegen.binding import SolverOptions
+    from scvi_codegen.native.binding import SolverOptions
 
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
@@ -218,7 +218,7 @@ def export(folder: str, output: str | None) -> None:
       scvi-codegen export long.run -o long.csv
     """  # noqa: D301  (click wants the character \b)
     from scvi_codegen.cli.recording import standing
-    from scvi_codegen.recording import load_run
+    from scvi_codegen.results.recording import load_run
 
     if output is not None:
         _check_outputs(output, None, None)
@@ -253,7 +253,7 @@ def generate(model_name: str, output: str, solver: str, force: bool, embedded: E
       python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
     """  # noqa: D301  (click wants the character \b)
     model = read_model(model_name, Choices(**choices))
-    from scvi_codegen.package import generate_package
+    from scvi_codegen.models.package import generate_package
 
     folder = generate_package(model, output, solver=solver, force=force, embedded=embedded)
     click.echo(f"{model.system.name}: {model.method.title}")
@@ -290,7 +290,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
 
         _emit(derivation_html(model.system, model.method), html)
         return
-    from scvi_codegen.equations import derive as derive_equations
+    from scvi_codegen.derivation.equations import derive as derive_equations
 
     equations = derive_equations(model.system, model.method, radicals=radicals)
     _emit(equations.to_latex() if latex else equations.to_text(), output)
@@ -342,8 +342,8 @@ def systems(name: str | None) -> None:
 
         click.echo(systems_table())
     else:
-        from scvi_codegen.model_file import Model, dump_model
-        from scvi_codegen.problems import problem
+        from scvi_codegen.models.model_file import Model, dump_model
+        from scvi_codegen.models.problems import problem
 
         click.echo(dump_model(Model.from_problem(problem(name))), nl=False)
 
@@ -369,7 +369,7 @@ def cache(action: str) -> None:
     Example:
       scvi-codegen cache info
     """  # noqa: D301  (click wants the character \b)
-    from scvi_codegen.cache import cache_folder, cache_info, clear_cache
+    from scvi_codegen.files.cache import cache_folder, cache_info, clear_cache
 
     if action == "clear":
         count = clear_cache()
@@ -487,7 +487,7 @@ def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -
     if plot is not None:
         _check_writable(Path(plot), "'--plot'")
     if plot is not None:
-        from scvi_codegen.plotting import check_plot_path
+        from scvi_codegen.results.plotting import check_plot_path
 
         check_plot_path(plot)
 
@@ -537,7 +537,7 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions) -> None:
     from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
-    from scvi_codegen.ensemble_file import load_ensemble
+    from scvi_codegen.models.ensemble_file import load_ensemble
 
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
     click.echo(ensemble_summary(model, outcome))
@@ -566,7 +566,7 @@ def _write_outputs(outcome: Outcome, output: str | None, plot: str | None) -> li
     if output is not None:
         outcome.trajectory.save(output)
     if plot is not None:
-        from scvi_codegen.plotting import plot_trajectory
+        from scvi_codegen.results.plotting import plot_trajectory
 
         plot_trajectory(outcome.trajectory, plot)
     return [path for path in (output, plot) if path is not None]
@@ -582,7 +582,7 @@ def _emit(text: str, output: str | None) -> None:
     if output is None:
         click.echo(text)
         return
-    from scvi_codegen.files import write_atomically
+    from scvi_codegen.files.atomic import write_atomically
 
     _check_writable(Path(output), "'-o'")
     write_atomically(output, partial(_write, text.rstrip("\n") + "\n"))

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import click
 
-from scvi_codegen.advice import Advice, Evidence, advise
-from scvi_codegen.binding import SolverOptions
+from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.running import duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
-from scvi_codegen.model_file import Model
+from scvi_codegen.models.model_file import Model
+from scvi_codegen.native.binding import SolverOptions
 
 __all__ = ["advised_model"]
 

@@ -14,7 +14,7 @@ import click
 
 if TYPE_CHECKING:
     from scvi_codegen.methods import Method
-    from scvi_codegen.model_file import Model
+    from scvi_codegen.models.model_file import Model
 
 __all__ = ["Choices", "model_arguments", "read_model"]
 
@@ -166,8 +166,8 @@ def read_model(name: str, choices: Choices) -> Model:
 
 def _named_model(name: str) -> Model:
     from scvi_codegen.errors import SystemDefinitionError
-    from scvi_codegen.model_file import Model, load_model
-    from scvi_codegen.problems import PROBLEMS, problem
+    from scvi_codegen.models.model_file import Model, load_model
+    from scvi_codegen.models.problems import PROBLEMS, problem
 
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():

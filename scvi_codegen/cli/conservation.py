@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.ensemble import EnsembleTrajectory
 from scvi_codegen.errors import StateError
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.trajectory import Trajectory
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.runtime.ensemble import EnsembleTrajectory
+from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["energy_report", "momentum_report"]
 

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scvi_codegen.binding import SolverOptions
 from scvi_codegen.cli.conservation import momentum_report
 from scvi_codegen.cli.running import counted, duration, interruptions, progress_bar
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.ensemble import Ensemble, EnsembleTrajectory
-from scvi_codegen.ensemble_file import EnsembleStates
 from scvi_codegen.errors import StateError
-from scvi_codegen.model_file import Model
+from scvi_codegen.models.ensemble_file import EnsembleStates
+from scvi_codegen.models.model_file import Model
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.ensemble import Ensemble, EnsembleTrajectory
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
 

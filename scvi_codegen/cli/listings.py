@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification
-from scvi_codegen.precision import mp
-from scvi_codegen.problems import PROBLEMS
-from scvi_codegen.tableau import exact_tableau, tableau_by_name
+from scvi_codegen.models.problems import PROBLEMS
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.tableau import exact_tableau, tableau_by_name
 
 __all__ = ["methods_table", "systems_table", "tableau_text"]
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from scvi_codegen.binding import SolverOptions
     from scvi_codegen.errors import StepFailedError
-    from scvi_codegen.model_file import Model
-    from scvi_codegen.recording import RecordedRun
-    from scvi_codegen.run import Run
+    from scvi_codegen.models.model_file import Model
+    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.results.recording import RecordedRun
+    from scvi_codegen.runtime.run import Run
 
 __all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "is_folder", "standing"]
 
@@ -34,8 +34,8 @@ def is_folder(output: str) -> bool:
 
 def check_format(output: str, *, ensemble: bool) -> None:
     """Find out whether there is such a kind of file, and its library."""
-    from scvi_codegen.export import WRITERS
-    from scvi_codegen.export import check_format as check
+    from scvi_codegen.files.export import WRITERS
+    from scvi_codegen.files.export import check_format as check
 
     known = (".npz", ".csv") if ensemble else tuple(WRITERS)
     if Path(output).suffix.lower() not in known:
@@ -93,7 +93,7 @@ class RecordedOutcome:
         from numpy import errstate
 
         from scvi_codegen.cli.running import conserved
-        from scvi_codegen.model_file import parse_model
+        from scvi_codegen.models.model_file import parse_model
 
         text = self.recorded.manifest.model
         if text is None or not self.run.steps:
@@ -136,8 +136,8 @@ class Recording:
         """Run a model into a folder, as far as it goes. Raises as :func:`record_run`."""
         from scvi_codegen.compiler import compile_stepper
         from scvi_codegen.errors import ModelFileError
-        from scvi_codegen.model_file import dump_model
-        from scvi_codegen.recording import record_run
+        from scvi_codegen.models.model_file import dump_model
+        from scvi_codegen.results.recording import record_run
 
         text = None
         with suppress(ModelFileError):
@@ -150,7 +150,7 @@ class Recording:
 
     def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
         """Go on with the run in a folder. Raises as :func:`resume_run`."""
-        from scvi_codegen.recording import load_run, resume_run
+        from scvi_codegen.results.recording import load_run, resume_run
 
         if steps is not None and span is not None:
             raise click.UsageError("--span and --steps exclude each other")
@@ -164,7 +164,7 @@ class Recording:
         """With a progress bar, ended by Ctrl-C or SIGTERM at a state that is written."""
         from scvi_codegen.cli.running import interruptions, progress_bar
         from scvi_codegen.errors import StepFailedError
-        from scvi_codegen.recording import load_run
+        from scvi_codegen.results.recording import load_run
 
         pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
         settings |= {name: value for name, value in pace.items() if value is not None}

@@ -11,12 +11,12 @@ from pathlib import Path
 import click
 
 from scvi_codegen.cli.running import counted
-from scvi_codegen.files import write_atomically
-from scvi_codegen.plotting import check_plot_path
-from scvi_codegen.reproduce.experiment import Experiment, Result
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
 from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_experiments, with_needs
 from scvi_codegen.reproduce.writing import write_result
+from scvi_codegen.results.plotting import check_plot_path
 
 __all__ = ["EVERYTHING", "Reproduction", "experiments_table", "reproduce_experiments"]
 

@@ -9,9 +9,9 @@ import click
 from scvi_codegen.cli.choices import Choices, read_model
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PackageError
-from scvi_codegen.model_file import Model
-from scvi_codegen.package import load_package
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.package import load_package
+from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification import Certificate, verify
 
 __all__ = ["certificate_path", "verified"]

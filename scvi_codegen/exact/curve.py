@@ -1,4 +1,4 @@
-"""Collocation of the Euler-Lagrange equations (2) at many Gauss points in 60 digits, for :mod:`scvi_codegen.exact`.
+"""Collocation of the Euler-Lagrange equations (2) at many Gauss points in 60 digits.
 
 A step is divided into equal pieces with n Gauss points each. The unknowns are the velocity v0 at the start and
 z = h (acceleration) at every point; velocities and positions follow by integration of the interpolating polynomials,
@@ -15,12 +15,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from scvi_codegen.basis import cardinal_integrals
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.mechanics import Mechanics
 from scvi_codegen.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
-from scvi_codegen.precision import Number, mp
-from scvi_codegen.quadrature import gauss_legendre
+from scvi_codegen.tables.basis import cardinal_integrals
+from scvi_codegen.tables.precision import Number, mp
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = ["Curve", "Grid"]
 

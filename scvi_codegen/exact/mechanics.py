@@ -9,12 +9,12 @@ from typing import Any, TypeAlias
 import numpy as np
 import sympy
 
-from scvi_codegen.derivatives import jacobian
 from scvi_codegen.exact.newton import Array, Floats, Solve, newton, solver
-from scvi_codegen.expression_text import evaluate
-from scvi_codegen.mechanics import accelerations, euler_lagrange, mass_entries, momentum
-from scvi_codegen.precision import Number, mp
-from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.mechanics.forms import accelerations, euler_lagrange, mass_entries, momentum
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["Mechanics"]
 

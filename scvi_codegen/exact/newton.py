@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.precision import Number, mp
+from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["Array", "Floats", "NotConvergedError", "Solve", "inverse", "largest", "newton", "scaled", "solver"]
 

@@ -19,11 +19,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from scvi_codegen import tableau as tableaux
-from scvi_codegen.basis import differentiation_matrix, extrapolation, identity_matrix, matrix_product
+from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import accelerations, euler_lagrange, momentum
+from scvi_codegen.mechanics.forms import accelerations, euler_lagrange, momentum
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import (
     EXTRAPOLATION_DEGREE,
     galerkin_system,
@@ -31,11 +30,12 @@ from scvi_codegen.methods.galerkin import (
     resolve_nodes,
 )
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters
-from scvi_codegen.nodes import Nodes
-from scvi_codegen.number_tables import Part
-from scvi_codegen.precision import Matrix, Number, Vector, mp
-from scvi_codegen.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
-from scvi_codegen.tableau import Tableau
+from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.tables import tableau as tableaux
+from scvi_codegen.tables.basis import differentiation_matrix, extrapolation, identity_matrix, matrix_product
+from scvi_codegen.tables.nodes import Nodes
+from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.tableau import Tableau
 
 __all__ = [
     "ChebyshevGauss",

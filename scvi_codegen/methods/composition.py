@@ -13,14 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from scvi_codegen.basis import identity_matrix
 from scvi_codegen.errors import MethodError
-from scvi_codegen.hamiltonian import lagrangian_twin
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import force, is_separable, momentum
+from scvi_codegen.mechanics.forms import force, is_separable, momentum
+from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method, Specification
-from scvi_codegen.precision import Vector, mp
-from scvi_codegen.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.tables.basis import identity_matrix
+from scvi_codegen.tables.precision import Vector, mp
 
 __all__ = ["Composition", "kicks_and_drifts"]
 

@@ -7,8 +7,8 @@ The discrete Lagrangian is the quadrature of L along a polynomial curve of degre
 made stationary in the interior coefficients (26a); p0 = -D_1 L_d and p1 = D_{s+1} L_d (27). The step depends on the
 degree and the quadrature alone: the nodes parametrise the same polynomials. Compiled, the curve is therefore given by
 the values V_b of its velocity at s points, whatever the nodes: Q = q0 + h sum_b a_nb V_b. Nothing else changes where
-the curves are not polynomials (:mod:`scvi_codegen.spaces`), or where the quadrature uses derivatives of the integrand:
-then dL/dt = L_q v + L_v a + L_t along the curve is summed, too (paper, 4.2.3).
+the curves are not polynomials (:mod:`scvi_codegen.tables.spaces`), or where the quadrature uses derivatives of the
+integrand: then dL/dt = L_q v + L_v a + L_t along the curve is summed, too (paper, 4.2.3).
 """
 
 from __future__ import annotations
@@ -18,17 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from scvi_codegen.basis import cardinal_slopes, cardinal_values, extrapolation, identity_matrix
+from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError, MethodWarning
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import curve_rates, lagrangian_rates
+from scvi_codegen.mechanics.forms import curve_rates, lagrangian_rates
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method, Specification, check_count, unit_sum
-from scvi_codegen.nodes import Nodes, nodes_by_name
-from scvi_codegen.number_tables import Part
-from scvi_codegen.precision import Matrix, Vector, mp
-from scvi_codegen.quadrature import Quadrature, gauss_legendre, quadrature_by_name
-from scvi_codegen.spaces import CurveSpace, Polynomials, space_by_name
-from scvi_codegen.stage_system import (
+from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
     Row,
@@ -39,7 +34,12 @@ from scvi_codegen.stage_system import (
     stationary_increments,
     stationary_nodal,
 )
-from scvi_codegen.tableau import lobatto_iiia
+from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values, extrapolation, identity_matrix
+from scvi_codegen.tables.nodes import Nodes, nodes_by_name
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre, quadrature_by_name
+from scvi_codegen.tables.spaces import CurveSpace, Polynomials, space_by_name
+from scvi_codegen.tables.tableau import lobatto_iiia
 
 __all__ = [
     "SVI",

@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 
 import sympy
 
-from scvi_codegen.cards import card, plain
+from scvi_codegen.display.cards import card, plain
+from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
-from scvi_codegen.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import force, momentum
-from scvi_codegen.number_tables import Part, number_table, numbers_html
-from scvi_codegen.precision import Number, Vector, mp
-from scvi_codegen.stage_system import PointFamily, Scatter, StageSystem, dyadic
-from scvi_codegen.tableau import MOST_STAGES
+from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import PointFamily, Scatter, StageSystem, dyadic
+from scvi_codegen.tables.precision import Number, Vector, mp
+from scvi_codegen.tables.tableau import MOST_STAGES
 
 __all__ = ["Method", "Specification", "check_count", "check_regular", "lagrangian_scatters", "unit_sum"]
 

@@ -19,10 +19,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from scvi_codegen.basis import cardinal_integrals, cardinal_slopes, cardinal_values, matrix_product
+from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import multiplied_residual, multipliers
+from scvi_codegen.mechanics.forms import multiplied_residual, multipliers
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import (
     acceleration_extrapolation,
     acceleration_gathers,
@@ -33,11 +33,7 @@ from scvi_codegen.methods.collocation import (
 )
 from scvi_codegen.methods.galerkin import SVI, nodal_quadrature_family, resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters, unit_sum
-from scvi_codegen.nodes import Nodes
-from scvi_codegen.number_tables import Part
-from scvi_codegen.precision import Matrix, Vector, mp
-from scvi_codegen.quadrature import Quadrature
-from scvi_codegen.stage_system import (
+from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
     PointFamily,
@@ -50,7 +46,11 @@ from scvi_codegen.stage_system import (
     stationary_increments,
     stationary_nodal,
 )
-from scvi_codegen.tableau import Tableau, collocation_tableau, tableau_by_name
+from scvi_codegen.tables.basis import cardinal_integrals, cardinal_slopes, cardinal_values, matrix_product
+from scvi_codegen.tables.nodes import Nodes
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import Tableau, collocation_tableau, tableau_by_name
 
 __all__ = ["SCVI"]
 

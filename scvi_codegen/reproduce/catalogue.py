@@ -4,25 +4,12 @@ from __future__ import annotations
 
 from itertools import chain
 
-from scvi_codegen.reproduce import (
-    claims,
-    correction,
-    costs,
-    duffing,
-    iterations,
-    kepler,
-    kepler_shooting,
-    oscillator,
-    oscillator_orders,
-    outlines,
-    overview,
-    pendulum,
-    properties,
-    tableaux,
-    theorems,
-    two_point,
-)
-from scvi_codegen.reproduce.experiment import Experiment
+from scvi_codegen.reproduce import claims, theorems
+from scvi_codegen.reproduce.correction import experiment as correction
+from scvi_codegen.reproduce.kepler import figures_13_to_20, figures_23_to_30, overview
+from scvi_codegen.reproduce.laboratory.experiment import Experiment
+from scvi_codegen.reproduce.oscillators import duffing, oscillator, oscillator_orders, pendulum, two_point_pendulum
+from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
 
 __all__ = ["EXPERIMENTS"]
 
@@ -36,8 +23,8 @@ ORDER = """
     correction claims
 """
 MODULES = (
-    *(overview, oscillator, oscillator_orders, pendulum, duffing, kepler, kepler_shooting, correction),
-    *(tableaux, properties, outlines, costs, iterations, two_point, theorems, claims),
+    *(overview, oscillator, oscillator_orders, pendulum, duffing, figures_13_to_20, figures_23_to_30, correction),
+    *(tableaux, properties, outlines, costs, iterations, two_point_pendulum, theorems, claims),
 )
 
 

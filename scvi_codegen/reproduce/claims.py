@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from scvi_codegen.reproduce.experiment import (
+from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
     Check,
     Experiment,

@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 from markupsafe import Markup
 
-from scvi_codegen.page.typesetting import SPACE
+from scvi_codegen.display.page.typesetting import SPACE
 
 __all__ = ["label", "linked"]
 

@@ -20,8 +20,8 @@ from multiprocessing.context import SpawnProcess
 from typing import TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError
-from scvi_codegen.expression_text import closest
-from scvi_codegen.reproduce.experiment import Experiment, Result
+from scvi_codegen.formulas.grammar import closest
+from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
 
 __all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]
 

@@ -8,9 +8,9 @@ import textwrap
 from pathlib import Path
 from typing import IO
 
-from scvi_codegen.files import write_atomically
-from scvi_codegen.reproduce.drawing import STYLE
-from scvi_codegen.reproduce.experiment import Block, Formula, Listing, Paragraph, Picture, Result, Table
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.reproduce.laboratory.drawing import STYLE
+from scvi_codegen.reproduce.laboratory.experiment import Block, Formula, Listing, Paragraph, Picture, Result, Table
 
 __all__ = ["csv_text", "draw", "statement", "write_result"]
 

@@ -1,8 +1,8 @@
 """The certificate of an integrator: what it promises, measured of it as it was built.
 
 Three independent paths meet. The *compiled* step is held against the paper's equations solved in 60 digits
-(:mod:`scvi_codegen.derived_step`) and, for its structure, against finite differences of itself. *Those digits* are held
-against the exact motion, which comes from the formula of L or H alone (:mod:`scvi_codegen.exact_motion`), and against
+(:mod:`scvi_codegen.exact.step`) and, for its structure, against finite differences of itself. *Those digits* are held
+against the exact motion, which comes from the formula of L or H alone (:mod:`scvi_codegen.exact.motion`), and against
 other methods that must be the same map. A fault of the printing, the tables, a kernel or a solver shows on the first
 path; one of the derivation, which both would share, on the second.
 
@@ -19,13 +19,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.building import TUNED_FLAGS
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.identities import identity_checks

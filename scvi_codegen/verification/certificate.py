@@ -13,7 +13,7 @@ from functools import partial
 from typing import IO, Any, NamedTuple
 
 from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
-from scvi_codegen.files import write_atomically
+from scvi_codegen.files.atomic import write_atomically
 
 __all__ = ["BrokenError", "Certificate", "Check", "Finding", "Outcome", "checked", "information"]
 

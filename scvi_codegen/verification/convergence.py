@@ -11,12 +11,12 @@ from functools import partial
 from typing import Any
 
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.exact_motion import Numbers
+from scvi_codegen.exact.motion import Numbers
 from scvi_codegen.methods import method_from_specification
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.precision import Number, mp
-from scvi_codegen.spaces import Trigonometric
+from scvi_codegen.tables.precision import Number, mp
+from scvi_codegen.tables.spaces import Trigonometric
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
 from scvi_codegen.verification.subject import State, Subject
 

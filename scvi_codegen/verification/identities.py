@@ -8,21 +8,28 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.derived_step import derived_step
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact_motion import motion_of, numbers
-from scvi_codegen.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
-from scvi_codegen.mechanical_system import MechanicalSystem
-from scvi_codegen.mechanics import is_separable
+from scvi_codegen.exact.motion import motion_of, numbers
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.mechanics.forms import is_separable
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import CollocationRK, Gauss, RungeKutta, SpectralCollocation
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.precision import mp
-from scvi_codegen.quadrature import Quadrature, clenshaw_curtis, fejer, gauss_legendre, gauss_lobatto, gauss_radau
-from scvi_codegen.spaces import Polynomials, Trigonometric
-from scvi_codegen.system import LagrangianSystem
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.quadrature import (
+    Quadrature,
+    clenshaw_curtis,
+    fejer,
+    gauss_legendre,
+    gauss_lobatto,
+    gauss_radau,
+)
+from scvi_codegen.tables.spaces import Polynomials, Trigonometric
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.subject import Subject
 

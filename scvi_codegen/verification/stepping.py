@@ -8,12 +8,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.binding import SolverOptions
-from scvi_codegen.derived_step import SolvedStep, compiled_equations
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.exact_motion import Numbers, numbers
-from scvi_codegen.precision import mp
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.exact.motion import Numbers, numbers
+from scvi_codegen.exact.step import SolvedStep, compiled_equations
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
 from scvi_codegen.verification.linearisation import WEIGHTS
 from scvi_codegen.verification.subject import LARGEST, State, Subject

@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.binding import SolverOptions
-from scvi_codegen.derived_step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.exact_motion import Motion, motion_of
-from scvi_codegen.mechanical_system import MechanicalSystem
+from scvi_codegen.exact.motion import Motion, motion_of
+from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.stepper import Stepper
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.linearisation import Linearised, linearised
 
 __all__ = ["EPSILON", "State", "Subject"]

@@ -1,0 +1,314 @@
+"""Which step (and which degree) for a wanted error: the longest that a short pilot says will do, with its evidence.
+
+Steps are halved until the error at the end is small enough, as the pilot predicts it
+(:mod:`scvi_codegen.advice.pilot`); between the two lengths that enclose it the answer is bisected, so that the step
+advised was tried, not only fitted. Methods of low order may need steps too short to try: their number follows from the
+order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import takewhile
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+
+from scvi_codegen.advice.pilot import STEEP, Pilot, launch
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
+from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["Advice", "Evidence", "advise"]
+
+DEGREES = (2, 4, 6, 8, 10, 12)
+SAFETY = 2.0
+"""The error aimed at is the tolerance divided by this."""
+CLOSE = 1.5
+"""Bisection ends where the errors of neighbours differ by this factor."""
+ORDER_MARGIN = 0.3
+LANES = 8
+OVERHEAD = 3.0
+"""Cost of a step beside its iterations, in iterations."""
+MUCH_LESS = 0.9
+"""Part of the work by which a shorter step is preferred to the longest."""
+NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
+"""Positions at points of steps in one pilot run, as far as that makes neither fewer nor more steps than these."""
+
+
+class Evidence(NamedTuple):
+    """One pilot run.
+
+    Attributes:
+        h: its step size.
+        error: estimate of the error at the end of the span; infinite where a step failed.
+        iterations: of the solver at each step.
+        seconds: time taken for a unit of time of the motion.
+    """
+
+    h: float
+    error: float
+    iterations: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Advice:
+    """A step size and why.
+
+    Attributes:
+        h: step size, ``span / steps``; negative for a span backward.
+        steps: number of steps.
+        degree: degree or number of stages of ``method``, ``None`` if it has none.
+        method: the method advised: that asked about, or the one of the best degree.
+        expected_error: of the positions at the end, relative to their size.
+        evidence: the pilot runs of ``method``, the longest steps first.
+        message: the advice in a few sentences.
+        warnings: what may not be as wished; empty if all is well.
+    """
+
+    h: float
+    steps: int
+    degree: int | None
+    method: Method
+    expected_error: float
+    evidence: tuple[Evidence, ...]
+    message: str
+    warnings: tuple[str, ...]
+
+
+def advise(
+    system: MechanicalSystem,
+    method: Method,
+    q: ArrayLike,
+    p: ArrayLike,
+    span: float,
+    tolerance: float,
+    *,
+    parameters: Mapping[str, float] | Sequence[float] | None = None,
+    t: float = 0.0,
+    degree: bool = False,
+    solver: str = "auto",
+    options: SolverOptions | None = None,
+) -> Advice:
+    """The longest step with which the positions at the end of a run are as right as wished.
+
+    Where shorter ones need less work in all (near the limit of the fixed point), it is one of them.
+
+    The step is one number for the whole run: a symplectic method whose step follows the motion is symplectic no longer,
+    and its energy drifts. Motions with rare violent moments (a close encounter) therefore need the small step of these
+    moments all the time; a pilot that ends before them does not know of them.
+
+    Args:
+        system: what moves.
+        method: how its motion is discretised.
+        q, p: (m,) initial positions and momenta.
+        span: length of time of the run, negative to go back.
+        tolerance: wanted error |q - q_exact| / |q| at the end; half of it is aimed at.
+        parameters: by name (others keep their defaults) or all in order.
+        t: initial time.
+        degree: choose the degree (or number of stages) among 2, 4, ..., 12 too, the one with the fewest evaluations in
+            full vector registers of 8 points.
+        solver, options: of the stage equations, as of ``compile_stepper`` and of the run.
+
+    Returns:
+        The advice, the same for the same question. It has warnings if the tolerance cannot be met (round-off, chaos),
+        or if that is not certain.
+
+    Raises:
+        StateError: on wrong shapes, names or numbers, or if every pilot run fails.
+        MethodError: if the degree is to be chosen of a method that has none.
+        BuildError: without a C compiler.
+    """
+    length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
+    if length == 0.0:
+        raise StateError("the span is 0")
+    if target <= 0.0:
+        raise StateError(f"the tolerance must be positive, not {tolerance!r}")
+    state = {"p": p, "t": t, "parameters": parameters, "options": options}
+    found: list[tuple[float, Advice]] = []
+    failures: list[StateError] = []
+    for candidate in _candidates(method) if degree else [method]:
+        for stepper in _steppers(system, candidate, solver):
+            try:
+                found.append(_advised(stepper, candidate, q, state, length, target))
+            except StateError as failure:
+                failures.append(failure)
+                continue
+            if found[-1][1].expected_error <= target:
+                break
+    if not found:
+        raise failures[-1]
+    met = [pair for pair in found if pair[1].expected_error <= target]
+    return min(met, key=lambda pair: pair[0])[1] if met else min(found, key=lambda pair: pair[1].expected_error)[1]
+
+
+def _advised(
+    stepper: Stepper, method: Method, q: ArrayLike, state: Mapping[str, Any], span: float, tolerance: float
+) -> tuple[float, Advice]:
+    """What pilot runs of one stepper advise, and what a unit of time costs then."""
+    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks them
+    points = _points(method)
+    most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
+    pilot = launch(partial(stepper.integrate, **state), method, start, span, goal=tolerance / SAFETY, most=most)
+    choice = _choose(pilot, tolerance)
+    return _cost(pilot, choice.n, points), _advice(pilot, choice, method)
+
+
+def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Stepper]:
+    """That asked for; but for ``"auto"`` first the fixed point alone, whose limit of h a good step should keep to."""
+    if solver == "auto":
+        with suppress(MethodError):
+            yield compile_stepper(system, method, solver="fixed-point")
+    yield compile_stepper(system, method, solver=solver)
+
+
+def _candidates(method: Method) -> list[Method]:
+    """The method with each degree."""
+    specification = dict(method.specification())
+    sized = [name for name in ("degree", "stages") if name in ARGUMENTS[str(specification["method"])]]
+    if not sized:
+        raise MethodError(f"{method.name} has no degree to choose")
+    if specification.get("quadrature") == f"gauss-legendre:{specification.get('degree')}":
+        del specification["quadrature"]  # the default of its degree: each degree has its own
+    return [method_from_specification(specification | {sized[0]: number}) for number in DEGREES]
+
+
+def _points(method: Method) -> int:
+    """Number of places on a step where the Lagrangian is evaluated, the same for every system."""
+    simplest = LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
+    return sum(len(family.abscissae) for family in method.stage_system(simplest).families)
+
+
+def _cost(pilot: Pilot, n: float, points: int) -> float:
+    """Evaluations in full registers of points, for a unit of time."""
+    nearest = min(pilot.good, key=lambda k: abs(math.log(k / n)))
+    return (pilot.legs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES / pilot.step(n)
+
+
+class _Choice(NamedTuple):
+    """A number of steps for the length of the pilot, its error at the end of the span, doubts."""
+
+    n: float
+    error: float
+    warnings: tuple[str, ...] = ()
+    tried: bool = True
+
+
+def _choose(pilot: Pilot, tolerance: float) -> _Choice:
+    """The longest step that meets the tolerance, or that rounding makes as good as any shorter one."""
+    floor, (coarse, fine) = pilot.floor_at_end, pilot.judged[-2:]
+    goal = max(tolerance / SAFETY, 2.0 * floor)
+    n = _cheapest(pilot, _bisected(pilot, goal))
+    if n is not None or (pilot.rate and floor > tolerance):
+        n = n or fine
+        return _Choice(n, min(1.0, pilot.error(n)), tuple(_doubts(pilot, tolerance, n)))
+    doubts = tuple(_doubts(pilot, tolerance, fine))
+    missed, ratio = pilot.error(fine) / goal, pilot.error(coarse) / pilot.error(fine)
+    if ratio > 1.0 and abs(math.log(ratio, fine / coarse) - pilot.order) <= ORDER_MARGIN * pilot.order:
+        return _Choice(fine * missed ** (1.0 / pilot.order), goal, doubts, tried=False)
+    words = (
+        f"the tolerance cannot be promised: the errors of runs with steps down to {pilot.step(pilot.finest):.3g} "
+        "do not follow the order of the method yet"
+    )
+    return _Choice(fine, min(1.0, pilot.error(fine)), (*doubts, words))
+
+
+def _doubts(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
+    """What may spoil the promise, or does."""
+    floor = pilot.floor_at_end
+    if pilot.rate:
+        tenfold = math.log(10.0) / pilot.rate
+        chaos = f"nearby motions part by a factor of 10 every {tenfold:.3g} units of time (chaos)"
+        if floor <= tolerance:
+            yield f"{chaos}, and how fast later is not certain"
+            return
+        yield f"the tolerance cannot be met: {chaos}, so rounding alone spoils it"
+        digits = math.log10(tolerance / max(pilot.late_error(n), 2.0**-52))
+        kept = max(0.0, abs(pilot.length) + digits * tenfold)
+        yield f"the step given keeps to it for about {kept:.3g} units of time"
+    elif floor > tolerance / SAFETY:
+        yield f"rounding alone leaves an error of about {floor:.1g} at the end, whatever the step"
+    elif not pilot.whole and pilot.growth > STEEP:
+        yield f"errors grew like t^{pilot.growth:.1f} in the pilot runs, which cannot be relied upon to go on so"
+
+
+def _bisected(pilot: Pilot, goal: float) -> int | None:
+    """The fewest steps that meet the goal as all more do; ``None`` if the finest run judged does not."""
+    fits = list(takewhile(lambda n: pilot.error(n) <= goal, reversed(pilot.judged)))
+    if not fits:
+        return None
+    best, worse = fits[-1], max((n for n in pilot.legs if n < fits[-1]), default=0)
+    while worse and best / worse > CLOSE ** (1.0 / pilot.order):
+        middle = _sampled(math.sqrt(worse * best))
+        if not worse < middle < best:
+            break
+        pilot.run(middle)
+        worse, best = (worse, middle) if pilot.error(middle) <= goal else (middle, best)
+    return best
+
+
+def _cheapest(pilot: Pilot, n: int | None) -> int | None:
+    """n, or more steps that need much less work: near the limit of the fixed point a step needs many sweeps."""
+    if n is None:
+        return None
+    work = {k: k * (pilot.legs[k].iterations + OVERHEAD) for k in pilot.judged if k >= n}
+    best = min(work, key=work.__getitem__)
+    return best if work[best] < MUCH_LESS * work[n] else n
+
+
+def _sampled(n: float) -> int:
+    """A number of steps near n that is a multiple of a power of 2, so that a run has states in common with others."""
+    unit = 1 << min(6, max(0, int(n).bit_length() - 6))
+    return math.ceil(n / unit) * unit
+
+
+def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
+    """All of it, in numbers and words."""
+    steps = max(1, math.ceil(choice.n * (pilot.span / pilot.length) * (1.0 - 1e-12)))
+    specification = method.specification()
+    degree = specification.get("degree", specification.get("stages"))
+    told = sorted(n for n, leg in pilot.legs.items() if n in pilot.judged or leg.failure)
+    legs = [(n, pilot.legs[n]) for n in told]
+    return Advice(
+        h=pilot.span / steps,
+        steps=steps,
+        degree=degree if isinstance(degree, int) else None,
+        method=method,
+        expected_error=choice.error,
+        evidence=tuple(
+            Evidence(pilot.length / n, pilot.error(n), leg.iterations, leg.seconds / abs(pilot.length))
+            for n, leg in legs
+        ),
+        message=" ".join(_sentences(pilot, choice, method, steps)),
+        warnings=choice.warnings,
+    )
+
+
+def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int) -> Iterator[str]:
+    yield f"{steps} steps of {pilot.span / steps:.6g} by {method.name}, for an expected error of {choice.error:.1g}."
+    if pilot.whole:
+        yield "The pilot runs covered the whole span."
+    else:
+        growth = "exponentially" if pilot.rate else f"like t^{pilot.growth:.1f}"
+        yield f"The pilot runs covered {pilot.length:.4g} of {pilot.span:.4g}, where errors grew {growth}."
+    if not choice.tried:
+        yield f"So short a step was not tried: the error follows order {pilot.order}."
+    failing = [n for n, leg in pilot.legs.items() if leg.failure]
+    if failing:
+        n = max(failing)
+        yield f"A step of {pilot.step(n):.3g} is far too large for the solver: {pilot.legs[n].failure}."
+    useless = [n for n in pilot.judged if pilot.error(n) >= 1.0]
+    if useless and len(useless) < len(pilot.judged):
+        yield f"With a step of {pilot.step(max(useless)):.3g} no digit is right."
+    if method.symplectic:
+        yield "The step is to stay fixed, which keeps the method symplectic."

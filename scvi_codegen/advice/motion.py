@@ -1,0 +1,173 @@
+"""A motion by one call, with the result that ``scipy.integrate.solve_ivp`` taught everyone to read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.advice.advice import advise
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import SVI, Method
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.dense_output import times_of_run
+from scvi_codegen.runtime.events import EventLike
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["Motion", "solve_motion"]
+
+Array = NDArray[np.float64]
+Solution: TypeAlias = Callable[[ArrayLike], Array]
+REACHED, EVENT, FAILED = 0, 1, -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motion:
+    """What :func:`solve_motion` returns; y is (q, p), positions and then momenta.
+
+    Attributes:
+        t: (n,) times.
+        y: (2 m, n) states.
+        sol: from times to states, (2 m,) of a number and (2 m, n) of n times; ``None`` without ``dense_output``.
+        t_events: (k,) times of the crossings of each event, ``None`` without events.
+        y_events: (k, 2 m) states there.
+        status: 0 the end of the span, 1 a terminal event, -1 a step failed.
+        message: the same in words.
+        success: whether the status is not negative.
+        trajectory: the states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies.
+    """
+
+    t: Array
+    y: Array
+    sol: Solution | None
+    t_events: list[Array] | None
+    y_events: list[Array] | None
+    status: int
+    message: str
+    trajectory: Trajectory
+
+    @property
+    def success(self) -> bool:
+        """Whether the end of the span or a terminal event was reached."""
+        return self.status >= 0
+
+
+def solve_motion(
+    system: MechanicalSystem | Stepper,
+    t_span: Sequence[float],
+    y0: ArrayLike,
+    *,
+    method: Method | None = None,
+    h: float | None = None,
+    tolerance: float = 1e-9,
+    t_eval: ArrayLike | None = None,
+    dense_output: bool = False,
+    events: EventLike | Sequence[EventLike] | None = None,
+    parameters: Mapping[str, float] | Sequence[float] | None = None,
+    options: SolverOptions | None = None,
+) -> Motion:
+    """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, for a run backward) with steps of one length.
+
+    Args:
+        system: what moves; or its compiled stepper, which takes the place of ``method`` and needs ``h``.
+        t_span: two times.
+        y0: (2 m,) initial positions, then momenta (:meth:`Stepper.momentum` gives them from velocities).
+        method: by default ``SVI(8)``.
+        h: longest step, taken a little shorter so that whole steps fill the span; by default :func:`advise` chooses it.
+        tolerance: the error |q - q_exact| / |q| at the end that it then aims at.
+        t_eval: (n,) times at which states are wanted; by default the ends of the steps.
+        dense_output: whether ``sol`` is wanted, for which all steps are kept.
+        events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
+        parameters, options: as of :meth:`Stepper.integrate`.
+
+    Raises:
+        StateError, EventError: on wrong shapes, names or numbers.
+    """
+    start, end = _span(t_span)
+    q, p = _halves(y0)
+    if isinstance(system, Stepper):
+        if method is not None or h is None:
+            raise StateError("a compiled stepper has its method, and its step h must be given")
+        stepper = system
+    else:
+        method = method or SVI(8)
+        stepper = compile_stepper(system, method)
+        if h is None:
+            advice = advise(
+                system, method, q, p, end - start, tolerance, t=start, parameters=parameters, options=options
+            )
+            h = advice.h
+    steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
+    h = (end - start) / steps
+    asked = None if t_eval is None else times_of_run(t_eval, start, h, steps)
+    status, message, failure = REACHED, "The end of the span was reached.", None
+    try:
+        trajectory = stepper.integrate(
+            q,
+            p,
+            h=h,
+            steps=steps,
+            t=start,
+            parameters=parameters,
+            options=options,
+            events=events,
+            t_eval=None if dense_output else asked,
+        )
+    except StepFailedError as error:
+        status, message, trajectory, failure = FAILED, str(error), error.recorded, error
+    ended_by = trajectory.ended_by
+    if ended_by is not None and failure is None:
+        status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
+    return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
+
+
+def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, status: int, message: str) -> Motion:
+    t, y = trajectory.t, np.hstack([trajectory.q, trajectory.p]).T
+    if asked is not None:
+        t = asked[(asked - trajectory.t[-1]) * trajectory.h <= 0.0]
+        y = _states(trajectory, t)
+    found = trajectory.events
+    return Motion(
+        t=t,
+        y=y,
+        sol=(lambda times: _states(trajectory, times)) if dense_output else None,
+        t_events=[crossings.t for crossings in found] if found else None,
+        y_events=[np.hstack([crossings.q, crossings.p]) for crossings in found] if found else None,
+        status=status,
+        message=message,
+        trajectory=trajectory,
+    )
+
+
+def _states(trajectory: Trajectory, t: ArrayLike) -> Array:
+    """(2 m,) or (2 m, n)."""
+    return np.concatenate([half.T for half in trajectory.at(t)])
+
+
+def _span(t_span: Sequence[float]) -> tuple[float, float]:
+    try:
+        start, end = t_span
+    except (TypeError, ValueError) as error:
+        raise StateError(f"t_span is two times, not {t_span!r}") from error
+    start, end = checked_number(start, "t_span[0]"), checked_number(end, "t_span[1]")
+    if start == end:
+        raise StateError(f"t_span begins and ends at {start:g}: there is nothing to integrate")
+    return start, end
+
+
+def _halves(y0: ArrayLike) -> tuple[Array, Array]:
+    try:
+        y = np.array(y0, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise StateError(f"y0 must be real numbers: {error}") from error
+    if y.ndim != 1 or y.size % 2:
+        raise StateError(f"y0 is 2 m numbers, positions and then momenta, not an array of shape {y.shape}")
+    return y[: y.size // 2], y[y.size // 2 :]

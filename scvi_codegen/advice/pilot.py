@@ -1,0 +1,244 @@
+"""Pilot runs: a motion with steps of several lengths, each judged by the run with the shortest.
+
+A pilot covers the whole span or a quarter, a sixteenth, ... of it, the longest part that a few thousand steps resolve.
+It grows from a moment to that length, and steps grow with it, so that none is ever trusted that is far too long. Errors
+at the end of the span are those at the end of the pilot, extrapolated by the growth seen there, linear or quadratic in
+time; or exponentially, if two runs from nearly the same state part so (chaos).
+
+Error means |q - q_exact| / |q| with Euclidean norms over all coordinates; |q| is the root mean square over the later
+half of the pilot.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.methods import Method
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["Leg", "Pilot", "launch"]
+
+Array = NDArray[np.float64]
+Integrate = Callable[..., Trajectory]
+
+SAMPLES = 64
+"""States of each run that are compared."""
+RESOLVED, DUST = 0.01, 1e-9
+"""Errors above the one do not follow a power of the step yet, errors below the other need not."""
+CUT, MOST_CUTS = 4, 20
+SEARCH = 16
+"""The length of the pilot is found with so many times fewer steps than a run may have."""
+STEEP, NEARLY_LINEAR, ROUNDING = 2.5, 1.35, 1.5
+"""Powers of time: above the first distances of motions grow exponentially, below the second errors of a symplectic
+method grow linearly; the third is that of positions whose energy is changed at random by every step."""
+NUDGE = 1e-9
+"""Relative change of the initial positions whose growth tells chaos."""
+EARLY, LATE = 0.38, 0.76
+"""Times, in parts of the pilot, at which a steadily growing error has its root mean square over the second quarter and
+over the second half."""
+
+
+class Leg(NamedTuple):
+    """One run: (samples, m) positions at equal distances, iterations a step, seconds, why a step failed or ``""``."""
+
+    q: Array
+    iterations: float
+    seconds: float
+    failure: str = ""
+
+
+def launch(integrate: Integrate, method: Method, q: Array, span: float, *, goal: float, most: int) -> Pilot:
+    """The pilot over the longest part of the span that can be resolved, down to steps with errors below the goal.
+
+    Args:
+        integrate: ``Stepper.integrate``, to be called with q, h, steps and every.
+        method: of the stepper.
+        q: (m,) initial positions.
+        span: length of time, not 0; negative to go back.
+        goal: error at the end of the span.
+        most: steps of any run.
+
+    Raises:
+        StateError: if the motion seems to end, or is not to be resolved from the first moment.
+    """
+    pilot, first = None, 1
+    for cuts in range(MOST_CUTS, -1, -1):
+        longer = Pilot(integrate, method, q, span, span / CUT**cuts)
+        longer.resolve(first, most // SEARCH)
+        if not longer.resolved:
+            break
+        pilot, first = longer, max(1, longer.finest // CUT)
+    h, failure = longer.step(longer.finest), longer.legs[longer.finest].failure
+    if pilot is None or (failure and CUT * h < pilot.step(pilot.finest)):
+        raise StateError(
+            f"no run over {longer.length:.3g} succeeds, with steps down to {h:.3g}: "
+            "the motion may end in a singularity; try a shorter span"
+        )
+    if not pilot.whole:
+        pilot.rate = pilot.rate_of_parting(most // SEARCH)
+    pilot.complete(goal, most)
+    return pilot
+
+
+class Pilot:
+    """Runs over ``length``, the beginning of ``span``, each known by its number n of steps.
+
+    Errors are extrapolated with ``rate``, that of their exponential growth, if it is not 0.
+    """
+
+    def __init__(self, integrate: Integrate, method: Method, q: Array, span: float, length: float) -> None:
+        self.integrate, self.q, self.span, self.length, self.rate = integrate, q, span, length, 0.0
+        self.order, self.symplectic = method.order or 1, method.symplectic
+        self.legs: dict[int, Leg] = {}
+
+    @property
+    def whole(self) -> bool:
+        """Whether the runs cover the span, so that nothing is extrapolated in time."""
+        return self.length == self.span
+
+    @property
+    def good(self) -> list[int]:
+        """Runs without a failure, the longest steps first."""
+        return sorted(n for n, leg in self.legs.items() if not leg.failure)
+
+    @property
+    def judged(self) -> list[int]:
+        """All of them but the finest, by which they are judged."""
+        return self.good[:-1]
+
+    @property
+    def finest(self) -> int:
+        """The run with the shortest steps, good or not."""
+        return max(self.legs)
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the errors of the last two runs judged are small, and fall."""
+        if len(self.judged) < 2:
+            return False
+        coarse, fine = map(self.late_error, self.judged[-2:])
+        return coarse < RESOLVED and fine <= max(coarse, DUST)
+
+    @property
+    def floor(self) -> float:
+        """Error of the pilot below which shorter steps do not lead, 0 if the runs do not show it."""
+        errors = [self.late_error(n) for n in self._halved()][-3:]
+        falls = max(0.5, 2.0 ** (-0.3 * self.order))
+        levelled = [fine > coarse * falls for coarse, fine in pairwise(errors)]
+        shown = levelled == [True, True] or (levelled[-1:] == [True] and errors[-1] < DUST)
+        return errors[-1] if shown else 0.0
+
+    @property
+    def growth(self) -> float:
+        """Power of time with which errors grow, of the coarsest resolved runs, which show more than rounding."""
+        return float(np.median([_power(self._errors(n)) for n in self._halved()[:3]]))
+
+    @property
+    def floor_at_end(self) -> float:
+        """What rounding makes of any step at the end of the span, 0 if the runs do not show it."""
+        if self.rate:
+            return self._exploded(max(self.floor, 2.0**-52))
+        return self.floor * float((self.span / self.length) ** ROUNDING)
+
+    def step(self, n: float) -> float:
+        """|h| of n steps."""
+        return abs(self.length) / n
+
+    def run(self, n: int) -> None:
+        """One more, sampled as often as its number of steps allows."""
+        began = time.perf_counter()
+        try:
+            trajectory = self.integrate(self.q, h=self.length / n, steps=n, every=n // math.gcd(n, SAMPLES))
+        except StepFailedError as failure:
+            self.legs[n] = Leg(np.empty((0, 0)), 0.0, time.perf_counter() - began, failure.status)
+        else:
+            iterations = float(trajectory.iterations.sum()) / n
+            self.legs[n] = Leg(trajectory.q[1:], iterations, time.perf_counter() - began)
+
+    def resolve(self, n: int, most: int) -> None:
+        """Halve the steps, from n of them, until errors are small."""
+        while not self.resolved and n <= most:
+            self.run(n)
+            n *= 2
+
+    def complete(self, goal: float, most: int) -> None:
+        """Shorter steps until the goal is met or rounding or cost end it, longer ones until no digit is right."""
+        while self.error(self.judged[-1]) > goal and not self.floor and 2 * self.finest <= most:
+            self.run(2 * self.finest)
+        while min(self.legs) > 1 and self.error(min(self.legs)) < 1.0:
+            self.run(min(self.legs) // 2)
+
+    def rate_of_parting(self, most: int) -> float:
+        """Rate of the exponential growth of a small change of the initial positions, 0 if it does not grow so."""
+        h = math.copysign(self.step(self.finest), self.span)
+        steps = min(most, int(self.span / h))
+        nudged = self.q + NUDGE * np.cos(np.arange(len(self.q))) * (_rms(self.q) or 1.0)
+        try:
+            one, other = (self.integrate(q, h=h, steps=steps, every=1).q[1:] for q in (self.q, nudged))
+        except StepFailedError:
+            return 0.0
+        apart = np.linalg.norm(other - one, axis=1) / (_rms(np.linalg.norm(one, axis=1)) or 1.0)
+        near = apart[: int(np.argmax(apart > RESOLVED)) or steps]
+        power = _power(near)
+        return power * math.log(2.0) / abs(0.5 * h * len(near)) if power > STEEP else 0.0
+
+    def error(self, n: int) -> float:
+        """Of the run with n steps, expected at the end of the span; infinite where it failed."""
+        if n not in self.judged:
+            return math.inf
+        if self.whole:
+            return max(float(self._errors(n)[-1]), self.late_error(n) / 3.0)  # the end may be a lucky moment
+        if self.rate:
+            return self._exploded(self.late_error(n))
+        early, late = _windows(self._errors(n))
+        ratio = self.span / self.length
+        if self.symplectic and self.growth < NEARLY_LINEAR:
+            return late * ratio / LATE
+        quadratic = max(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
+        return max(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
+
+    def late_error(self, n: int) -> float:
+        """Of the run with n steps, in the last quarter of the pilot."""
+        errors = self._errors(n)
+        return _rms(errors[-max(1, len(errors) // 4) :])
+
+    def _halved(self) -> list[int]:
+        """Runs whose steps came of halving and whose errors are small."""
+        return [n for n in self.judged if n.bit_count() == 1 and self.late_error(n) < RESOLVED]
+
+    def _errors(self, n: int) -> Array:
+        """Of a run at its samples by the finest good one, which is not exact either."""
+        finest = self.good[-1]
+        reference, positions = self.legs[finest].q, self.legs[n].q
+        size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=1)) or 1.0
+        count = math.gcd(len(reference), len(positions))
+        both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]
+        errors: Array = np.linalg.norm(both[1] - both[0], axis=1) / size
+        return errors / (1.0 - (n / finest) ** self.order)
+
+    def _exploded(self, size: float) -> float:
+        return size * math.exp(min(self.rate * abs(self.span - self.length), 600.0))
+
+
+def _windows(errors: Array) -> tuple[float, float]:
+    """Root mean squares over the second quarter and over the second half."""
+    half, quarter = len(errors) // 2, len(errors) // 4
+    return _rms(errors[quarter:half]), _rms(errors[half:])
+
+
+def _power(errors: Array) -> float:
+    """Of time, with which errors at equal distances grow."""
+    early, late = _windows(errors)
+    return math.log2(late / early) if 0.0 < early <= late else 0.0
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float(np.mean(np.square(values)))) if len(values) else 0.0

@@ -1,0 +1,148 @@
+"""This project's own steppers, at the step sizes that :func:`scvi_codegen.advise` gives for a ladder of tolerances."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from scvi_codegen.advice.advice import advise
+from scvi_codegen.benchmark.cases import Array, Case
+from scvi_codegen.benchmark.contenders.contenders import OURS, Contender
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native import building
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
+
+TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
+"""For which advice is asked; what is reached is measured."""
+
+QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
+LARGEST_NEWTON = 18
+"""Degrees of freedom beyond which the steps advised are those of the iteration by fixed point: Newton's method allows
+longer ones, each of which takes seconds."""
+
+_builds = itertools.count()
+
+
+def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = False) -> list[Contender]:
+    """Every method at every step advised.
+
+    Args:
+        case: what to integrate.
+        methods: by default the default method, SVI(8).
+        quick: few tolerances.
+    """
+    result = []
+    for method in methods or (SVI(8),):
+        stepper, seconds = compiled(case, method)
+        momenta = momenta_of(stepper, case)
+        for count, tolerance in advised_counts(case, method, momenta[0], quick=quick).items():
+            result.append(
+                Contender(
+                    method=f"{OURS} {method.name}",
+                    setting=_setting(case, count, tolerance),
+                    options=f"{stepper.title}, solver auto, {' '.join(stepper.flags)}",
+                    compile_seconds=seconds,
+                    prepare=_preparation(stepper, case, momenta, count),
+                    momenta=momenta,
+                )
+            )
+    return result
+
+
+def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
+    """SVI(8) with all states of the case as one ensemble, in one thread."""
+    stepper, seconds = compiled(case, SVI(8))
+    momenta = momenta_of(stepper, case)
+    began = time.perf_counter()
+    stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled at its first use
+    seconds += time.perf_counter() - began
+    return [
+        Contender(
+            method=f"{OURS} ensemble",
+            setting=_setting(case, count, tolerance),
+            options=f"{stepper.title}, one thread",
+            compile_seconds=seconds,
+            prepare=_ensemble_preparation(stepper, case, momenta, count),
+            momenta=momenta,
+            trajectories=len(case.q),
+        )
+        for count, tolerance in advised_counts(case, SVI(8), momenta[0], quick=quick).items()
+    ]
+
+
+def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
+    """Numbers of steps that fill the span -> the tolerance for which each was advised, at the first initial state."""
+    counts: dict[int, float] = {}
+    solver = "auto" if case.dimension <= LARGEST_NEWTON else "fixed-point"
+    for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
+        try:
+            advice = advise(case.system, method, case.q[0], momentum, case.span, tolerance, solver=solver)
+        except StateError:  # no step is known to be good enough
+            continue
+        counts.setdefault(advice.steps, tolerance)
+    return counts
+
+
+def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
+    """The stepper, and the seconds from the Lagrangian to it with an empty cache and a name that is new."""
+    with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder, _cache_in(folder):
+        began = time.perf_counter()
+        stepper = compile_stepper(case.system, method, prefix=f"bench_{next(_builds)}")
+        return stepper, time.perf_counter() - began
+
+
+def momenta_of(stepper: Stepper, case: Case) -> Array:
+    """(k, m) initial momenta."""
+    return np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
+
+
+@contextmanager
+def _cache_in(folder: str) -> Iterator[None]:
+    before = os.environ.get(building.CACHE_VARIABLE)
+    os.environ[building.CACHE_VARIABLE] = folder
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[building.CACHE_VARIABLE]
+        else:
+            os.environ[building.CACHE_VARIABLE] = before
+
+
+def _setting(case: Case, count: int, tolerance: float) -> str:
+    return f"h={case.span / count:.4g} for {tolerance:.0e}"
+
+
+def _preparation(stepper: Stepper, case: Case, momenta: Array, count: int) -> Callable[[int], Callable[[], Array]]:
+    def prepare(index: int) -> Callable[[], Array]:
+        run = stepper.start(case.q[index], momenta[index], h=case.span / count)
+
+        def integrate() -> Array:
+            final: Array = run.record(count, every=count).q[-1]
+            return final
+
+        return integrate
+
+    return prepare
+
+
+def _ensemble_preparation(
+    stepper: Stepper, case: Case, momenta: Array, count: int
+) -> Callable[[int], Callable[[], Array]]:
+    def integrate() -> Array:
+        result = stepper.integrate_ensemble(case.q, momenta, h=case.span / count, steps=count, every=count, threads=1)
+        final: Array = result.q[-1]
+        return final
+
+    return lambda index: integrate

@@ -1,0 +1,253 @@
+"""Other people's integrators, each with the best options and the best formulation we know of.
+
+heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
+rebound     IAS15, for gravitating bodies, with its default step control.
+cyrk        DOP853 in C++ (CyRK), right-hand side compiled by Numba.
+jitcode     SciPy's Fortran DOP853, right-hand side compiled by C with JiTCODE's default flags (-Ofast -march=native).
+scipy       ``solve_ivp`` with DOP853, right-hand side compiled by Numba if it is there, else plain Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import Array, Case
+from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
+from scvi_codegen.benchmark.contenders.tracing import rates_text
+
+__all__ = ["PEERS", "Peer", "missing_module", "peer_contenders"]
+
+TOLERANCES = (3e-14, 1e-13, 1e-12, 1e-11, 1e-9, 1e-7)
+IAS15_EPSILONS = (1e-9, 1e-6, 1e-4)
+MOST_STEPS = 10**9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Peer:
+    """One library.
+
+    Attributes:
+        modules: what must be installed.
+        contenders: makes its contenders, one setting after the other.
+        suits: the cases it can integrate.
+    """
+
+    modules: tuple[str, ...]
+    contenders: Callable[[Case, bool], Iterator[Contender]]
+    suits: Callable[[Case], bool] = lambda case: True
+
+
+def missing_module(peer: Peer) -> str | None:
+    """The first module that is not installed."""
+    return next((name for name in peer.modules if importlib.util.find_spec(name) is None), None)
+
+
+def peer_contenders(name: str, case: Case, *, quick: bool = False) -> Iterator[Contender]:
+    """The contenders of a peer for a case."""
+    return PEERS[name].contenders(case, quick)
+
+
+# ---- REBOUND
+
+
+def _rebound(case: Case, quick: bool) -> Iterator[Contender]:
+    for epsilon in IAS15_EPSILONS[: 1 if quick else None]:
+        yield Contender(
+            method="rebound IAS15",
+            setting=f"epsilon={epsilon:.0e}" + (" (default)" if epsilon == IAS15_EPSILONS[0] else ""),
+            options="default step control (PRS23)",
+            compile_seconds=0.0,
+            prepare=_rebound_preparation(case, epsilon),
+        )
+
+
+def _rebound_preparation(case: Case, epsilon: float) -> Callable[[int], Callable[[], Array]]:
+    import rebound
+
+    bodies = case.bodies
+    assert bodies is not None
+
+    def prepare(index: int) -> Callable[[], Array]:
+        simulation = rebound.Simulation()
+        simulation.integrator = "ias15"
+        simulation.integrator.epsilon = epsilon
+        simulation.G = bodies.gravity
+        if bodies.fixed_centre:
+            simulation.add(m=1.0)
+            simulation.N_active = 1
+        q, v = (part[index].reshape(-1, bodies.axes) for part in (case.q, case.velocity))
+        for mass, position, velocity in zip(bodies.masses, q, v, strict=True):
+            start = {axis: float(x) for axis, x in zip("xyz", position, strict=False)}
+            start |= {f"v{axis}": float(x) for axis, x in zip("xyz", velocity, strict=False)}
+            simulation.add(m=mass, **start)
+
+        def integrate() -> Array:
+            simulation.integrate(case.span)
+            moving = simulation.particles[1:] if bodies.fixed_centre else simulation.particles
+            return np.array([particle.xyz[: bodies.axes] for particle in moving]).ravel()
+
+        return integrate
+
+    return prepare
+
+
+# ---- Dormand and Prince's method of order 8, three times
+
+
+def _start(case: Case, index: int) -> Array:
+    return np.concatenate([case.q[index], case.velocity[index]])
+
+
+def _right_hand_side(case: Case) -> Callable[..., None]:
+    """Plain Python ``rates(out, t, x, unused)``: the loops of the case if it has some, else lines without any."""
+    names: dict[str, Any] = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
+    text = case.loops or rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension)
+    exec(compile(text, f"<rates of {case.name}>", "exec"), names)
+    function: Callable[..., None] = names["rates"]
+    return function
+
+
+def _dop853(
+    method: str, options: str, seconds: float, case: Case, quick: bool, solve: Callable[[Array, float], Array]
+) -> Iterator[Contender]:
+    """One contender a tolerance; ``solve`` maps (state, relative tolerance) to the final state."""
+
+    def preparation(tolerance: float) -> Callable[[int], Callable[[], Array]]:
+        def prepare(index: int) -> Callable[[], Array]:
+            start = _start(case, index)
+            return lambda: solve(start, tolerance)[: case.dimension]
+
+        return prepare
+
+    for tolerance in TOLERANCES[: 2 if quick else None]:
+        yield Contender(
+            method=method,
+            setting=f"rtol={tolerance:.0e}",
+            options=options,
+            compile_seconds=seconds,
+            prepare=preparation(tolerance),
+        )
+
+
+def _absolute(tolerance: float, start: Array) -> float:
+    """Absolute tolerance that belongs to a relative one: a tenth of it for the smaller of typical q and v."""
+    sizes = [float(np.sqrt(np.mean(half**2))) for half in np.split(start, 2)]
+    return 0.1 * tolerance * min(size for size in sizes if size > 0.0)
+
+
+def _cyrk(case: Case, quick: bool) -> Iterator[Contender]:
+    import numba
+    from CyRK import cyjit, nbsolve2_ivp
+
+    began = time.perf_counter()
+    address = cyjit(_right_hand_side(case)).address
+    span = np.array([case.span])
+
+    @numba.njit  # type: ignore[untyped-decorator]  # Numba ships no stubs
+    def compiled(address: int, start: Array, relative: float, absolute: float, span: Array) -> Any:
+        outcome = nbsolve2_ivp(
+            address, (0.0, span[0]), start, method="DOP853", rtol=relative, atol=absolute, t_eval=span
+        )
+        final, success = outcome.y[:, -1].copy(), outcome.success
+        outcome.free()
+        return final, success
+
+    def solve(start: Array, tolerance: float) -> Array:
+        final, success = compiled(address, start, tolerance, _absolute(tolerance, start), span)
+        if not success:
+            raise ArithmeticError("CyRK's DOP853 failed")
+        result: Array = final
+        return result
+
+    compiled(address, _start(case, 0), 1e-3, 1e-3, 1e-3 * span)
+    seconds = time.perf_counter() - began
+    yield from _dop853("CyRK DOP853", "right-hand side by Numba", seconds, case, quick, solve)
+
+
+def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
+    import jitcode
+    import symengine
+
+    began = time.perf_counter()
+    x = [jitcode.y(n) for n in range(2 * case.dimension)]
+    rates = case.formulations[0].rates(x, case.parameters, symengine)
+    system = jitcode.jitcode(rates, n=len(x), verbose=False)
+    with _elsewhere():
+        system.compile_C()
+    seconds = time.perf_counter() - began
+
+    def solve(start: Array, tolerance: float) -> Array:
+        system.set_integrator("dop853", rtol=tolerance, atol=_absolute(tolerance, start), nsteps=MOST_STEPS)
+        system.set_initial_value(start, 0.0)
+        final: Array = system.integrate(case.span)
+        return final
+
+    yield from _dop853("JiTCODE DOP853", "right-hand side in C, default flags", seconds, case, quick, solve)
+
+
+@contextlib.contextmanager
+def _elsewhere() -> Iterator[None]:
+    """In a temporary folder: setuptools, which JiTCODE calls, would read a pyproject.toml here; and its logs aside."""
+    level = logging.root.level
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        try:
+            yield
+        finally:
+            logging.root.setLevel(level)
+
+
+def _scipy(case: Case, quick: bool) -> Iterator[Contender]:
+    from scipy.integrate import solve_ivp
+
+    began = time.perf_counter()
+    plain, size = _right_hand_side(case), 2 * case.dimension
+    fast, options = plain, "right-hand side in Python"
+    if importlib.util.find_spec("numba") is not None:
+        import numba
+
+        fast, options = numba.njit(plain), "right-hand side by Numba"
+
+    def rates(t: float, x: Array) -> Array:
+        out = np.empty(size)
+        fast(out, t, x, 0)
+        return out
+
+    def solve(start: Array, tolerance: float) -> Array:
+        outcome = solve_ivp(
+            rates,
+            (0.0, case.span),
+            start,
+            method="DOP853",
+            rtol=tolerance,
+            atol=_absolute(tolerance, start),
+            t_eval=[case.span],
+        )
+        if not outcome.success:
+            raise ArithmeticError(f"solve_ivp: {outcome.message}")
+        final: Array = outcome.y[:, -1]
+        return final
+
+    rates(0.0, _start(case, 0))
+    seconds = time.perf_counter() - began
+    yield from _dop853("SciPy DOP853", options, seconds, case, quick, solve)
+
+
+PEERS = {
+    "heyoka": Peer(modules=("heyoka",), contenders=heyoka_contenders),
+    "rebound": Peer(modules=("rebound",), contenders=_rebound, suits=lambda case: case.bodies is not None),
+    "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk),
+    "jitcode": Peer(modules=("jitcode",), contenders=_jitcode),
+    "scipy": Peer(modules=("scipy",), contenders=_scipy),
+}
+"""Peers by the name on the command line, the fastest first."""

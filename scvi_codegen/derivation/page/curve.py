@@ -1,0 +1,170 @@
+"""The trial curve of a method, in words and formulas, and the numbers that belong to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import sympy
+from sympy import Function, Symbol
+
+from scvi_codegen.derivation.equations import TableEntry
+from scvi_codegen.derivation.page.step_drawing import step_drawing
+from scvi_codegen.display.number_tables import decimal, number_table, short
+from scvi_codegen.display.page.blocks import Cell, Content, Formula, Paragraph, Section, Table
+from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.tables.spaces import Polynomials
+from scvi_codegen.tables.tableau import Tableau
+
+__all__ = ["curve_section", "tables_section"]
+
+CAPTIONS = {
+    "l": "l_j(tau_n): cardinal functions at the quadrature points",
+    "dl": "Slopes of the cardinal functions l_j at the quadrature points",
+    "D": "D_{n,j}: the differentiation matrix (11) on [-1, 1]",
+    "DD": "Products of differentiation matrices, for accelerations at the nodes (16)",
+    "a": "a_{n,j}: positions from velocities",
+    "aa": "(A^2)_{n,j}: positions from accelerations",
+    "c": "c_n: positions from the velocity at the start",
+    "r": "r_{n,j}: positions along the curve",
+    "u": "u_{n,j}: velocities along the curve",
+    "bA": "(bA)_j: the position at the end from accelerations",
+    "beta": "beta_j: the position at the end",
+    "gamma": "gamma_j: the fractions of the step",
+}
+SHOWN_WITH_PARTS = ("w", "dw", "d", "b")
+"""Entries that stand in the tables of quadratures and tableaux."""
+MOST_CELLS = 40
+"""Rows, and columns, of a table."""
+tau, j, s = Symbol("tau"), Symbol("j", integer=True), Symbol("s")
+
+
+def curve_section(method: Method) -> Section:
+    """Where on the step the method looks, and what moves between."""
+    drawing = step_drawing(method)
+    contents = (*_curve(method), *(() if drawing is None else (drawing,)))
+    return Section(name="curve", title="The trial curve", contents=contents)
+
+
+def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
+    """Nodes, weights, tableaux, and all entries that the equations name."""
+    contents: list[Content] = []
+    for part in method.parts:
+        numbers = number_table(part)
+        contents.append(Table(columns=numbers.columns, rows=numbers.rows, name=numbers.title))
+    skipped = {*SHOWN_WITH_PARTS, *("ac" if any(isinstance(part, Tableau) for part in method.parts) else "")}
+    for prefix in dict.fromkeys(_indices(entry)[0] for entry in entries):
+        if prefix not in skipped:
+            contents += _entry_table(prefix, [entry for entry in entries if _indices(entry)[0] == prefix])
+    contents.append(
+        Paragraph(
+            "Numbers are computed in 60 digits and shown in 17, or as radicals where these are short. Entries that are "
+            "0, 1 or -1 have no name: here a dash, in the equations what they are."
+        )
+    )
+    return Section(name="tables", title="Nodes, weights and tables", contents=tuple(contents))
+
+
+def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
+    """Entries of one name: a matrix, or a column where they have one index."""
+    cells: dict[tuple[int, ...], Cell] = {_indices(entry)[1]: _shown(entry) for entry in entries}
+    caption = CAPTIONS.get(prefix, f"{prefix}_{{n,j}}: coefficients of the equations")
+    if any(len(index) < 2 for index in cells):
+        column = tuple((str(index[-1]), cell) for index, cell in sorted(cells.items()))
+        yield Table(columns=("", prefix), rows=column[:MOST_CELLS], name=caption)
+        return
+    lines, columns = ({index[k] for index in cells} for k in range(2))
+    if max(len(lines), len(columns)) > MOST_CELLS:
+        yield Paragraph(f"{caption}: {len(lines)} rows and {len(columns)} columns, not shown.")
+        return
+    rows = tuple((str(n), *(cells.get((n, column)) for column in sorted(columns))) for n in sorted(lines))
+    yield Table(columns=("n", *(f"j = {column}" for column in sorted(columns))), rows=rows, name=caption)
+
+
+def _indices(entry: TableEntry) -> tuple[str, tuple[int, ...]]:
+    prefix, *indices = entry.symbol.name.lstrip("_").split("_")
+    return prefix, tuple(map(int, indices))
+
+
+def _shown(entry: TableEntry) -> Cell:
+    return entry.exact if short(entry.exact) else decimal(entry.value)
+
+
+def _curve(method: Method) -> Iterator[Content]:
+    if isinstance(method, SVI) and isinstance(method.curves, Polynomials):
+        yield from _nodal(method.degree)
+        yield from _action("25")
+    elif isinstance(method, SVI):
+        yield Paragraph(
+            f"Curves of the space '{method.curves.name}', given by their velocities V_j at "
+            f"{method.curves.dimension(method.degree)} points. The discrete Lagrangian is the quadrature of L along "
+            "the curve, and stationary in what is inside:"
+        )
+        yield from _action("25")
+    elif isinstance(method, SCVI):
+        yield from _shooting(method)
+    elif isinstance(method, SpectralCollocation) and method.form == "position":
+        yield from _nodal(method.degree)
+        yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s; node 0 carries no equation.")
+    elif isinstance(method, RungeKutta | SpectralCollocation):
+        where = "Hamilton's equations" if method.form == "phase-space" else "(q, v)"
+        yield Paragraph(
+            f"Stages of a Runge-Kutta method on {where}, (22): positions at c_i are q_k and the velocities of the "
+            "stages, weighted by the tableau."
+        )
+    elif isinstance(method, StoermerVerlet):
+        yield Paragraph(
+            "The Lobatto IIIA-IIIB pair of two stages, at both ends of the step. For constant masses it is the "
+            "leapfrog scheme: half a kick, a drift, half a kick."
+        )
+    elif isinstance(method, Composition):
+        count = len(method.fractions)
+        yield Paragraph(
+            f"{count} leapfrog step{'s' * (count > 1)} of sizes gamma_j h one after the other: kicks by forces and "
+            "drifts with constant velocity in turn."
+        )
+
+
+def _nodal(degree: int) -> Iterator[Content]:
+    yield Paragraph(
+        f"The polynomial of degree s = {degree} through the positions Q^j at the nodes, Q^0 = q_k; l_j are the "
+        "cardinal functions, tau in [-1, 1] is time on the step:"
+    )
+    cardinal = Function("l_j")(tau)
+    yield Formula(sympy.Sum(Symbol("Q__j") * cardinal, (j, 0, s)), Function("q")(tau))
+
+
+def _action(number: str) -> Iterator[Content]:
+    n, g, h = Symbol("n", integer=True), Symbol("g"), Symbol("h")
+    at = Symbol("tau_n")
+    L = Function("L")(Function("q")(at), Function("q_dot")(at), Symbol("t_n"))
+    yield Paragraph("The discrete Lagrangian is the quadrature of L along it:")
+    yield Formula(h / 2 * sympy.Sum(Symbol("w_n") * L, (n, 1, g)), Symbol("L_d"), number)
+
+
+def _shooting(method: SCVI) -> Iterator[Content]:
+    if method.abscissae is None:
+        yield from _nodal(method.degree)
+        yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s, E_i = 0 (34a), v_0 at its start.")
+    else:
+        yield Paragraph(
+            f"The collocation solution of the Euler-Lagrange equations on {method.places}: v_0 the velocity at the "
+            "start, z_i the accelerations at the abscissae times h."
+        )
+    yield from _action("33")
+    if method.variational and (method.degree > 1 or method.abscissae is not None):
+        i = Symbol("i", integer=True)
+        terms = sympy.Sum(Symbol("lambda_i") * Symbol("E_i"), (i, 1, s))
+        yield Paragraph(
+            "The curve depends on both ends. Multipliers carry that dependence, so that the discrete Lagrangian is "
+            "differentiated in full; stationary is"
+        )
+        yield Formula(Symbol("L_d") + terms, Symbol("G"))
+    elif not method.variational:
+        yield Paragraph(
+            "As printed in the paper, partial derivatives of L_d stand for total ones: with more than two nodes the "
+            "step is not symplectic."
+        )

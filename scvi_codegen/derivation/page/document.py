@@ -1,0 +1,70 @@
+"""The sections of the page, in order, and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from scvi_codegen import __version__
+from scvi_codegen.compiler import c_identifier, program_of
+from scvi_codegen.derivation.equations import table_entries
+from scvi_codegen.derivation.page.curve import curve_section, tables_section
+from scvi_codegen.derivation.page.functions import functions_section
+from scvi_codegen.derivation.page.kernels import kernels_section, operations_section
+from scvi_codegen.derivation.page.motion import motion_section, system_section
+from scvi_codegen.derivation.page.stage_equations import (
+    idel_section,
+    jacobian_section,
+    stage_section,
+    written_out,
+    written_out_section,
+)
+from scvi_codegen.display.page.blocks import Section
+from scvi_codegen.display.page.environment import page_template, style_sheet
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method, check_regular
+from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.rendering.outline import functions_of
+from scvi_codegen.rendering.text import render
+
+__all__ = ["derivation_html"]
+
+
+def derivation_html(system: MechanicalSystem, method: Method, *, solver: str = "auto") -> str:
+    """The derivation of ``method`` for ``system`` as a page of HTML that needs nothing else.
+
+    Args:
+        system: what moves.
+        method: how its motion is discretised.
+        solver: of the C that is shown; as of :func:`~scvi_codegen.compiler.compile_stepper`.
+
+    Raises:
+        MethodError: for a solver that the method does not have, or a system that the method is not for.
+    """
+    check_regular(method, system)
+    return page_template("derivation.html.jinja").render(
+        title=f"{system.name}: {method.title}",
+        body_class="derivation",
+        system=system,
+        method=method,
+        sections=list(_sections(system, method, solver)),
+        css=style_sheet("page.css", "derivation.css"),
+        version=__version__,
+    )
+
+
+def _sections(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Section]:
+    program = program_of(system, method, solver=solver, prefix=c_identifier(system.name))
+    functions = functions_of(render(program).code)
+    stages = with_auxiliaries(system, method.paper_form(system))
+    derived = written_out(system, method, stages)
+    yield system_section(system)
+    yield motion_section(system)
+    yield curve_section(method)
+    yield tables_section(method, table_entries(stages, method))
+    yield stage_section(system, stages)
+    yield idel_section(system, stages)
+    yield written_out_section(derived)
+    yield jacobian_section(system, stages, derived, program)
+    yield operations_section(program)
+    yield kernels_section(system, program, functions)
+    yield functions_section(system, method, program, functions)

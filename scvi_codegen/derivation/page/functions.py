@@ -1,0 +1,131 @@
+"""The functions around the kernels, in the order of their calls: what each does, and its C."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+
+import sympy
+from sympy import Symbol
+
+from scvi_codegen.derivation.page.elision import lines
+from scvi_codegen.derivation.page.kernels import kernels_of
+from scvi_codegen.derivation.page.stage_equations import families_contents
+from scvi_codegen.derivation.page.sums import end_formulas, row_formulas
+from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section
+from scvi_codegen.ir.program import Program
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.rendering.outline import Function, reached
+
+__all__ = ["functions_section"]
+
+OPENED = re.compile(r"\w+_advance|solve|sweep|newton|evaluate")
+"""Functions that are unfolded: the loop over the steps, and what solves for the stages."""
+LANE_FUNCTION = re.compile(r"(lanes_)?inverse_root_\d|lanes_\w+")
+n, j = Symbol("n", integer=True), Symbol("j", integer=True)
+h, q, p, v0, g = (Symbol(name) for name in ("h", "q_k", "p_k", "v_0", "g"))
+inverse_mass = Symbol("M__-1")
+
+
+def functions_section(
+    system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Function]
+) -> Section:
+    """From the loop over the steps down: formulas or words at the left, C at the right."""
+    stages = with_auxiliaries(system, method.stage_system(system))
+    kernels = {kernel.name for kernel in kernels_of(program)}
+    start = f"{program.prefix}_advance"
+    pairs = [
+        _pair(function, start, _formulas(function.name, system, stages, program))
+        for function in reached(functions, start)
+        if function.name not in kernels and not LANE_FUNCTION.fullmatch(function.name)
+        if function.comment or function.name == start
+    ]
+    text = (
+        "Everything else is loops over tables, the same for every system: from the loop over the steps down, each "
+        "function once, in the order of the calls. The folded ones open when touched."
+    )
+    return Section(name="functions", title="The step: what the C does", contents=(Paragraph(text), *pairs))
+
+
+def _pair(function: Function, start: str, given: Iterator[Content]) -> Beside:
+    words = (
+        function.comment
+        or "The loop over the steps, with compensated sums: increments are added with what rounding cut off."
+    )
+    return Beside(
+        title=f"{function.name}({', '.join(function.arguments)})",
+        left=(Paragraph(words if words.endswith(".") else f"{words}."), *given),
+        right=(lines(function.text),),
+        folded=not OPENED.fullmatch(function.name) and function.name != start,
+    )
+
+
+def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program: Program) -> Iterator[Content]:
+    """The equations that a function computes, where there is something to show."""
+    if name == "evaluate":
+        yield from _compiled(system, stages)
+    elif name == "newton":
+        yield from _newton()
+    elif name == "sweep" and program.sweep is not None:
+        yield from SWEEPS[program.sweep.kind]
+    elif name == "gather":
+        yield Formula(sympy.Sum(Symbol("table_j_n") * Symbol("z_j"), (j, 1, Symbol("B"))), Symbol("u_n"))
+
+
+def _compiled(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
+    yield Paragraph(
+        "The stage equations as they are compiled: unknowns are velocities or accelerations times h in place of "
+        "positions, which would lose digits in differences."
+    )
+    yield from families_contents(system, stages)
+    for _, formula in row_formulas(system, stages):
+        yield formula
+    yield from end_formulas(system, stages)
+
+
+def _newton() -> Iterator[Content]:
+    R, J, z, change = Symbol("R"), Symbol("J"), Symbol("z"), Symbol("delta")
+    yield Paragraph("R the residuals of evaluate and J their Jacobian, factorised with exchanges of rows:")
+    yield Formula(R, J * change)
+    yield Formula(z - change, Symbol("z_new"))
+    yield Paragraph("until neither stages nor end momentum move by more than the tolerance, or rounding stops them.")
+
+
+def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
+    return sympy.Sum(Symbol(coefficient) * value, (j, 1, g))
+
+
+SWEEPS: dict[str, tuple[Content, ...]] = {
+    "separable": (
+        Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; again until they rest:"),
+        Formula(q + h * Symbol("c_n") * v0 + h**2 * _sum("a_n_j", inverse_mass * Symbol("F_j")), Symbol("q_n")),
+        Formula(q + h * v0 + h**2 * _sum("beta_j", inverse_mass * Symbol("F_j")), Symbol("q_k+1")),
+        Formula(p + h * _sum("b_j", Symbol("F_j")), Symbol("p_k+1")),
+    ),
+    "coupled": (
+        Paragraph("Velocities V_n at the points, corrected until they rest; M = L_vv there:"),
+        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
+        Formula(Symbol("V_n") + inverse_mass * (Symbol("P_n") - Symbol("L_v_n")), Symbol("V_n_new")),
+        Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
+        Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
+    ),
+    "shooting": (
+        Paragraph(
+            "Scaled accelerations z_n at the nodes, corrected by the Euler-Lagrange residuals E; then p_(k+1), the "
+            "velocity v_0 at the start and the multipliers, in turn until all rest:"
+        ),
+        Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
+        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        Formula(Symbol("z_n") - h * inverse_mass * Symbol("E_n"), Symbol("z_n_new")),
+    ),
+    "collocation": (
+        Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; again until they rest:"),
+        Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
+        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        Formula(h * inverse_mass * Symbol("F_n"), Symbol("z_n")),
+    ),
+}

@@ -1,0 +1,95 @@
+"""Each kernel's formulas beside its C, and what finding their common parts saved."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import sympy
+from sympy import Symbol
+
+from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines, operations
+from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section, Table
+from scvi_codegen.ir.program import Kernel, Program, SeparableSweep
+from scvi_codegen.mechanics.forms import auxiliary_multipliers, multipliers
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.rendering.outline import Function
+
+__all__ = ["kernels_of", "kernels_section", "operations_section"]
+
+COUNTS = re.compile(r" Operations: .*$")
+
+
+def kernels_of(program: Program) -> tuple[Kernel, ...]:
+    """Every kernel of the C, each name once."""
+    kernels = list(program.kernels)
+    if program.sweep:
+        kernels += program.sweep.kernels
+        kernels += [program.sweep.mass] if isinstance(program.sweep, SeparableSweep) else []
+    if program.splitting:
+        kernels += program.splitting.kernels
+    return tuple({kernel.name: kernel for kernel in kernels}.values())
+
+
+def operations_section(program: Program) -> Section:
+    """Operations of every kernel before and after common parts were found."""
+    rows = tuple(
+        (
+            kernel.name,
+            len(kernel.formulas),
+            sum(map(operations, kernel.formulas)),
+            sum(kernel.operation_counts().values()),
+            len(kernel.temporaries),
+        )
+        for kernel in kernels_of(program)
+    )
+    columns = ("kernel", "results", "before", "after", "temporaries")
+    contents: tuple[Content, ...] = (
+        Paragraph(
+            "Operations of one evaluation at one point. Before: of the formulas as they were derived, each on its own, "
+            "as SymPy counts them. After: of the C, with common parts computed once; a call of a function is one, and "
+            "a power such as x^(-3/2) is one call. A kernel of a few formulas may gain nothing: powers are written out "
+            "as products there."
+        ),
+        Table(columns=columns, rows=rows, formats=dict.fromkeys(columns[1:], "d"), name="Operations of the kernels"),
+    )
+    return Section(name="operations", title="Operation counts", contents=contents)
+
+
+def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Function]) -> Section:
+    """One pair a kernel: formulas at the left, C at the right."""
+    names = _names(system)
+    pairs = tuple(_pair(program, kernel, functions[kernel.name], names) for kernel in kernels_of(program))
+    text = (
+        "A kernel is all that depends on the system: arithmetic in a straight line, at one point. Those called _lanes "
+        "do the same for all points at once."
+    )
+    return Section(name="kernels", title="The kernels: formulas and C", contents=(Paragraph(text), *pairs))
+
+
+def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
+    """Short symbols for the multipliers, lambda and nu with the name of their coordinate."""
+    named = ((multipliers(system), "lambda"), (auxiliary_multipliers(system), "nu"))
+    return {
+        symbol: Symbol(f"{letter}_{q.name}")
+        for symbols, letter in named
+        for symbol, q in zip(symbols, system.coordinates, strict=False)
+    }
+
+
+def _pair(program: Program, kernel: Kernel, function: Function, names: Mapping[Symbol, Symbol]) -> Beside:
+    values, slopes = (
+        [
+            Formula(formula.xreplace(names) if k < MOST_FORMULAS else formula, Symbol(f"{name}_{k}"))
+            for k, formula in enumerate(given)
+        ]
+        for name, given in (("value", kernel.formulas[: kernel.values]), ("slope", kernel.formulas[kernel.values :]))
+    )
+    left: list[Content] = [Paragraph(COUNTS.sub("", function.comment))] if function.comment else []
+    if kernel.uses_arguments:
+        left.append(Formula(sympy.Tuple(*kernel.symbols).xreplace(names), Symbol("u")))
+    if kernel.uses_parameters:
+        left.append(Formula(sympy.Tuple(*map(Symbol, program.parameter_names)), Symbol("parameters")))
+    left += [*formulas(values, "value"), *formulas(slopes, "slope")]
+    title = f"{kernel.name}({', '.join(function.arguments)})"
+    return Beside(title=title, left=tuple(left), right=(lines(function.text),))

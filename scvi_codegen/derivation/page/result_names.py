@@ -1,0 +1,62 @@
+"""What kernels are given and give back at a point, as symbols: q_n, L_q at point n, the Euler-Lagrange residual E_n."""
+
+from __future__ import annotations
+
+from sympy import Symbol
+
+from scvi_codegen.lowering.program import argument_name
+from scvi_codegen.mechanics.forms import constitutive, euler_lagrange, force, momentum
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter
+
+__all__ = ["argument_symbol", "meaning", "place_name", "result_symbol", "scalar_name"]
+
+ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
+"""Rates of the curve as they are typeset."""
+PLACES = {"start": "k", "end": "k+1"}
+MEANINGS = {
+    "L": "L the Lagrangian, whose index says by what it is differentiated",
+    "S": "E the Euler-Lagrange residual and S its product with the multipliers, whose index says by what it is "
+    "differentiated",
+    "E": "E the Euler-Lagrange residual",
+    "L_dot": "L with a dot its time derivative along the curve, by what its index says",
+}
+
+
+def place_name(family: PointFamily, point: object = "n") -> str:
+    """The index of a point of a family: n, or k and k + 1 where it is an end of the step."""
+    return PLACES.get(family.name, str(point if len(family.abscissae) > 1 else 1))
+
+
+def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Symbol:
+    """What a gather gives at a point."""
+    name = argument_name(system, gather)
+    return Symbol(f"{ARGUMENTS.get(name, name)}_{place}")
+
+
+def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
+    """What a scatter takes from the kernel at a point; of a scalar's gradient, scatters are parallel to gathers."""
+    if family.scalar is None:
+        known = {
+            force(system): "L_q",
+            momentum(system): "L_v",
+            euler_lagrange(system): "E",
+            constitutive(system): "L_p",
+        }
+        return Symbol(f"{known[scatter.results]}_{place}")
+    name = argument_name(system, family.gathers[family.scatters.index(scatter)])
+    return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(family)}_{name}_{place}")
+
+
+def scalar_name(family: PointFamily) -> str:
+    """L, its k-th time derivative along the curve, or S."""
+    if family.name == "node":
+        return "S"
+    return "L" if not family.scalar_power else "L_dot" if family.scalar_power == 1 else f"L_d{family.scalar_power}"
+
+
+def meaning(family: PointFamily) -> str:
+    """What the letter of a family's results stands for."""
+    if family.scalar is not None:
+        return MEANINGS[scalar_name(family)[:5]]
+    return MEANINGS["E"] if family.name == "node" else MEANINGS["L"]

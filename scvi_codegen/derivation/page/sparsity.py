@@ -1,0 +1,90 @@
+"""Which entries of the Jacobian are not zero, by the structure of the tables and of the derivatives of kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from scvi_codegen.display.page.blocks import Drawing
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.methods.stage_system import StageSystem
+
+__all__ = ["Pattern", "jacobian_pattern", "pattern_drawing"]
+
+SIDE = 320
+"""Pixels of the picture."""
+LARGEST_DRAWN = 400
+"""Rows of a matrix of which every entry is drawn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """A square matrix of ``size`` rows: columns of the entries that are not zero, ascending, by row."""
+
+    size: int
+    rows: tuple[tuple[int, ...], ...]
+
+    @property
+    def entries(self) -> int:
+        """How many are not zero."""
+        return sum(map(len, self.rows))
+
+
+def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
+    """Of the residuals with respect to the unknowns, in the order of the equations: block after block of m."""
+    found: list[set[int]] = [set() for _ in range(len(stages.rows) * dimension)]
+    for family in stages.families:
+        for scatter in family.scatters:
+            for gather in family.gathers:
+                pairs = jacobian(scatter.results, gather.arguments)
+                for r, b in _met(scatter.table.entries, gather.table.entries, len(stages.rows)):
+                    for i, j in pairs:
+                        found[r * dimension + i].add(b * dimension + j)
+    return Pattern(len(found), tuple(tuple(sorted(row)) for row in found))
+
+
+def _met(rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]], count: int) -> set[tuple[int, int]]:
+    """Rows and blocks that have a point in common."""
+    return {
+        (r, b - 1)
+        for row, block in zip(rows, blocks, strict=True)
+        for r in range(count)
+        if row[r] != 0
+        for b in range(1, len(block))
+        if block[b] != 0
+    }
+
+
+def pattern_drawing(pattern: Pattern) -> Drawing | None:
+    """A picture of the matrix, ``None`` where it would be too large to be seen."""
+    if pattern.size > LARGEST_DRAWN:
+        return None
+    cell = SIDE / pattern.size
+    runs = [
+        f"M{first * cell:.2f} {r * cell:.2f}h{length * cell:.2f}v{cell:.2f}h{-length * cell:.2f}z"
+        for r, row in enumerate(pattern.rows)
+        for first, length in _runs(row)
+    ]
+    share = 100 * pattern.entries / pattern.size**2
+    caption = (
+        f"The Jacobian: {pattern.size} rows and columns, {pattern.entries} entries that are not zero "
+        f"({share:.0f} per cent)."
+    )
+    svg = (
+        f'<svg viewBox="-1 -1 {SIDE + 2} {SIDE + 2}" role="img" aria-label="{caption}" '
+        f'style="--width: {SIDE}px; min-width: 0">'
+        f'<path d="{"".join(runs)}" fill="var(--link)"/>'
+        f'<path d="M0 0H{SIDE}V{SIDE}H0z" fill="none" stroke="currentColor" opacity="0.5"/></svg>'
+    )
+    return Drawing(svg, caption)
+
+
+def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:
+    """First column and length of every run of neighbours."""
+    runs: list[tuple[int, int]] = []
+    for column in columns:
+        if runs and sum(runs[-1]) == column:
+            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
+        else:
+            runs.append((column, 1))
+    return runs

@@ -1,0 +1,171 @@
+"""The equations of a step: in a few lines with sums, written out where they are short, and their Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import groupby
+
+import sympy
+from sympy import Symbol
+
+from scvi_codegen.derivation.equations import Equation, StepEquations, derive
+from scvi_codegen.derivation.page.elision import formulas, operations
+from scvi_codegen.derivation.page.result_names import meaning
+from scvi_codegen.derivation.page.sparsity import jacobian_pattern, pattern_drawing
+from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, row_formulas
+from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section
+from scvi_codegen.ir.program import Program
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+
+__all__ = [
+    "families_contents",
+    "idel_section",
+    "jacobian_section",
+    "stage_section",
+    "written_out",
+    "written_out_section",
+]
+
+MOST_OPERATIONS = 6000
+"""Of all equations written out, about: beyond, they are not."""
+LARGEST_SHOWN_JACOBIAN = 3
+FAMILIES = {
+    "quadrature": "At the quadrature points tau_n",
+    "node": "At the nodes",
+    "stage": "At the stages",
+    "start": "At the start of the step",
+    "end": "At its end",
+    "kick": "At the kicks",
+    "drift": "In the drifts",
+}
+
+
+def stage_section(system: MechanicalSystem, stages: StageSystem) -> Section:
+    """What is unknown, what kernels are given, and the equations but those with p_k."""
+    return Section(
+        name="stages",
+        title="Stage equations",
+        contents=(
+            Paragraph(_unknowns(system, stages)),
+            *families_contents(system, stages),
+            *_rows(system, stages, {"stage", "multiplier", "Legendre"}),
+        ),
+    )
+
+
+def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
+    """The implicit discrete Euler-Lagrange equations (5) and the end of the step."""
+    rows = list(_rows(system, stages, {"IDEL"}))
+    text = (
+        "The equations that hold the momenta p_k and p_(k+1) together with the curve, (5): p_k is known, p_(k+1) is "
+        "what the last one gives."
+        if rows
+        else "The end of the step:"
+    )
+    return Section(
+        name="idel",
+        title="Implicit discrete Euler-Lagrange equations",
+        contents=(Paragraph(text), *rows, *end_formulas(system, stages)),
+    )
+
+
+def families_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
+    """What each family of points is given, and what its results are called."""
+    meanings: dict[str, None] = {}
+    for family in stages.families:
+        given = list(gather_formulas(system, stages, family))
+        if given:
+            yield Paragraph(f"{_place(family)}:")
+            yield from given
+        meanings[meaning(family)] = None
+    yield Paragraph(f"{'; '.join(meanings)}.")
+
+
+def written_out(system: MechanicalSystem, method: Method, stages: StageSystem) -> StepEquations | None:
+    """The equations with everything put in, ``None`` where they would be too long to be read."""
+    points = sum(
+        len(family.abscissae) * sum(1 + operations(result) for result in family.results) for family in stages.families
+    )
+    return derive(system, method) if points * len(stages.rows) <= MOST_OPERATIONS else None
+
+
+def written_out_section(derived: StepEquations | None) -> Section:
+    """All equations component by component."""
+    title, name = "Written out", "written-out"
+    if derived is None:
+        text = (
+            "Written out, the equations of this system and method have many thousand operations: they are left out "
+            "here. The command scvi-codegen derive without --html prints them."
+        )
+        return Section(name=name, title=title, contents=(Paragraph(text),))
+    contents: list[Content] = [
+        Paragraph("The same equations component by component, positions and velocities put in, nothing simplified:")
+    ]
+    for _, group in groupby(derived.equations, key=lambda equation: equation.kind):
+        contents += formulas([_formula(equation) for equation in group], "equation", together=MOST_OPERATIONS)
+    q, p = derived.state
+    ends = zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True)
+    contents += formulas(
+        [Formula(e.residual, Symbol(f"{symbol.name.lstrip('_')}+1"), e.number) for symbol, e in ends],
+        "end value",
+        together=MOST_OPERATIONS,
+    )
+    contents.append(Paragraph("Newton's iteration begins on the straight line with the velocity that belongs to p_k:"))
+    contents += formulas([Formula(value, symbol) for symbol, value in derived.initial_guess.items()], "first guess")
+    return Section(name=name, title=title, contents=tuple(contents))
+
+
+def jacobian_section(
+    system: MechanicalSystem, stages: StageSystem, derived: StepEquations | None, program: Program
+) -> Section:
+    """Where the derivatives of the equations by their unknowns are not zero."""
+    pattern = jacobian_pattern(stages, system.dimension)
+    drawing = pattern_drawing(pattern)
+    text = (
+        f"Derivatives of the {pattern.size} equations with respect to the {pattern.size} unknowns: {pattern.entries} "
+        f"of {pattern.size**2} entries are not zero by structure. It is not written out but summed over the points "
+        "from the slopes of the kernels, the same expressions at every point."
+    )
+    contents: list[Content] = [Paragraph(text)]
+    contents += [] if drawing is None else [drawing]
+    if derived is not None and pattern.size <= LARGEST_SHOWN_JACOBIAN:
+        entries = derived.jacobian.todok().items()
+        contents += formulas([Formula(value, Symbol(f"J_{i + 1}_{j + 1}")) for (i, j), value in entries], "entry")
+    if program.newton:
+        contents.append(
+            Paragraph(
+                f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations a "
+                f"coordinate, {program.unknowns} numbers. In the order chosen, coordinates that meet are at most "
+                f"{program.bandwidth} apart, and the matrix is the band that follows, or full if that is smaller."
+            )
+        )
+    else:
+        contents.append(Paragraph("The step is explicit, or solved by sweeps alone: the C has no Jacobian."))
+    return Section(name="jacobian", title="Jacobian", contents=tuple(contents))
+
+
+def _rows(system: MechanicalSystem, stages: StageSystem, kinds: set[str]) -> Iterator[Formula]:
+    return (formula for row, formula in row_formulas(system, stages) if row.kind in kinds)
+
+
+def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
+    groups = groupby(stages.blocks, key=lambda block: block.name.rpartition("_")[0])
+    names = []
+    for _, blocks in groups:
+        members = [block.name.replace("_", "^") if block.name[0] in "QVP" else block.name for block in blocks]
+        names.append(", ".join(members if len(members) < 4 else (members[0], "..", members[-1])))
+    size = len(stages.blocks) * system.dimension
+    each = f", each of them {system.dimension} numbers" if system.dimension > 1 else ""
+    return f"Unknown are {', '.join(names)}{each}: {size} in all. Known are q_k, p_k, t_k and h."
+
+
+def _place(family: PointFamily) -> str:
+    first = family.name.partition("_")[0]
+    named = FAMILIES.get(first, f"At the points of '{family.name}'")
+    return named if len(family.abscissae) == 1 else f"{named}, {len(family.abscissae)} of them"
+
+
+def _formula(equation: Equation) -> Formula:
+    return Formula(equation.residual, sympy.S.Zero, equation.number)

@@ -1,0 +1,253 @@
+"""Stage equations of any method in a few lines: sums over points and unknowns, and one row for those alike."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import sympy
+from sympy import Symbol
+
+from scvi_codegen.derivation.page.columns import Column, column_of
+from scvi_codegen.derivation.page.result_names import argument_symbol, place_name, result_symbol
+from scvi_codegen.display.mathml.names import RAISED
+from scvi_codegen.display.page.blocks import Formula
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import Block, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.tables.precision import Number
+
+__all__ = ["end_formulas", "gather_formulas", "gathered", "row_formulas"]
+
+h, n, j = Symbol("h"), Symbol("n", integer=True), Symbol("j", integer=True)
+RUNNING_ROW = "i"
+
+
+def gather_formulas(system: MechanicalSystem, stages: StageSystem, family: PointFamily) -> Iterator[Formula]:
+    """What the kernel of a family is given at point n; what is an unknown itself is left out."""
+    for gather in family.gathers:
+        total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, place_name(family))
+        scale = sympy.Rational(str(gather.scale))
+        if scale == 1:
+            right = sympy.Add(*(h**gather.power * term for term in sympy.Add.make_args(total)))
+        else:
+            right = sympy.Mul(scale, h**gather.power, total, evaluate=not total.is_Add)
+        if right != left:
+            yield Formula(right, left)
+
+
+def row_formulas(system: MechanicalSystem, stages: StageSystem) -> Iterator[tuple[Row, Formula]]:
+    """The equations; rows that differ in an index alone are one, the range of its index beside the number."""
+    lines = [_Line.of(system, stages, r) for r in range(len(stages.rows))]
+    for _, alike in groupby(zip(stages.rows, lines, strict=True), key=lambda pair: pair[1].pattern):
+        members = list(alike)
+        row, first = members[0]
+        if len(members) == 1:
+            yield row, Formula(first.summed(first.base), sympy.S.Zero, row.number)
+            continue
+        number = re.sub(r"(?<=_)\d+$", RUNNING_ROW, row.number)
+        last = members[-1][1].base
+        bounds = f"{RUNNING_ROW} = {first.base}, {'.., ' * (len(members) > 2)}{last}"
+        yield row, Formula(first.summed(RUNNING_ROW), sympy.S.Zero, f"{number}, {bounds}")
+
+
+def end_formulas(system: MechanicalSystem, stages: StageSystem) -> tuple[Formula, Formula]:
+    """q_(k+1) and p_(k+1)."""
+    number_q, number_p = stages.end_numbers
+    end = _Line.of(system, stages, len(stages.rows))
+    return (
+        Formula(gathered(stages.end_position, stages.blocks), Symbol("q_k+1"), number_q),
+        Formula(end.summed(end.base), Symbol("p_k+1"), number_p),
+    )
+
+
+def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
+    """One line of a table times q_k and the unknowns, which are summed where they are of one kind."""
+    columns = [column_of(table, c) for c in range(len(blocks) + 1)]
+    first = columns[0]
+    if first.kind == "single" and [column.index for column in columns] == list(range(1, len(columns) + 1)):
+        return _unknown(_letter(blocks[0]), "n-1")  # the points are the nodes, and number 0 is q_k
+    entry = Symbol("G_n_0") if first.kind in ("single", "other") and first.points > 1 else first.entry(0)
+    terms = [entry * Symbol("q_k")] if first.kind != "zero" else []
+    numbered = list(zip(columns[1:], blocks, strict=True))
+    for letter, group in groupby(numbered, key=lambda pair: _letter(pair[1])):
+        terms += _group_terms(letter, list(group))
+    return sympy.Add(*terms)
+
+
+def _group_terms(letter: str, group: Sequence[tuple[Column, Block]]) -> Iterator[sympy.Expr]:
+    """Unknowns of one kind times their coefficients."""
+    columns, numbers = [column for column, _ in group], [_number(block) for _, block in group]
+    factor, span = h ** group[0][1].power, (j, numbers[0], numbers[-1])
+    kinds = {column.kind for column in columns}
+    named = [(column, number) for column, number in zip(columns, numbers, strict=True) if column.kind == "named"]
+    present = [(column, number) for column, number in zip(columns, numbers, strict=True) if column.kind != "zero"]
+    if not present:
+        return
+    if len(present) == 1 and present[0][0].kind in ("named", "constant"):
+        column, number = present[0]
+        yield factor * column.entry(column.index) * _unknown(letter, number)
+    elif named and "other" not in kinds and len({_ahead(column, number) for column, number in named}) == 1:
+        ahead = _ahead(*named[0])
+        yield factor * sympy.Sum(named[0][0].entry(f"j{ahead:+d}" if ahead else j) * _unknown(letter, j), span)
+    elif kinds == {"constant"} and len(set(columns)) == 1:
+        yield factor * columns[0].factor * sympy.Sum(_unknown(letter, j), span)
+    elif kinds == {"single"} and [column.index for column in columns] == numbers:
+        yield factor * columns[0].factor * _unknown(letter, n)
+    else:
+        yield factor * sympy.Sum(Symbol("G_n_j") * _unknown(letter, j), span)
+
+
+def _ahead(column: Column, number: int) -> int:
+    """By how much the index of a column is greater than that of its unknown."""
+    return 0 if column.index is None else column.index - number
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What one scatter gives to one line: what the table has there, and the result that it multiplies."""
+
+    system: MechanicalSystem
+    family: PointFamily
+    scatter: Scatter
+    column: Column
+    power: int
+
+    @property
+    def first(self) -> int:
+        """The number of the first point, as the names of the weights have it."""
+        return int(self.family.weight_names[0].rpartition("_")[2] or 1)
+
+    @property
+    def index(self) -> int | None:
+        """Of the column, or of the point of its single entry or its last leading one."""
+        kind, index = self.column.kind, self.column.index
+        return index + self.first - 1 if index is not None and kind in ("single", "leading") else index
+
+    def product(self, index: object) -> sympy.Expr:
+        """The entry times the result: at point n, or at the single point of the entry; weights left out."""
+        place = place_name(self.family, index if self.column.kind == "single" else n)
+        factor = sympy.Rational(str(self.scatter.scale)) * h**self.power
+        return factor * self.column.entry(index) * result_symbol(self.system, self.family, self.scatter, place)
+
+    def weight(self, index: object) -> sympy.Expr:
+        """Of a point, 1 where weights have no names."""
+        name = self.family.weight_names[0]
+        return Symbol(f"{name.rpartition('_')[0]}_{index}") if name else sympy.S.One
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """One row of the equations, or the line of p_(k+1).
+
+    Attributes:
+        momentum: coefficient of p_k: a number, or the column of q_(k+1) whose entry it is.
+        parts: what the scatters give.
+        kind: number and kind of the row, without its own index.
+        base: the index in which it differs from rows of the same pattern.
+    """
+
+    momentum: sympy.Expr | Column
+    parts: tuple[_Part, ...]
+    kind: tuple[str, ...]
+    base: int | None
+
+    @classmethod
+    def of(cls, system: MechanicalSystem, stages: StageSystem, r: int) -> _Line:
+        """Read a row; ``r`` beyond the last one is the line of p_(k+1)."""
+        row = stages.rows[r] if r < len(stages.rows) else None
+        parts = tuple(
+            _Part(system, family, scatter, column, scatter.power + (row.power if row else 0))
+            for family in stages.families
+            for scatter in family.scatters
+            if (column := column_of(scatter.table, r)).kind != "zero"
+        )
+        indices = [part.index for part in parts if part.index is not None and part.column.points > 1]
+        number = row.number if row else ""
+        if own := re.search(r"_(\d+)$", number):
+            indices.insert(0, int(own[1]))
+        kind = (number.removesuffix(own[0]) if own else number, row.kind if row else "end")
+        return cls(_momentum(stages, r), parts, kind, indices[0] if indices else None)
+
+    @property
+    def pattern(self) -> tuple[object, ...]:
+        """Equal for lines that differ in an index alone."""
+        momentum = self.momentum
+        if isinstance(momentum, Column):
+            coefficient: tuple[object, ...] = (momentum.prefix, self._shift(momentum.index))
+        else:
+            coefficient = (momentum,)
+        shapes = [
+            (
+                part.column.kind,
+                part.column.factor,
+                part.column.prefix,
+                self._shift(part.index),
+                id(part.scatter),
+                part.power,
+            )
+            for part in self.parts
+        ]
+        return (self.kind, coefficient, tuple(shapes))
+
+    def _shift(self, index: int | None) -> int | None:
+        return None if index is None or self.base is None else index - self.base
+
+    def summed(self, own: object) -> sympy.Expr:
+        """The right side, ``own`` in place of the line's own index."""
+
+        def placed(index: int | None) -> object:
+            shift = self._shift(index)
+            return index if shift is None or own == self.base else own if shift == 0 else f"{own}{shift:+d}"
+
+        momentum = self.momentum
+        factor = momentum.entry(placed(momentum.index)) if isinstance(momentum, Column) else momentum
+        terms = [factor * Symbol("p_k")]
+        sums: dict[tuple[str, object], list[tuple[_Part, sympy.Expr]]] = {}
+        for part in self.parts:
+            index = placed(part.index)
+            product = part.product(index)
+            if part.column.points == 1:
+                terms.append(part.weight(part.first) * product)
+            elif part.column.kind == "single":
+                terms.append(part.weight(index) * product)
+            else:
+                last = index if part.column.kind == "leading" else part.first + part.column.points - 1
+                sums.setdefault((part.family.name, last), []).append((part, product))
+        for (_, last), products in sums.items():
+            part = products[0][0]
+            total = part.weight(n) * sympy.Add(*(product for _, product in products))
+            terms.append(
+                sympy.Sum(total, (n, part.first, sympy.sympify(last) if isinstance(last, int) else Symbol(str(last))))
+            )
+        return sympy.Add(*terms)
+
+
+def _momentum(stages: StageSystem, r: int) -> sympy.Expr | Column:
+    """The coefficient of p_k: the entry of the line of q_(k+1) where it is that, else a number."""
+    if r == len(stages.rows):
+        return _small(stages.end_momentum)
+    value = stages.rows[r].momentum
+    column = column_of(stages.end_position, r + 1)
+    if column.prefix == "beta" and value == stages.end_position.entries[0][r + 1]:
+        return column
+    return _small(value)
+
+
+def _small(value: Number) -> sympy.Expr:
+    """Halves exactly, other numbers in 17 digits."""
+    doubled = 2 * value
+    return sympy.Rational(int(doubled), 2) if doubled == int(doubled) else sympy.Float(str(value), 17)
+
+
+def _letter(block: Block) -> str:
+    return block.name.rpartition("_")[0]
+
+
+def _number(block: Block) -> int:
+    return int(block.name.rpartition("_")[2])
+
+
+def _unknown(letter: str, index: object) -> Symbol:
+    return Symbol(f"{letter}{'__' if letter in RAISED else '_'}{index}")

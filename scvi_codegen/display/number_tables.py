@@ -1,0 +1,120 @@
+"""Nodes, quadratures and Runge-Kutta tableaux as tables to be read: radicals where they are short, and decimals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import sympy
+
+from scvi_codegen.display.cards import Html, grid, plain
+from scvi_codegen.display.mathml import mathml
+from scvi_codegen.tables.nodes import Nodes, exact_points
+from scvi_codegen.tables.precision import Number, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature, exact_rule
+from scvi_codegen.tables.tableau import Tableau, exact_tableau
+
+__all__ = ["NumberTable", "Part", "decimal", "number_table", "numbers_html", "positions", "short"]
+
+Part: TypeAlias = Nodes | Quadrature | Tableau
+"""What the numbers of a method are made from."""
+SHORT = 40
+"""Characters of an exact form that is shown."""
+SIGNIFICANT = 17
+MOST_ROWS = 12
+"""Of a table in a notebook."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NumberTable:
+    """Lines of text and of exact numbers.
+
+    Attributes:
+        title: what it is.
+        columns: headings.
+        rows: as many cells as columns.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str | sympy.Expr, ...], ...]
+
+
+def number_table(part: Part) -> NumberTable:
+    """All numbers of a part of a method."""
+    if isinstance(part, Tableau):
+        return _tableau_table(part)
+    if isinstance(part, Nodes):
+        exact = exact_points(part)
+        columns, series = [("node", part.points, exact)], range(len(part.points))
+        title = f"Nodes: {part.name}, degree {part.degree}"
+    else:
+        rule = exact_rule(part)
+        columns = [("point", part.points, rule and rule[0]), ("weight", part.weights, rule and rule[1])]
+        columns += [(f"weight of derivative {k}", w, None) for k, w in enumerate(part.derivative_weights, 1)]
+        series = range(1, len(part) + 1)
+        title = f"Quadrature: {part.name}, of order {part.order}"
+    written = [written for name, values, exact in columns for written in _columns(name, values, exact)]
+    return NumberTable(
+        title=title,
+        columns=("", *(name for name, _ in written)),
+        rows=tuple((str(number), *(cells[k] for _, cells in written)) for k, number in enumerate(series)),
+    )
+
+
+def numbers_html(table: NumberTable) -> Html:
+    """The first rows of a table for a notebook."""
+    rows = [[_cell(cell) for cell in row] for row in table.rows[:MOST_ROWS]]
+    left_out = len(table.rows) - len(rows)
+    title = f"{table.title} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.title
+    return grid(rows, head=table.columns, caption=title)
+
+
+def _cell(cell: str | sympy.Expr) -> Html:
+    return plain(cell) if isinstance(cell, str) else Html(mathml(cell))
+
+
+def positions(part: Part) -> Vector:
+    """Where on the step they stand, in [0, 1]."""
+    if isinstance(part, Tableau):
+        return part.c
+    return tuple((x + 1) / 2 for x in part.points)
+
+
+def decimal(value: Number) -> str:
+    """17 digits, as a double needs."""
+    return str(mp.nstr(value, SIGNIFICANT))
+
+
+def short(exact: sympy.Expr | None) -> bool:
+    """Whether an exact form is short enough to be shown."""
+    return exact is not None and len(str(exact)) <= SHORT
+
+
+def _columns(
+    name: str, values: Vector, exact: Sequence[sympy.Expr] | None
+) -> Iterator[tuple[str, tuple[str | sympy.Expr, ...]]]:
+    """The exact column where all its entries are short, and the decimal one where that says more."""
+    if exact is not None and all(map(short, exact)):
+        yield name, tuple(exact)
+        if all(x.is_Rational for x in exact):
+            return
+    yield name, tuple(map(decimal, values))
+
+
+def _tableau_table(tableau: Tableau) -> NumberTable:
+    exact = exact_tableau(tableau)
+    rows: list[tuple[str | sympy.Expr, ...]]
+    if exact is not None and all(short(x) for part in (*exact[0], *exact[1:]) for x in part):
+        A, b, c = exact
+        rows = [(c[i], *A[i]) for i in range(tableau.stages)] + [("", *b)]
+    else:
+        rows = [(decimal(tableau.c[i]), *map(decimal, tableau.A[i])) for i in range(tableau.stages)]
+        rows.append(("", *map(decimal, tableau.b)))
+    labels = [*(str(i) for i in range(1, tableau.stages + 1)), "b"]
+    return NumberTable(
+        title=f"Runge-Kutta tableau: {tableau.name}, of order {tableau.order}",
+        columns=("", "c", *(f"a_i{k}" for k in range(1, tableau.stages + 1))),
+        rows=tuple((label, *row) for label, row in zip(labels, rows, strict=True)),
+    )

@@ -1,0 +1,227 @@
+"""The exact discrete Lagrangian (6) and the exact flow to many digits: what every variational integrator approximates.
+
+    L_d^E(q0, q1) = integral of L(q(t), q'(t), t) from t to t + h, q the solution of (2) with q(t) = q0, q(t + h) = q1.
+
+Its derivatives are the momenta of that solution at its ends, p0 = -D_1 L_d^E and p1 = D_2 L_d^E, so the exact discrete
+Legendre transforms and the exact flow come with it. The solution is found by :mod:`scvi_codegen.exact.curve` on finer
+and finer grids, until two in a row agree to the digits asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.exact.curve import Curve, Grid
+from scvi_codegen.exact.mechanics import Mechanics
+from scvi_codegen.exact.newton import Array, NotConvergedError, largest
+from scvi_codegen.formulas.grammar import closest
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.tables.precision import Number, Vector, mp
+
+__all__ = ["ExactStep", "exact_discrete_lagrangian", "exact_map"]
+
+MOST_DIGITS = 50
+POINTS = (10, 15, 22, 32)
+"""Gauss points a piece; all are tried on the fewest pieces for which a solution is found, then the last alone."""
+PIECES = (1, 2, 4, 8, 16)
+MOST_STRAIGHT = 2
+"""Pieces with which a straight line is tried as first guess; more have not helped."""
+
+Values = Mapping[str, Any] | Sequence[Any] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExactStep:
+    """A piece of an exact trajectory; numbers are ``mpmath`` numbers of 60 digits, correct to about ``error``.
+
+    Attributes:
+        q0, q1: m positions at t and t + h.
+        p0, p1: m momenta there: the exact discrete Legendre transforms are F-: (q0, q1) -> (q0, p0) and
+            F+: (q0, q1) -> (q1, p1), the exact flow is (q0, p0) -> (q1, p1).
+        v0, v1: m velocities there.
+        action: L_d^E(q0, q1), paper (6).
+        error: estimated error, relative to the size of the position, of the momentum and of the integral of ``|L|``.
+    """
+
+    q0: Vector
+    q1: Vector
+    p0: Vector
+    p1: Vector
+    v0: Vector
+    v1: Vector
+    action: Number
+    error: Number
+
+
+def exact_discrete_lagrangian(
+    system: LagrangianSystem,
+    q0: Sequence[Any],
+    q1: Sequence[Any],
+    h: Any,
+    *,
+    t: Any = 0.0,
+    parameters: Values = None,
+    digits: int = 30,
+    guess: Sequence[Any] | None = None,
+) -> ExactStep:
+    """Solve the Euler-Lagrange boundary-value problem from q0 at t to q1 at t + h; paper (6).
+
+    Several solutions may join two points (a pendulum can wind round); Newton's iteration starts from the straight line,
+    or from the trajectory that leaves q0 with the velocity ``guess``.
+
+    Args:
+        system: any regular Lagrangian.
+        q0, q1: m positions each. Floats stand for their exact binary values; strings such as ``"0.1"``, integers,
+            fractions, mpmath and SymPy numbers are taken to 60 digits.
+        h: step, negative to go back.
+        t: time at the start.
+        parameters: by name (others keep their defaults) or all in order.
+        digits: asked for, 1 to 50.
+        guess: m velocities at the start, near those of the solution wanted.
+
+    Raises:
+        StateError: on numbers that are none, wrong shapes or names; if no solution is found; if q1 is conjugate to q0,
+            where the solution is not unique.
+    """
+    problem = _Problem(system, h, t, parameters, digits)
+    start, end = problem.vector(q0, "q0"), problem.vector(q1, "q1")
+    velocity = None if guess is None else problem.vector(guess, "guess")
+
+    def solve(grid: Grid) -> Curve:
+        nonlocal velocity
+        mechanics, times = problem.mechanics, (problem.t, problem.h)
+        if velocity is None and grid.pieces > MOST_STRAIGHT:
+            raise NotConvergedError("Newton's iteration from the straight line stalls")
+        if velocity is None:
+            first = Curve.straight(mechanics, grid, *times, start, end)
+        else:
+            first = Curve.launched(mechanics, grid, *times, start, velocity, digits)
+        curve = first.joined_to(end, digits)
+        velocity = curve.velocity
+        return curve
+
+    hint = "give guess, the velocity at the start, or take a smaller step"
+    return problem.answer(solve, f"no trajectory from q0 = {_shown(start)} to q1 = {_shown(end)} was found: {hint}")
+
+
+def exact_map(
+    system: LagrangianSystem,
+    q0: Sequence[Any],
+    p0: Sequence[Any],
+    h: Any,
+    *,
+    t: Any = 0.0,
+    parameters: Values = None,
+    digits: int = 30,
+) -> ExactStep:
+    """Follow the exact trajectory from (q0, p0) at t to t + h: the map that L_d^E generates by (5).
+
+    Args:
+        system: any regular Lagrangian.
+        q0, p0: m positions and m momenta.
+        h, t, parameters, digits: as in :func:`exact_discrete_lagrangian`.
+
+    Raises:
+        StateError: on numbers that are none, wrong shapes or names; if the trajectory does not exist up to t + h, or is
+            too far from smooth to be followed in 16 pieces.
+    """
+    problem = _Problem(system, h, t, parameters, digits)
+    start, momenta = problem.vector(q0, "q0"), problem.vector(p0, "p0")
+    origin = f"the trajectory from q0 = {_shown(start)}, p0 = {_shown(momenta)}"
+    try:
+        velocity = problem.mechanics.velocity(start, momenta, problem.t, digits)
+    except ArithmeticError as failure:
+        raise StateError(f"{origin}: no velocity has this momentum ({failure})") from failure
+
+    def solve(grid: Grid) -> Curve:
+        return Curve.launched(problem.mechanics, grid, problem.t, problem.h, start, velocity, digits)
+
+    return problem.answer(solve, f"{origin} was not found up to h = {mp.nstr(problem.h, 8)}: take a smaller step")
+
+
+class _Problem:
+    """Checked arguments, and the search for a grid that is fine enough."""
+
+    def __init__(self, system: LagrangianSystem, h: Any, t: Any, parameters: Values, digits: int) -> None:
+        if isinstance(digits, bool) or not isinstance(digits, int) or not 1 <= digits <= MOST_DIGITS:
+            raise StateError(f"digits must be a whole number from 1 to {MOST_DIGITS}, not {digits!r}")
+        self.names = [coordinate.name for coordinate in system.coordinates]
+        self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
+        if self.h == 0:
+            raise StateError("the step h is 0")
+        self.mechanics = Mechanics(system, _parameter_values(system, parameters))
+
+    def vector(self, values: Sequence[Any], name: str) -> Array:
+        """(m,) numbers."""
+        entries = [values] if isinstance(values, str) or not hasattr(values, "__len__") else list(values)
+        if len(entries) != len(self.names):
+            raise StateError(f"{name} must be {len(self.names)} numbers ({', '.join(self.names[:6])}), not {values!r}")
+        numbers = [_number(entry, f"{name}[{index}] ({self.names[index]})") for index, entry in enumerate(entries)]
+        return np.array(numbers, dtype=object)
+
+    def answer(self, solve: Callable[[Grid], Curve], complaint: str) -> ExactStep:
+        """The solution on the first grid that agrees with the one before."""
+        coarse, reason = None, ""
+        for pieces in PIECES:
+            for points in POINTS if coarse is None else POINTS[-1:]:
+                try:
+                    fine = solve(Grid.of(points, pieces))
+                    error = mp.inf if coarse is None else _difference(coarse, fine)
+                except ArithmeticError as failure:
+                    reason = str(failure)
+                    break
+                if error <= mp.mpf(10) ** -self.digits:
+                    return _step(fine, error)
+                coarse, reason = fine, f"{points} points in each of {pieces} pieces give only {mp.nstr(error, 2)}"
+        raise StateError(f"{complaint} ({reason})")
+
+
+def _step(curve: Curve, error: Number) -> ExactStep:
+    ends = {"q": curve.ends(), "v": curve.end_velocities(), "p": curve.end_momenta()}
+    named = {f"{name}{index}": tuple(values) for name, pair in ends.items() for index, values in enumerate(pair)}
+    return ExactStep(**named, action=curve.action(), error=error)
+
+
+def _difference(coarse: Curve, fine: Curve) -> Number:
+    """The largest difference of action, ends and momenta, each relative to the size of its kind along the curve."""
+    differences = (
+        abs(fine.action() - coarse.action()),
+        largest(np.array(fine.ends()) - np.array(coarse.ends())),
+        largest(np.array(fine.end_momenta()) - np.array(coarse.end_momenta())),
+    )
+    return max(error / size if error else mp.zero for error, size in zip(differences, fine.sizes(), strict=True))
+
+
+def _number(value: Any, name: str) -> Number:
+    try:
+        number = mp.mpf(mp.convert(str(value.evalf(mp.dps)) if hasattr(value, "evalf") else value))
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise StateError(f"{name} must be a real number, not {value!r}") from error
+    if not mp.isfinite(number):
+        raise StateError(f"{name} is {number}")
+    return number
+
+
+def _parameter_values(system: LagrangianSystem, parameters: Values) -> dict[str, Number]:
+    names = [parameter.name for parameter in system.parameters]
+    if parameters is None or isinstance(parameters, Mapping):
+        given = dict(zip(names, system.defaults, strict=True)) | dict(parameters or {})
+    elif len(parameters) == len(names):
+        given = dict(zip(names, parameters, strict=True))
+    else:
+        raise StateError(f"there are {len(names)} parameters ({', '.join(names)}), not {len(parameters)}")
+    for name in given:
+        if name not in names:
+            raise StateError(
+                f"there is no parameter '{name}'{closest(name, names)} Known: {', '.join(names) or 'none'}"
+            )
+    return {name: _number(value, f"the parameter {name}") for name, value in given.items()}
+
+
+def _shown(values: Array) -> str:
+    return f"({', '.join(mp.nstr(value, 6) for value in values)})"

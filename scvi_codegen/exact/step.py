@@ -1,0 +1,265 @@
+"""One step of a method's equations in 60 digits: what the compiled step should be, free of round-off.
+
+It shares with the compiled code what the method is and nothing of how it is solved: the equations are the paper's
+(:meth:`~scvi_codegen.methods.method.Method.paper_form`, those that :func:`~scvi_codegen.derivation.equations.derive`
+writes out), kernels are evaluated expression by expression, and the matrix of Newton's iteration comes from finite
+differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.exact.motion import Numbers, motion_of, numbers
+from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+from scvi_codegen.tables.precision import Number, mp
+
+__all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
+
+MOST_ITERATIONS = 60
+WIDTH = mp.mpf(10) ** -30
+"""Relative, of the differences: slopes to 30 digits."""
+REFINEMENTS = 4
+STEADY = mp.mpf("0.1")
+"""The matrix is kept while updates shrink so fast."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolvedStep:
+    """The unknowns of a step, in the order of the derivation, and the state at its end."""
+
+    unknowns: tuple[Number, ...]
+    q: tuple[Number, ...]
+    p: tuple[Number, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    q: Numbers
+    p: Numbers
+    h: Number
+    t: Number
+
+
+class DerivedStep:
+    """The stage equations of a system as functions of numbers; parameters have their default values."""
+
+    def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
+        self.system, self.stages, self.motion = system, stages, motion_of(system)
+        symbols = [(*family.arguments, system.time, *system.parameters) for family in stages.families]
+        self.kernels = [Tape(family.results, own) for family, own in zip(stages.families, symbols, strict=True)]
+        self.scalars = [
+            None if family.scalar is None else Tape([family.scalar], own)
+            for family, own in zip(stages.families, symbols, strict=True)
+        ]
+        self.powers = [row.power for row in stages.rows] + [0]
+        self.momenta = numbers([*(row.momentum for row in stages.rows), stages.end_momentum])
+        self.gathers = [[numbers(gather.table.entries) for gather in family.gathers] for family in stages.families]
+        self.scatters = [[numbers(scatter.table.entries) for scatter in family.scatters] for family in stages.families]
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers a step is solved for."""
+        return len(self.stages.blocks) * self.system.dimension
+
+    def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
+        """The step from (q, p) at t to t + h; numbers are taken as they are given, so 0.1 is the double.
+
+        Raises:
+            StateError: if Newton's iteration does not converge.
+        """
+        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
+        z = self._straight(known)
+        matrix, rows, last = None, self._rows(z, known), mp.inf
+        for _ in range(MOST_ITERATIONS):
+            if matrix is None:
+                matrix = self._inverse(self._exact_matrix(z, known), known)
+            change = self._solved(matrix, rows[:-1])
+            size = max(map(abs, change.ravel()))
+            z, rows, whole = self._moved(z, change, known)
+            if whole and size <= mp.eps**0.75 * max(1, *map(abs, z.ravel())):
+                return self._end(z, rows, known)
+            if size > STEADY * last:
+                matrix = None
+            last = size
+        raise StateError(f"the derived equations were not solved in {MOST_ITERATIONS} iterations with h = {float(h):g}")
+
+    def _moved(self, z: Numbers, change: Numbers, known: _Known) -> tuple[Numbers, Numbers, bool]:
+        """Unknowns and rows after the update, or so much of it that the formula is defined; whether it is the whole."""
+        for halvings in range(MOST_ITERATIONS):
+            trial = z - change / 2**halvings
+            try:
+                return trial, self._rows(trial, known), halvings == 0
+            except ArithmeticError:
+                continue
+        raise StateError(f"the derived equations lead out of the domain of the formula with h = {float(known.h):g}")
+
+    def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
+        """What one update of Newton's iteration makes of the straight line, the matrix from finite differences."""
+        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
+        z = self._straight(known)
+        matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[:-1]
+        inverse = self._inverse(matrix, known)
+        update = self._solved(inverse, rows)
+        for _ in range(REFINEMENTS):
+            update = update + self._solved(inverse, rows - (matrix @ update.ravel()).reshape(rows.shape))
+        z = z - update
+        return self._end(z, self._rows(z, known), known)
+
+    def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
+        """(m,) and (blocks, m) derivatives of the generating function by q0 and the unknowns, by central differences.
+
+        ``None`` where a family of points has no scalar.
+        """
+        if None in self.scalars:
+            return None
+        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
+        z = np.array(solved.unknowns, dtype=object).reshape(len(self.stages.blocks), -1)
+        joined = np.concatenate([known.q[None], z])
+
+        def action(values: Numbers) -> Number:
+            return self._action(values[1:], _Known(values[0], known.p, known.h, known.t))
+
+        slopes = np.empty_like(joined)
+        for place in np.ndindex(joined.shape):
+            width = mp.mpf(10) ** -18 * max(1, abs(joined[place]))
+            ends = []
+            for sign in (1, -1):
+                moved = joined.copy()
+                moved[place] += sign * width
+                ends.append(action(moved))
+            slopes[place] = (ends[0] - ends[1]) / (2 * width)
+        return slopes[0], slopes[1:]
+
+    def _action(self, z: Numbers, known: _Known) -> Number:
+        total = mp.zero
+        for f, family in enumerate(self.stages.families):
+            arguments = self._arguments(f, z, known)
+            scale = mp.mpf(family.scatters[0].scale.numerator) / family.scatters[0].scale.denominator
+            scale /= mp.mpf(family.gathers[0].scale.numerator) / family.gathers[0].scale.denominator
+            for n, weight in enumerate(family.weights):
+                scalar = self.scalars[f]
+                assert scalar is not None  # or there would be no slopes
+                (value,) = scalar(self._point(family, n, arguments[n], known))
+                total += scale * weight * known.h ** (1 + family.scalar_power) * value
+        return total
+
+    def _straight(self, known: _Known) -> Numbers:
+        """(blocks, m): the straight line with the velocity of the initial state."""
+        v = self.motion.velocity(known.q, known.p, known.t)
+        return np.array(
+            [
+                known.q * block.straight[0]
+                + v * (block.straight[1] * known.h ** (1 - block.power))
+                + known.p * block.momentum
+                for block in self.stages.blocks
+            ],
+            dtype=object,
+        )
+
+    def _arguments(self, f: int, z: Numbers, known: _Known) -> Numbers:
+        """(points, arguments) of the kernel of a family."""
+        powers = np.array([known.h**block.power for block in self.stages.blocks], dtype=object)
+        columns = np.concatenate([known.q[None], powers[:, None] * z])
+        parts = []
+        for gather, table in zip(self.stages.families[f].gathers, self.gathers[f], strict=True):
+            factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
+            parts.append((table @ columns) * factor)
+        return np.concatenate(parts, axis=1)
+
+    def _point(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> list[Number]:
+        return [*arguments, known.t + family.abscissae[n] * known.h, *self.motion.parameters]
+
+    def _kernel(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
+        return np.array(self.kernels[f](self._point(self.stages.families[f], n, arguments, known)), dtype=object)
+
+    def _factor(self, family: PointFamily, s: int, n: int, r: Any, known: _Known) -> Number:
+        scatter = family.scatters[s]
+        scale = mp.mpf(scatter.scale.numerator) / scatter.scale.denominator
+        return scale * family.weights[n] * known.h ** (scatter.power + self.powers[r])
+
+    def _rows(self, z: Numbers, known: _Known) -> Numbers:
+        """(blocks + 1, m): the equations, and p1."""
+        rows = self.momenta[:, None] * known.p[None]
+        m = self.system.dimension
+        for f, family in enumerate(self.stages.families):
+            arguments = self._arguments(f, z, known)
+            for n in range(len(family.abscissae)):
+                values = self._kernel(f, n, arguments[n], known)
+                for s, table in enumerate(self.scatters[f]):
+                    own = values[s * m : (s + 1) * m]
+                    for r in np.flatnonzero(table[n]):
+                        rows[r] = rows[r] + own * (self._factor(family, s, n, r, known) * table[n, r])
+        return rows
+
+    def _exact_matrix(self, z: Numbers, known: _Known) -> Numbers:
+        """Derivatives of the rows by the unknowns, those of the kernels by differences."""
+        blocks, m = len(self.stages.blocks), self.system.dimension
+        matrix = numbers(np.zeros((blocks, m, blocks, m)))
+        powers = [known.h**block.power for block in self.stages.blocks]
+        for f, family in enumerate(self.stages.families):
+            arguments = self._arguments(f, z, known)
+            for n in range(len(family.abscissae)):
+                slopes = self._kernel_slopes(f, n, arguments[n], known)
+                for s, rows in enumerate(self.scatters[f]):
+                    for g, gather in enumerate(family.gathers):
+                        own = slopes[s * m : (s + 1) * m, g * m : (g + 1) * m]
+                        moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
+                        for r in np.flatnonzero(rows[n, :-1]):
+                            factor = self._factor(family, s, n, r, known) * rows[n, r] * moved
+                            for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
+                                entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
+                                matrix[r, :, b, :] += own * entry
+        return matrix.reshape(blocks * m, blocks * m)
+
+    def _kernel_slopes(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
+        values = self._kernel(f, n, arguments, known)
+        slopes = numbers(np.zeros((len(values), len(arguments))))
+        for i in range(len(arguments)):
+            moved, width = arguments.copy(), WIDTH * max(1, abs(arguments[i]))
+            moved[i] += width
+            slopes[:, i] = (self._kernel(f, n, moved, known) - values) / width
+        return slopes
+
+    def _inverse(self, exact: Numbers, known: _Known) -> Numbers:
+        """The inverse in double precision, with rows and columns scaled to size 1: later updates correct it."""
+        rows = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact], dtype=object)
+        exact = rows[:, None] * exact
+        columns = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact.T], dtype=object)
+        try:
+            inverse = np.linalg.inv((exact * columns).astype(float)).astype(object)
+        except np.linalg.LinAlgError as error:
+            raise StateError(f"the derived equations are singular with h = {float(known.h):g}") from error
+        result: Numbers = columns[:, None] * inverse * rows
+        return result
+
+    def _solved(self, inverse: Numbers, rows: Numbers) -> Numbers:
+        update: Numbers = (inverse @ rows.ravel()).reshape(rows.shape)
+        return update
+
+    def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
+        powers = np.array([known.h**block.power for block in self.stages.blocks], dtype=object)
+        row = numbers(self.stages.end_position.entries[0])
+        q = row @ np.concatenate([known.q[None], powers[:, None] * z])
+        return SolvedStep(unknowns=tuple(z.ravel()), q=tuple(q), p=tuple(rows[-1]))
+
+
+@lru_cache(maxsize=64)
+def derived_step(system: MechanicalSystem, method: Method) -> DerivedStep:
+    """The paper's equations of a method for a system, derived once a process."""
+    return DerivedStep(system, with_auxiliaries(system, method.paper_form(system)))
+
+
+@lru_cache(maxsize=64)
+def compiled_equations(system: MechanicalSystem, method: Method) -> DerivedStep:
+    """The same map in the unknowns of the compiled code."""
+    return DerivedStep(system, with_auxiliaries(system, method.stage_system(system)))

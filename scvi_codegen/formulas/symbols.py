@@ -1,0 +1,110 @@
+r"""Names of coordinates, velocities, momenta and parameters: which are fit, and how a user's become ours.
+
+Every symbol is ``Symbol(name, real=True)`` with a plain identifier as name: coordinate ``q`` has the velocity
+``q_dot``, time is ``t``. Names given by the user are mapped as follows.
+
+* ``\theta_1``, ``\theta_{1}`` and ``θ_1`` become ``theta_1``; spaces become underscores.
+* Refused, with the name: what is no identifier even then, keywords of C, functions and constants of the grammar,
+  ``t`` for anything but time, ``q_dot`` for anything but the velocity of ``q``, two symbols that end up the same.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Sequence
+from typing import Any
+
+from sympy import Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.grammar import FUNCTIONS
+
+__all__ = ["C_KEYWORDS", "DOT", "TIME", "check_name", "check_names", "given_name", "identifier", "number", "symbol"]
+
+C_KEYWORDS = frozenset(
+    """
+    alignas alignof auto bool break case char const constexpr continue default do double else enum extern false float
+    for goto if inline int long nullptr register restrict return short signed sizeof static static_assert struct switch
+    thread_local true typedef typeof typeof_unqual union unsigned void volatile while asm fortran
+    """.split()  # noqa: SIM905  (a paragraph of words reads better than fifty quoted ones)
+)
+
+IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
+TIME = "t"
+DOT = "_dot"
+
+
+def symbol(name: str) -> Symbol:
+    """The real symbol of that name."""
+    return Symbol(name, real=True)
+
+
+def number(name: str, value: Any) -> float:
+    """Convert a default value; text and complex numbers are refused, not converted."""
+    try:
+        converted = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        converted = math.nan
+    if not math.isfinite(converted):
+        raise SystemDefinitionError(f"the default value of parameter '{name}' is not a finite real number: {value!r}")
+    return converted
+
+
+def identifier(name: str) -> str:
+    r"""Spell a name with letters, digits and underscores where that is harmless: ``\theta_{1}`` -> ``theta_1``."""
+    spelled = "".join(_letter(character) for character in name.strip())
+    return re.sub(r"\s+", "_", spelled.replace("{", "").replace("}", "").replace("\\", ""))
+
+
+def _letter(character: str) -> str:
+    words = unicodedata.name(character, "").split()
+    if words[:1] != ["GREEK"] or words[2:3] != ["LETTER"] or len(words) != 4:
+        return character
+    letter = words[3].replace("LAMDA", "LAMBDA")
+    return letter.lower() if words[1] == "SMALL" else letter.capitalize()
+
+
+def given_name(key: object) -> str:
+    """The name of a parameter given as a symbol or as text."""
+    if isinstance(key, Symbol):
+        return str(key.name)
+    if isinstance(key, str):
+        return key
+    raise SystemDefinitionError(f"a parameter is a symbol or a name, not {key!r} ({type(key).__name__})")
+
+
+def check_name(name: object) -> None:
+    """Raise :class:`SystemDefinitionError` for what cannot be a name in C and in formulas."""
+    if not isinstance(name, str) or not IDENTIFIER.fullmatch(name):
+        raise SystemDefinitionError(
+            f"{name!r} is not a name: use letters a-z, A-Z, digits and underscores, beginning with a letter"
+        )
+    if name in C_KEYWORDS:
+        raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for instance to '{name}_'")
+    if name in FUNCTIONS or name == "pi":
+        raise SystemDefinitionError(f"'{name}' has a meaning in formulas: rename the symbol, for instance to '{name}_'")
+
+
+def check_names(coordinates: Sequence[str], parameters: Sequence[str], momenta: Sequence[str] = ()) -> None:
+    """The same for all names of a system, and for one name in two roles."""
+    if not coordinates:
+        raise SystemDefinitionError("a system needs at least one coordinate: coordinates is empty")
+    roles: dict[str, str] = {TIME: "time"}
+    for name in (*coordinates, *momenta, *parameters):
+        check_name(name)
+    described = [
+        *((name, f"coordinate '{name}'") for name in coordinates),
+        *((name + DOT, f"the velocity of '{name}'") for name in coordinates),
+        *((name, f"momentum '{name}'") for name in momenta),
+        *((name, f"parameter '{name}'") for name in parameters),
+    ]
+    for name, role in described:
+        if roles.get(name) == role:
+            raise SystemDefinitionError(f"{role} is listed twice: list it once")
+        if name in roles:
+            shadowed = role.startswith("parameter") and roles[name].startswith("coordinate")
+            hint = " (a coordinate is used as a parameter: take it out of the parameters)" if shadowed else ""
+            raise SystemDefinitionError(f"'{name}' is the name of both {roles[name]} and {role}: rename one{hint}")
+        roles[name] = role

@@ -1,0 +1,116 @@
+"""From SymPy as users write it, with functions of time and derivatives, to the canonical symbols of a system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.grammar import evaluated
+from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
+
+__all__ = ["Translation"]
+
+
+class Translation:
+    """The map from a user's symbols, functions of time and derivatives to canonical symbols.
+
+    Attributes:
+        coordinates, momenta, parameters: canonical symbols.
+        rules: from what the user writes to symbols.
+    """
+
+    def __init__(
+        self,
+        expression: Expr,
+        coordinates: Sequence[Expr],
+        *,
+        velocities: Sequence[Expr] | None = None,
+        momenta: Sequence[Expr] = (),
+        time: Symbol | None,
+        parameters: tuple[str, ...],
+    ) -> None:
+        self.rules: dict[Expr, Expr] = {}
+        self.free = sorted(expression.free_symbols, key=lambda free: str(free.name))
+        self.user_time = self._time(coordinates, time, parameters)
+        if self.user_time is not None:
+            self._add(self.user_time, TIME)
+        if velocities is not None and len(velocities) != len(coordinates):
+            raise SystemDefinitionError(
+                f"{len(coordinates)} coordinates, but {len(velocities)} velocities: list one each"
+            )
+        self.coordinates = tuple(self._coordinate(coordinate) for coordinate in coordinates)
+        for index, coordinate in enumerate(coordinates):
+            self._velocity(coordinate, None if velocities is None else velocities[index])
+        self.momenta = tuple(self._coordinate(momentum, "momentum") for momentum in momenta)
+        self.parameters = tuple(self._parameter(parameter) for parameter in parameters)
+        for free in self.free:
+            if free not in self.rules:
+                self._add(free, identifier(free.name))
+
+    def apply(self, expression: Expr, what: str = "Lagrangian") -> Expr:
+        """The expression in canonical symbols, its numbers exact."""
+        unfolded = {derivative: derivative.doit() for derivative in expression.atoms(sympy.Derivative)}
+        result = evaluated(expression.xreplace(unfolded), self.rules)
+        leftover = sorted(result.atoms(sympy.Derivative) or result.atoms(AppliedUndef), key=str)
+        if leftover:
+            raise SystemDefinitionError(
+                f"'{leftover[0]}' in the {what} is neither a coordinate nor the velocity of one: list it among the "
+                "coordinates, or write a given function of time with the functions of the grammar (accelerations and "
+                "other higher derivatives are not supported)"
+            )
+        return result
+
+    def _add(self, source: Expr, name: str) -> Symbol:
+        target = symbol(name)
+        if self.rules.get(source, target) != target:
+            raise SystemDefinitionError(f"'{source}' is used both as '{self.rules[source]}' and as '{name}'")
+        for other, taken in self.rules.items():
+            if taken == target and other != source and not isinstance(other, sympy.Derivative):
+                raise SystemDefinitionError(
+                    f"'{other}' and '{source}' are different symbols that would both be called '{name}': rename one "
+                    "(two symbols of one name and different assumptions are different, too)"
+                )
+        self.rules[source] = target
+        return target
+
+    def _time(self, coordinates: Sequence[Expr], time: Symbol | None, parameters: tuple[str, ...]) -> Symbol | None:
+        if time is not None:
+            return time
+        functions = [coordinate for coordinate in coordinates if isinstance(coordinate, AppliedUndef)]
+        if functions:
+            return functions[0].args[0]
+        candidates = [free for free in self.free if free.name == TIME and free not in coordinates]
+        return candidates[0] if candidates and TIME not in parameters else None
+
+    def _coordinate(self, coordinate: Expr, role: str = "coordinate") -> Symbol:
+        if isinstance(coordinate, AppliedUndef):
+            if coordinate.args != (self.user_time,):
+                raise SystemDefinitionError(f"{role} '{coordinate}' is not a function of time '{self.user_time}' alone")
+            return self._add(coordinate, identifier(coordinate.func.__name__))
+        if not isinstance(coordinate, Symbol):
+            raise SystemDefinitionError(f"{role} {coordinate!r} is neither a symbol nor a function of time")
+        return self._add(coordinate, identifier(coordinate.name))
+
+    def _velocity(self, coordinate: Expr, velocity: Expr | None) -> None:
+        name = self.rules[coordinate].name + DOT
+        if isinstance(coordinate, AppliedUndef):
+            self.rules[sympy.Derivative(coordinate, self.user_time)] = symbol(name)
+        if velocity is not None:
+            if not isinstance(velocity, (Symbol, AppliedUndef, sympy.Derivative)):
+                raise SystemDefinitionError(f"velocity {velocity!r} is neither a symbol nor a derivative")
+            self._add(velocity, name)
+        elif isinstance(coordinate, Symbol):
+            for free in self.free:
+                if free.name == coordinate.name + DOT:
+                    self._add(free, name)
+
+    def _parameter(self, parameter: str) -> Symbol:
+        name = identifier(parameter)
+        for free in self.free:
+            if free.name == parameter and free not in self.rules:
+                self._add(free, name)
+        return symbol(name)

@@ -1,0 +1,86 @@
+"""The fixed-point solver of collocation in position form: accelerations at the nodes, as lanes.
+
+It serves what collocates the Euler-Lagrange equations and is not variational: spectral collocation and Runge-Kutta
+methods in position form, whose momenta at both ends are those of the velocities there, and the shooting-based method as
+printed, whose momenta at both ends are quadratures. The equations, those of ``methods/collocation.py`` and
+``methods/shooting.py`` solved for the accelerations, stand at :class:`scvi_codegen.ir.program.CollocationSweep`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from scvi_codegen.ir.program import CollocationSweep, Kernel, PrintedEnds
+from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector
+from scvi_codegen.mechanics.forms import applied_force, mass_entries
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values
+from scvi_codegen.tables.precision import Number
+from scvi_codegen.tables.tableau import Tableau
+
+__all__ = ["position_sweep", "printed_sweep"]
+
+
+def position_sweep(system: MechanicalSystem, tableau: Tableau) -> CollocationSweep | None:
+    """The fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
+    lanes = lane_count(len(tableau.b))
+    if lanes > MOST_LANES:
+        return None
+    kernel, entries = _node_kernel(system)
+    return CollocationSweep(
+        lanes=lanes,
+        nodes=node_tables(tableau, lanes),
+        points=None,
+        kernel=kernel,
+        mass_entries=entries,
+        ends=None,
+    )
+
+
+def printed_sweep(system: MechanicalSystem, method: SCVI) -> CollocationSweep | None:
+    """The fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
+    lanes = lane_count(max(method.degree, len(method.rule)))
+    if lanes > MOST_LANES:
+        return None
+    kernel, entries = _node_kernel(system)
+    return CollocationSweep(
+        lanes=lanes,
+        nodes=node_tables(method.tableau, lanes),
+        points=point_tables(system, method.tableau, method.rule, lanes),
+        kernel=kernel,
+        mass_entries=entries,
+        ends=_printed_ends(method, lanes),
+    )
+
+
+def _printed_ends(method: SCVI, lanes: int) -> PrintedEnds:
+    """Weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
+    rule, nodes = method.rule, (0, *method.tableau.c)
+    values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_slopes))
+
+    def weighted(numbers: Iterable[Number]) -> tuple[float, ...]:
+        return pad_vector(tuple(w * x for w, x in zip(rule.unit_weights, numbers, strict=True)), lanes)
+
+    return PrintedEnds(
+        start_force=weighted(line[0] for line in values),
+        start_momentum=weighted(line[0] for line in slopes),
+        end_force=weighted(line[0] + line[-1] for line in values),
+        end_momentum=weighted(line[0] + line[-1] for line in slopes),
+    )
+
+
+def _node_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+    """L_q - L_vq v - L_vt and the lower triangle of the mass."""
+    mass = {key: entry for key, entry in mass_entries(system).items() if key[0] >= key[1]}
+    kernel = lower_kernel(
+        "applied_force_lanes",
+        arguments=(*system.coordinates, *system.velocities),
+        time=system.time,
+        parameters=system.parameters,
+        values=applied_force(system),
+        slopes=tuple(mass.values()),
+    )
+    return kernel, tuple(mass)

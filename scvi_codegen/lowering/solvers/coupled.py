@@ -1,0 +1,98 @@
+"""The fixed-point solver for any regular Lagrangian: velocities are corrected by the mass at each point, in lanes.
+
+The equations are L_v(q_n, V_n) = P_n with q_n and P_n from the two tables of a method. With other points than
+velocities (an SVI of another quadrature) the s velocities z_b give V_n = sum_b l_nb z_b and the equations are projected
+on them: a correction goes to the points by l, through the mass of each, and back by the projection.
+
+For a variational method the two tables belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
+rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51,
+the rounded map still has a generating function: its energy error does not drift.
+"""
+
+from __future__ import annotations
+
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.ir.program import CoupledSweep, Kernel
+from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
+from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.basis import transpose
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+__all__ = ["coupled_sweep", "over", "weighted_tables"]
+
+FRACTION_BITS = 51
+
+
+def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSweep | None:
+    """The fixed-point iteration of a system; ``None`` with too many points."""
+    points, blocks = len(tables.abscissae), len(tables.blocks)
+    lanes = lane_count(max(points, blocks))
+    if lanes > MOST_LANES:
+        return None
+    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
+    guess = guess_tables(tables.blocks, lanes)
+    kernel, entries = _point_kernel(system)
+    return CoupledSweep(
+        points=points,
+        blocks=blocks,
+        lanes=lanes,
+        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
+        position=pad_matrix(position, lanes),
+        position_weights=pad_vector(position_weights, lanes),
+        momentum=pad_matrix(momenta, lanes),
+        momentum_weights=pad_vector(momentum_weights, lanes),
+        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
+        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
+        velocity=pad_matrix(tables.velocity, lanes) if tables.velocity else (),
+        projection=pad_matrix(tables.projection, lanes) if tables.projection else (),
+        guess=guess,
+        kernel=kernel,
+        force=_force_kernel(system),
+        mass_entries=entries,
+    )
+
+
+def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
+    """Position table and weights, momentum table and weights, whose products are the method's own tables."""
+    beta, weights = tables.end_position, tables.end_momentum
+    if not tables.variational:
+        ones = (mp.one,) * len(beta)
+        return tables.position, ones, tables.momentum, ones
+    unit = mp.ldexp(1, FRACTION_BITS)
+    mu = tuple(tuple(mp.nint(x * unit) / unit for x in over(line, beta)) for line in tables.position)
+    if tables.projection:
+        return mu, beta, tuple(over(line, weights) for line in tables.momentum), weights
+    return mu, beta, transpose(tuple(tuple(1 - x for x in line) for line in mu)), weights
+
+
+def over(numbers: Vector, divisors: Vector) -> Vector:
+    """Quotients, entry by entry."""
+    return tuple(x / y for x, y in zip(numbers, divisors, strict=True))
+
+
+def _force_kernel(system: MechanicalSystem) -> Kernel:
+    return lower_kernel(
+        "force_lanes",
+        arguments=(*system.coordinates, *system.velocities),
+        time=system.time,
+        parameters=system.parameters,
+        values=force(system),
+    )
+
+
+def _point_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+    """L_q, L_v and the lower triangle of the mass."""
+    momenta = momentum(system)
+    mass = {key: entry for key, entry in jacobian(momenta, system.velocities).items() if key[0] >= key[1]}
+    kernel = lower_kernel(
+        "point_lanes",
+        arguments=(*system.coordinates, *system.velocities),
+        time=system.time,
+        parameters=system.parameters,
+        values=(*force(system), *momenta),
+        slopes=tuple(mass.values()),
+    )
+    return kernel, tuple(mass)

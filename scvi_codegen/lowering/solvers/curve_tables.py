@@ -1,0 +1,44 @@
+"""Tables of the fixed-point solvers whose unknowns are accelerations: the nodes of a curve, and points along it."""
+
+from __future__ import annotations
+
+from scvi_codegen.ir.program import NodeTables, PointTables
+from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.lowering.solvers.padding import guess_tables, pad_matrix, pad_vector
+from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import Tableau
+
+__all__ = ["node_tables", "point_tables"]
+
+
+def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
+    """The nodes of a curve: the stages of a tableau."""
+    size = len(tableau.b)
+    return NodeTables(
+        count=size,
+        abscissae=pad_vector(tableau.c, lanes, repeat=True),
+        collocation=pad_matrix(tableau.A, lanes),
+        end=pad_vector(tableau.b, lanes, repeat=True),
+        mask=pad_vector((mp.one,) * size, lanes),
+        guess=guess_tables(tableau.c, lanes),
+    )
+
+
+def point_tables(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, lanes: int) -> PointTables:
+    """The points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
+    return PointTables(
+        abscissae=pad_vector(rule.abscissae, lanes, repeat=True),
+        position=pad_matrix(cardinal_integrals(tableau.c, rule.abscissae, 0), lanes),
+        velocity=pad_matrix(cardinal_values(tableau.c, rule.abscissae), lanes),
+        action=lower_kernel(
+            "action_lanes",
+            arguments=(*system.coordinates, *system.velocities),
+            time=system.time,
+            parameters=system.parameters,
+            values=(*force(system), *momentum(system)),
+        ),
+    )

@@ -1,0 +1,43 @@
+"""The fixed-point solver for a system given by its Hamiltonian: no mass matrix, no Legendre transform, in lanes.
+
+With positions and momenta at the points by the two tables of a method, one sweep takes forces, momenta, velocities and
+positions in turn, each from the latest of the others. It contracts like h^2 where H = T(p) + V(q), and like h at worst.
+H need not be regular. The tables are those of :mod:`scvi_codegen.lowering.solvers.coupled`: the rounded map of a
+variational method still has a generating function.
+"""
+
+from __future__ import annotations
+
+from scvi_codegen.ir.program import HamiltonianSweep
+from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
+from scvi_codegen.mechanics.forms import force, legendre_map
+from scvi_codegen.mechanics.system import MechanicalSystem
+
+__all__ = ["hamiltonian_sweep"]
+
+
+def hamiltonian_sweep(system: MechanicalSystem, tables: VelocityTables) -> HamiltonianSweep | None:
+    """The fixed-point iteration of a Hamiltonian; ``None`` with too many points, or other points than velocities."""
+    lanes = lane_count(len(tables.abscissae))
+    if lanes > MOST_LANES or tables.velocity:
+        return None
+    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
+    arguments, velocities = legendre_map(system)
+    common = {"arguments": arguments, "time": system.time, "parameters": system.parameters}
+    return HamiltonianSweep(
+        points=len(tables.abscissae),
+        lanes=lanes,
+        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
+        position=pad_matrix(position, lanes),
+        position_weights=pad_vector(position_weights, lanes),
+        momentum=pad_matrix(momenta, lanes),
+        momentum_weights=pad_vector(momentum_weights, lanes),
+        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
+        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
+        guess=guess_tables(tables.blocks, lanes),
+        kernel=lower_kernel("velocity_lanes", values=velocities, **common),
+        force=lower_kernel("force_lanes", values=force(system), **common),
+    )

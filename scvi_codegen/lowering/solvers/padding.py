@@ -1,0 +1,78 @@
+"""Tables of fixed-point solvers, padded to whole vectors.
+
+Lanes beyond the last real point repeat it (its row, its abscissa) and have weight 0: whatever the domain of the
+Lagrangian, they are inside, and they never delay convergence.
+"""
+
+from __future__ import annotations
+
+from scvi_codegen.ir.program import GuessTables, LaneTable, SplitMatrix, SplitVector
+from scvi_codegen.lowering.program import lower_matrix, lower_vector
+from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+__all__ = ["MOST_LANES", "guess_tables", "lane_count", "pad_matrix", "pad_split", "pad_split_matrix", "pad_vector"]
+
+MOST_LANES = 32
+DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
+"""Of the polynomials through the last step, or through the last two, that are continued into the next. Higher ones
+follow the motion longer, but multiply rounding errors, by about 1e6 for these."""
+INTERPOLATED = 5
+"""Up to this degree the polynomial of two steps goes through all points; above, least squares make better guesses."""
+
+
+def lane_count(points: int) -> int:
+    """The power of two, at least 2, that holds so many points."""
+    return max(2, 1 << (points - 1).bit_length())
+
+
+def pad_matrix(entries: Matrix, lanes: int) -> LaneTable:
+    """Rows beyond the last repeat it, columns beyond are zero: a lane too many is the last point again."""
+    return lower_matrix(_wide(entries, lanes))
+
+
+def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[float, ...]:
+    """The rest is zero, or the last entry again."""
+    return lower_vector(_longer(entries, lanes, repeat=repeat))
+
+
+def pad_split_matrix(entries: Matrix, lanes: int) -> SplitMatrix:
+    """A padded matrix in twice the precision."""
+    wide = _wide(entries, lanes)
+    high = lower_matrix(wide)
+    return SplitMatrix(high, lower_matrix(tuple(map(_difference, wide, high))))
+
+
+def pad_split(entries: Vector, lanes: int, *, repeat: bool = False) -> SplitVector:
+    """A padded vector in twice the precision."""
+    long = _longer(entries, lanes, repeat=repeat)
+    high = lower_vector(long)
+    return SplitVector(high, lower_vector(_difference(long, high)))
+
+
+def guess_tables(abscissae: Vector, lanes: int, through: Matrix | None = None) -> GuessTables:
+    """From the values at the points in the last step, or in the last two, to those in the next.
+
+    ``through``: a matrix to apply to the guess.
+    """
+    alone = extrapolation(abscissae, 1, min(len(abscissae) - 1, DEGREE_OF_ONE))
+    places = len({*abscissae, *(x - 1 for x in abscissae)})  # one fewer if both ends of a step are points
+    through_most = max(2 * len(abscissae) - 2, INTERPOLATED)
+    tables: tuple[Matrix, ...] = (alone, *continuation(abscissae, min(places - 1, through_most, DEGREE_OF_TWO)))
+    if through is not None:
+        tables = tuple(matrix_product(through, table) for table in tables)
+    last_alone, last, before = (pad_matrix(table, lanes) for table in tables)
+    return GuessTables(last_alone=last_alone, last=last, before=before)
+
+
+def _wide(entries: Matrix, lanes: int) -> Matrix:
+    wide = tuple(_longer(line, lanes) for line in entries)
+    return (*wide, *(wide[-1],) * (lanes - len(wide)))
+
+
+def _longer(entries: Vector, lanes: int, *, repeat: bool = False) -> Vector:
+    return (*entries, *((entries[-1] if repeat else mp.zero),) * (lanes - len(entries)))
+
+
+def _difference(numbers: Vector, doubles: Vector) -> Vector:
+    return tuple(x - y for x, y in zip(numbers, doubles, strict=True))

@@ -1,0 +1,70 @@
+"""The fixed-point solver of the shooting-based variational method: node and quadrature points as lanes.
+
+The order of the updates inside a sweep (accelerations, then the action along the new curve, then momentum, initial
+velocity and multipliers) makes it contract twice as fast as all at once. The equations, those of
+``methods/shooting.py`` in these unknowns, stand at :class:`scvi_codegen.ir.program.ShootingSweep`.
+"""
+
+from __future__ import annotations
+
+from sympy import S
+
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.ir.program import Kernel, ShootingSweep
+from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
+from scvi_codegen.mechanics.forms import (
+    accelerations,
+    euler_lagrange,
+    mass_entries,
+    multiplied_residual,
+    multipliers,
+)
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
+
+__all__ = ["shooting_sweep"]
+
+LARGEST_DIMENSION = 8
+"""Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
+
+
+def shooting_sweep(system: MechanicalSystem, method: SCVI) -> ShootingSweep | None:
+    """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
+    tableau, rule = method.tableau, method.rule
+    lanes = lane_count(max(len(tableau.b), len(rule)))
+    if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
+        return None
+    position = cardinal_integrals(tableau.c, rule.abscissae, 0)
+    velocity = cardinal_values(tableau.c, rule.abscissae)
+    kernel, entries = _node_kernel(system)
+    return ShootingSweep(
+        lanes=lanes,
+        nodes=node_tables(tableau, lanes),
+        points=point_tables(system, tableau, rule, lanes),
+        collocation_transposed=pad_matrix(transpose(tableau.A), lanes),
+        position_transposed=pad_matrix(transpose(position), lanes),
+        velocity_transposed=pad_matrix(transpose(velocity), lanes),
+        weights=pad_vector(rule.unit_weights, lanes),
+        consistency=pad_vector(matrix_product((rule.unit_weights,), velocity)[0], lanes, repeat=True),
+        kernel=kernel,
+        mass_entries=entries,
+    )
+
+
+def _node_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+    """E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
+    scalar = multiplied_residual(system)
+    slopes = gradient(scalar, (*system.coordinates, *system.velocities))
+    mass = {key: entry for key, entry in mass_entries(system).items() if key[0] >= key[1]}
+    kernel = lower_kernel(
+        "node_lanes",
+        arguments=(*system.coordinates, *system.velocities, *accelerations(system), *multipliers(system)),
+        time=system.time,
+        parameters=system.parameters,
+        values=(*euler_lagrange(system), *(slopes.get(i, S.Zero) for i in range(2 * system.dimension))),
+        slopes=tuple(mass.values()),
+    )
+    return kernel, tuple(mass)

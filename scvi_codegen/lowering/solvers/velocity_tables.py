@@ -1,0 +1,131 @@
+"""The two tables of a method whose unknowns are velocities: positions from velocities, momenta from forces.
+
+    q_n = q0 + h sum_b position[n][b] V_b,    P_b = p0 + h sum_n momentum[b][n] F_n,
+
+with q1 and p1 by the rows ``end_position`` and ``end_momentum``. The fixed-point solvers of separable and of coupled
+systems are both made from them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scvi_codegen.mechanics.forms import is_separable
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.collocation import phase_space_system
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+from scvi_codegen.tables.basis import matrix_product, transpose
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+__all__ = ["VelocityTables", "velocity_tables"]
+
+CONSISTENT = 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityTables:
+    """Tables in 60 digits.
+
+    Attributes:
+        abscissae: (g,) of the points; blocks: (s,) of the velocities.
+        position: (g, s); momentum: (s, g); end_position: (s,); end_momentum: (g,).
+        velocity, projection: (g, s) from the s velocities to those at the points, (s, g) back; empty if they are the
+            same.
+        variational: whether ``momentum`` is the adjoint of ``position``: beta_b momentum[b][n] = w_n (beta_b -
+            position[n][b]) (summed over the projection, where there is one).
+    """
+
+    abscissae: Vector
+    blocks: Vector
+    position: Matrix
+    momentum: Matrix
+    end_position: Vector
+    end_momentum: Vector
+    velocity: Matrix
+    projection: Matrix
+    variational: bool
+
+
+def velocity_tables(system: MechanicalSystem, method: Method) -> VelocityTables | None:
+    """Those of a method for a system, or ``None`` where its equations have another shape."""
+    stages = _velocity_stages(system, method)
+    if stages is None:
+        return None
+    family = stages.families[0]
+    if family.scalar is not None:
+        return _variational_tables(family, stages)
+    A = tuple(line[1:] for line in family.gathers[0].table.entries)
+    b = stages.end_position.entries[0][1:]
+    return VelocityTables(
+        abscissae=family.abscissae,
+        blocks=family.abscissae,
+        position=A,
+        momentum=A,
+        end_position=b,
+        end_momentum=b,
+        velocity=(),
+        projection=(),
+        variational=False,
+    )
+
+
+def _velocity_stages(system: MechanicalSystem, method: Method) -> StageSystem | None:
+    """Stage equations with one family whose kernel is (L_q, L_v) and whose unknowns are velocities."""
+    if getattr(method, "form", None) == "position":
+        return phase_space_system(system, method.tableau) if is_separable(system) else None  # type: ignore[attr-defined]
+    stages = method.stage_system(system)
+    family = stages.families[0]
+    plain = len(stages.families) == 1 and len(family.gathers) == len(family.scatters) == 2
+    return stages if plain else None
+
+
+def _variational_tables(family: PointFamily, stages: StageSystem) -> VelocityTables | None:
+    """The adjoint pair; where the velocities are not those at the points, the equations projected on the curve."""
+    beta = stages.end_position.entries[0][1:]
+    if any(x == 0 for x in beta):
+        return None
+    position = tuple(line[1:] for line in family.gathers[0].table.entries)
+    velocity = tuple(line[1:] for line in family.gathers[1].table.entries)
+    rest = tuple(tuple(b - x for x in column) for b, column in zip(beta, transpose(position), strict=True))
+    projection: Matrix = ()
+    if _is_identity(velocity):
+        adjoint: Matrix = tuple(tuple(x / b for x in line) for b, line in zip(beta, rest, strict=True))
+        blocks = family.abscissae
+    else:
+        inverse = _inverse_stiffness(velocity, family.weights)
+        if inverse is None or max(abs(mp.fdot(line, beta) - 1) for line in inverse) > CONSISTENT:
+            return None
+        adjoint = matrix_product(inverse, rest)
+        projection = _columns_scaled(matrix_product(inverse, transpose(velocity)), family.weights)
+        blocks = stages.block_abscissae
+    return VelocityTables(
+        abscissae=family.abscissae,
+        blocks=blocks,
+        position=position,
+        momentum=_columns_scaled(adjoint, family.weights),
+        end_position=beta,
+        end_momentum=family.weights,
+        velocity=velocity if projection else (),
+        projection=projection,
+        variational=True,
+    )
+
+
+def _is_identity(entries: Matrix) -> bool:
+    square = len(entries) == len(entries[0])
+    return square and all(x == int(n == b) for n, line in enumerate(entries) for b, x in enumerate(line))
+
+
+def _inverse_stiffness(velocity: Matrix, weights: Vector) -> Matrix | None:
+    """K^-1, K = l^T w l: it solves beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) for constant mass."""
+    stiffness = mp.matrix(matrix_product(_columns_scaled(transpose(velocity), weights), velocity))
+    try:
+        inverse = mp.inverse(stiffness)
+    except ZeroDivisionError:
+        return None
+    return tuple(tuple(inverse[i, j] for j in range(inverse.cols)) for i in range(inverse.rows))
+
+
+def _columns_scaled(entries: Matrix, factors: Vector) -> Matrix:
+    return tuple(tuple(x * w for x, w in zip(line, factors, strict=True)) for line in entries)

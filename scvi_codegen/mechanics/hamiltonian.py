@@ -1,0 +1,316 @@
+"""A mechanical system given by its Hamiltonian, and Legendre's transform in both directions.
+
+Hamilton's principle in phase space (paper, section 1.1) makes the action of p . v - H(q, p, t) stationary in q and p.
+Nothing there needs a Lagrangian: H = q p or the Hamiltonian of point vortices, for which d2H/dp2 is singular, are
+integrated as well, by methods that do not need one (:attr:`~scvi_codegen.methods.method.Method.needs_regular`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.grammar import evaluate, parse_expression, unsupported_part
+from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
+from scvi_codegen.formulas.translation import Translation
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
+from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_twin"]
+
+LARGEST_INVERSE = 3
+"""Coupled momenta (velocities) whose quadratic form is inverted symbolically."""
+NEGLIGIBLE = mp.mpf(10) ** -30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HamiltonianSystem(MechanicalSystem):
+    """A Hamiltonian H(q, p, t; parameters) in m coordinates and momenta, checked on construction.
+
+    Build one with ``from_text`` or ``from_sympy``, or from a Lagrangian with :func:`hamiltonian_of`. Every method takes
+    it in place of a Lagrangian; the variational ones then are those of Hamilton's principle in phase space, (35).
+
+    Attributes:
+        name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
+        momenta: the m momenta, parallel to ``coordinates``.
+        hamiltonian: H, exact: no floating-point number occurs in it.
+
+    Raises:
+        SystemDefinitionError: naming the symbol at fault.
+    """
+
+    momenta: tuple[Symbol, ...]
+    hamiltonian: Expr
+
+    def __post_init__(self) -> None:
+        if len(self.momenta) != len(self.coordinates):
+            raise SystemDefinitionError(
+                f"{len(self.coordinates)} coordinates, but {len(self.momenta)} momenta: list one each"
+            )
+        self._check("Hamiltonian", self.momenta, "a momentum")
+
+    @classmethod
+    def from_text(
+        cls,
+        *,
+        name: str,
+        coordinates: Sequence[str],
+        hamiltonian: str,
+        momenta: Sequence[str] | None = None,
+        parameters: Mapping[str, float] | None = None,
+    ) -> HamiltonianSystem:
+        """Read H from text of the grammar in ``expression_text``.
+
+        Args:
+            name: what the system is called.
+            coordinates: names of the coordinates.
+            hamiltonian: the formula; it may span several lines.
+            momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
+            parameters: default value by name.
+
+        >>> HamiltonianSystem.from_text(
+        ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
+        ... ).lagrangian
+        -p**2/2 + p*q_dot + cos(q)
+        """
+        for what, given in (("coordinates", coordinates), ("momenta", momenta)):
+            if isinstance(given, str):
+                raise SystemDefinitionError(f"{what} is a sequence of names: write ['{given}']")
+        names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
+        values = dict(parameters or {})
+        check_names(coordinates, tuple(values), names)
+        symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values]}
+        return cls(
+            name=name,
+            coordinates=tuple(symbols[given] for given in coordinates),
+            momenta=tuple(symbols[given] for given in names),
+            time=symbols[TIME],
+            parameters=tuple(symbols[given] for given in values),
+            defaults=tuple(number(given, value) for given, value in values.items()),
+            hamiltonian=parse_expression(hamiltonian, symbols),
+        )
+
+    @classmethod
+    def from_sympy(
+        cls,
+        *,
+        name: str,
+        hamiltonian: Expr,
+        coordinates: Sequence[Expr],
+        momenta: Sequence[Expr],
+        time: Symbol | None = None,
+        parameters: Mapping[Symbol | str, float] | None = None,
+    ) -> HamiltonianSystem:
+        """Take H from a SymPy expression, in plain symbols or in functions of time.
+
+        Floating-point numbers become the rationals their shortest decimal form says; symbols become canonical as
+        :mod:`scvi_codegen.formulas.symbols` describes.
+
+        Args:
+            name: what the system is called.
+            hamiltonian: H.
+            coordinates, momenta: symbols or functions of time, parallel to each other.
+            time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
+            parameters: default value by symbol or by name.
+        """
+        if not isinstance(hamiltonian, Expr):
+            raise SystemDefinitionError(
+                f"the Hamiltonian is a {type(hamiltonian).__name__}, not a SymPy expression (text goes to from_text)"
+            )
+        given = named_parameters(parameters)
+        translation = Translation(hamiltonian, coordinates, momenta=momenta, time=time, parameters=tuple(given))
+        return cls(
+            name=name,
+            coordinates=translation.coordinates,
+            momenta=translation.momenta,
+            time=symbol(TIME),
+            parameters=translation.parameters,
+            defaults=tuple(number(parameter, value) for parameter, value in given.items()),
+            hamiltonian=translation.apply(hamiltonian, "Hamiltonian"),
+        )
+
+    @property
+    def lagrangian(self) -> Expr:
+        """P . v - H, the integrand of Hamilton's principle in phase space."""
+        products = [p * v for p, v in zip(self.momenta, self.velocities, strict=True)]
+        return sympy.Add(*products, -self.hamiltonian)
+
+    @property
+    def auxiliaries(self) -> tuple[Symbol, ...]:
+        """The momenta."""
+        return self.momenta
+
+    @property
+    def formula(self) -> Expr:
+        """H."""
+        return self.hamiltonian
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether d2H/dp2 is regular somewhere: only then velocities determine momenta."""
+        return _is_regular(self)
+
+    def _repr_latex_(self) -> str:
+        return rf"$\displaystyle H = {sympy.latex(self.hamiltonian)}$"
+
+
+def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = None) -> HamiltonianSystem:
+    """The Hamiltonian p . v - L of a Lagrangian, v expressed by p = dL/dv (paper, section 1.1).
+
+    Args:
+        system: the Lagrangian.
+        momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
+
+    Raises:
+        SystemDefinitionError: where p = dL/dv has no closed solution that SymPy finds.
+
+    >>> oscillator = LagrangianSystem.from_text(
+    ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2", parameters={"m": 1, "k": 2})
+    >>> hamiltonian_of(oscillator).hamiltonian
+    k*x**2/2 + p_x**2/(2*m)
+    """
+    names = _default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
+    symbols = tuple(symbol(name) for name in names)
+    return HamiltonianSystem(
+        name=system.name,
+        coordinates=system.coordinates,
+        momenta=symbols,
+        time=system.time,
+        parameters=system.parameters,
+        defaults=system.defaults,
+        hamiltonian=_legendre_dual(system, system.velocities, symbols),
+    )
+
+
+@lru_cache(maxsize=64)
+def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
+    """The Lagrangian p . v - H of a Hamiltonian, p expressed by v = dH/dp (paper, section 1.1).
+
+    Raises:
+        SystemDefinitionError: where d2H/dp2 is singular, or v = dH/dp has no closed solution that SymPy finds.
+    """
+    if not system.is_regular:
+        raise SystemDefinitionError(
+            f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine momenta"
+        )
+    return LagrangianSystem(
+        name=system.name,
+        coordinates=system.coordinates,
+        time=system.time,
+        parameters=system.parameters,
+        defaults=system.defaults,
+        lagrangian=_legendre_dual(system, system.momenta, system.velocities),
+    )
+
+
+def lagrangian_twin(system: MechanicalSystem) -> LagrangianSystem | None:
+    """A Lagrangian with the same motion: the system's own, that of a Hamiltonian, or ``None`` where none is found."""
+    if isinstance(system, LagrangianSystem):
+        return system
+    assert isinstance(system, HamiltonianSystem)
+    return _twin(system)
+
+
+@lru_cache(maxsize=64)
+def _twin(system: HamiltonianSystem) -> LagrangianSystem | None:
+    try:
+        return lagrangian_of(system)
+    except SystemDefinitionError:
+        return None
+
+
+@lru_cache(maxsize=64)
+def _is_regular(system: HamiltonianSystem) -> bool:
+    others = (*system.coordinates, system.time)
+    return singular_part(system.hamiltonian, system.momenta, others, system.constants) is None
+
+
+def _default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"p_{name}" for name in coordinates)
+
+
+def _legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: Sequence[Symbol]) -> Expr:
+    """The product x . y less f(x), with y = df/dx solved for x; f is the system's formula."""
+    f = system.formula
+    curvature = hessian(f, variables)
+    origin = dict.fromkeys(variables, sympy.S.Zero)
+    slopes = gradient(f, variables)
+    if all(not (entry.free_symbols & set(variables)) for entry in curvature.values()):
+        shifted = [y - slopes[i].xreplace(origin) for i, y in enumerate(duals)]
+        forms = [_inverse_form(curvature, block, shifted) for block in coupled_blocks(curvature, len(variables))]
+        return sympy.Add(*forms, -f.xreplace(origin))
+    solution = {x: _inverse_slope(system, slopes[i], x, duals[i], variables) for i, x in enumerate(variables)}
+    still, moving = f.as_independent(*variables, as_Add=True)
+    dual = sympy.Add(*(x * y for x, y in zip(solution.values(), duals, strict=True)), -moving.xreplace(solution))
+    positive = _positive_parameters(system)
+    return sympy.simplify(dual.xreplace(positive)).xreplace({dummy: given for given, dummy in positive.items()}) - still
+
+
+def _positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
+    """Stand-ins for the parameters with positive default values, so that roots of their squares are taken."""
+    return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
+
+
+def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
+    """Half of y . C^-1 y over one block."""
+    if len(block) == 1:
+        (i,) = block
+        return y[i] ** 2 / (2 * curvature[i, i])
+    if len(block) > LARGEST_INVERSE:
+        raise SystemDefinitionError(
+            f"Legendre's transform couples {len(block)} variables: their quadratic form is not inverted symbolically. "
+            "Give both functions yourself, or use the system as it is"
+        )
+    size = len(block)
+    matrix = sympy.Matrix(size, size, lambda a, b: curvature.get((block[a], block[b]), 0))
+    adjugate, determinant = matrix.adjugate(), matrix.det(method="berkowitz")
+    terms = [adjugate[a, b] * y[i] * y[j] for a, i in enumerate(block) for b, j in enumerate(block)]
+    return sympy.Add(*terms) / (2 * determinant)
+
+
+def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]) -> Expr:
+    """The x with y = slope(x), the branch that holds at random points for parameters of the signs of their defaults."""
+    if slope.free_symbols & (set(variables) - {x}):
+        raise SystemDefinitionError(
+            f"Legendre's transform of '{system.name}' needs the solution of coupled equations that are not linear; "
+            "give the other function yourself, or use the system as it is"
+        )
+    positive = {
+        symbol: sympy.Dummy(symbol.name, positive=True) for symbol, value in system.constants.items() if value > 0
+    }
+    back = {dummy: symbol for symbol, dummy in positive.items()}
+    for root in _roots(slope.xreplace(positive) - y, x):
+        found = root.xreplace(back)
+        if unsupported_part(found) is None and _holds(system, found, slope, x, y):
+            return found
+    raise SystemDefinitionError(f"SymPy does not solve {y} = {slope} for {x}; give the other function yourself")
+
+
+def _roots(expression: Expr, x: Symbol) -> list[Expr]:
+    """What SymPy finds, without the formulas of Cardano and Ferrari, on which it would spend minutes; unchecked."""
+    try:
+        return list(sympy.solve(expression, x, check=False, simplify=False, cubics=False, quartics=False))
+    except (NotImplementedError, ArithmeticError, AttributeError, TypeError, ValueError, RecursionError):
+        return []
+
+
+def _holds(system: MechanicalSystem, root: Expr, slope: Expr, x: Symbol, y: Symbol) -> bool:
+    tried = 0
+    for point in sample_points([x], (*system.coordinates, system.time), system.constants):
+        try:
+            value = evaluate(slope, point, {})
+            again = evaluate(root, point | {y: value}, {})
+        except ArithmeticError:
+            continue
+        tried += 1
+        if abs(again - point[x]) > NEGLIGIBLE * (1 + abs(point[x])):
+            return False
+    return tried > 0

@@ -1,0 +1,194 @@
+"""A mechanical system given by its Lagrangian, from text or from SymPy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
+from scvi_codegen.formulas.translation import Translation
+from scvi_codegen.mechanics.regularity import null_direction, singular_part
+from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
+
+if TYPE_CHECKING:
+    from sympy.physics.mechanics import LagrangesMethod
+
+__all__ = ["LagrangianSystem"]
+
+REMEDY = (
+    "A variational integrator needs a regular Lagrangian: add the missing kinetic energy, use fewer coordinates "
+    "(independent ones, if there is a constraint), or choose coordinates that are not redundant"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LagrangianSystem(MechanicalSystem):
+    """A Lagrangian L(q, q_dot, t; parameters) in m coordinates, checked on construction.
+
+    Build one with ``from_text``, ``from_sympy`` or ``from_lagranges_method``. Equality is structural.
+
+    Attributes:
+        name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
+        lagrangian: L, exact: no floating-point number occurs in it.
+
+    Raises:
+        SystemDefinitionError: naming the symbol at fault, if a name is unfit or used twice, L contains an unknown
+            symbol or an unsupported function, a default value is not a finite number, a velocity does not occur in L,
+            or the mass matrix d2L/dv2 is singular at every point tried.
+    """
+
+    lagrangian: Expr
+
+    def __post_init__(self) -> None:
+        self._check("Lagrangian", self.velocities, "a velocity")
+        _check_velocities(self)
+        _check_mass_matrix(self)
+
+    @property
+    def auxiliaries(self) -> tuple[Symbol, ...]:
+        """None."""
+        return ()
+
+    @property
+    def formula(self) -> Expr:
+        """L."""
+        return self.lagrangian
+
+    @classmethod
+    def from_text(
+        cls, *, name: str, coordinates: Sequence[str], lagrangian: str, parameters: Mapping[str, float] | None = None
+    ) -> LagrangianSystem:
+        """Read L from text of the grammar in ``expression_text``.
+
+        Args:
+            name: what the system is called.
+            coordinates: names of the coordinates; the velocity of ``q`` is written ``q_dot``, time ``t``.
+            lagrangian: the formula; it may span several lines.
+            parameters: default value by name.
+
+        >>> LagrangianSystem.from_text(
+        ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2", parameters={"m": 1, "k": 2}
+        ... ).lagrangian
+        -k*x**2/2 + m*x_dot**2/2
+        """
+        if isinstance(coordinates, str):
+            raise SystemDefinitionError(f"coordinates is a sequence of names: write ['{coordinates}']")
+        values = dict(parameters or {})
+        check_names(coordinates, tuple(values))
+        velocities = [coordinate + DOT for coordinate in coordinates]
+        symbols = {symbol_name: symbol(symbol_name) for symbol_name in [*coordinates, *velocities, TIME, *values]}
+        return cls(
+            name=name,
+            coordinates=tuple(symbols[coordinate] for coordinate in coordinates),
+            time=symbols[TIME],
+            parameters=tuple(symbols[parameter] for parameter in values),
+            defaults=tuple(number(parameter, value) for parameter, value in values.items()),
+            lagrangian=parse_expression(lagrangian, symbols),
+        )
+
+    @classmethod
+    def from_sympy(
+        cls,
+        *,
+        name: str,
+        lagrangian: Expr,
+        coordinates: Sequence[Expr],
+        velocities: Sequence[Expr] | None = None,
+        time: Symbol | None = None,
+        parameters: Mapping[Symbol | str, float] | None = None,
+    ) -> LagrangianSystem:
+        """Take L from a SymPy expression, in plain symbols or in functions of time.
+
+        Floating-point numbers become the rationals their shortest decimal form says (``0.1`` is 1/10); symbols become
+        canonical as the module describes.
+
+        Args:
+            name: what the system is called.
+            lagrangian: L.
+            coordinates: symbols, or functions of time such as ``dynamicsymbols`` gives.
+            velocities: parallel to ``coordinates``; by default ``Derivative(q(t), t)`` for a function of time, the
+                symbol called ``q_dot`` for a symbol ``q``.
+            time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
+            parameters: default value by symbol or by name.
+        """
+        if not isinstance(lagrangian, Expr):
+            raise SystemDefinitionError(
+                f"the Lagrangian is a {type(lagrangian).__name__}, not a SymPy expression (text goes to from_text)"
+            )
+        given = named_parameters(parameters)
+        translation = Translation(lagrangian, coordinates, velocities=velocities, time=time, parameters=tuple(given))
+        return cls(
+            name=name,
+            coordinates=translation.coordinates,
+            time=symbol(TIME),
+            parameters=translation.parameters,
+            defaults=tuple(number(parameter, value) for parameter, value in given.items()),
+            lagrangian=translation.apply(lagrangian),
+        )
+
+    @classmethod
+    def from_lagranges_method(
+        cls, method: LagrangesMethod, *, name: str, parameters: Mapping[Symbol | str, float] | None = None
+    ) -> LagrangianSystem:
+        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` without forces and constraints.
+
+        Raises:
+            SystemDefinitionError: if it has a force list or constraints; they are refused, never dropped.
+        """
+        if len(method.forcelist):
+            raise SystemDefinitionError(
+                "this LagrangesMethod has a forcelist: a variational integrator of L alone would drop the forces. "
+                "Put conservative forces into the potential; nonconservative ones are not supported"
+            )
+        if len(method.coneqs):
+            raise SystemDefinitionError(
+                "this LagrangesMethod has constraints (hol_coneqs or nonhol_coneqs), which are not supported: use as "
+                "many independent coordinates as there are degrees of freedom"
+            )
+        lagrangian = method._L[0]  # LagrangesMethod has no public name for it
+        return cls.from_sympy(name=name, lagrangian=lagrangian, coordinates=list(method.q), parameters=parameters)
+
+    def _repr_latex_(self) -> str:
+        dotted = {
+            velocity: rf"\dot{{{sympy.latex(coordinate)}}}"
+            for coordinate, velocity in zip(self.coordinates, self.velocities, strict=True)
+        }
+        return rf"$\displaystyle L = {sympy.latex(self.lagrangian, symbol_names=dotted)}$"
+
+
+def _check_velocities(system: LagrangianSystem) -> None:
+    free = system.lagrangian.free_symbols
+    for coordinate, velocity in zip(system.coordinates, system.velocities, strict=True):
+        if velocity not in free:
+            raise SystemDefinitionError(
+                f"velocity '{velocity}' does not occur in the Lagrangian: coordinate '{coordinate}' has no kinetic "
+                f"energy. Add a term such as {velocity}**2/2, or take the coordinate out (a known function of it can "
+                "be a parameter)"
+            )
+
+
+def _check_mass_matrix(system: LagrangianSystem) -> None:
+    others = (*system.coordinates, system.time)
+    found = singular_part(system.lagrangian, system.velocities, others, system.constants)
+    if found is None:
+        return
+    velocities, block = found
+    names = ", ".join(velocity.name for velocity in velocities)
+    subject = f"the mass matrix d2L/dv2 of '{system.name}'"
+    if not block:
+        reason = (
+            f"no second derivative by {names} is left (it occurs only linearly)"
+            if velocities
+            else "some velocities occur only in products with too few others"
+        )
+        raise SystemDefinitionError(f"{subject} is singular: {reason}. {REMEDY}")
+    values = " with the default parameters" if any(entry.has(*system.parameters) for entry in block.values()) else ""
+    direction = null_direction(block, velocities)
+    motion = f": a motion with ({direction}) has no kinetic energy" if direction else ""
+    raise SystemDefinitionError(f"{subject} in {names} is singular at every point tried{values}{motion}. {REMEDY}")

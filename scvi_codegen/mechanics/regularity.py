@@ -1,0 +1,153 @@
+"""Whether the Hessian of a function is regular: the mass matrix d2L/dv2 of a Lagrangian, d2H/dp2 of a Hamiltonian."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+from sympy import Expr, Matrix, Symbol
+
+from scvi_codegen.formulas.derivatives import hessian
+from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.tables.precision import Number, mp
+
+__all__ = ["Entries", "coupled_blocks", "null_direction", "sample_points", "singular_part"]
+
+Entries = Mapping[tuple[int, int], Expr]
+
+NEGLIGIBLE = mp.mpf(10) ** -40
+LARGEST_NULL_SPACE = 8
+
+
+def singular_part(
+    scalar: Expr, variables: Sequence[Symbol], others: Sequence[Symbol], constants: Mapping[Symbol, float]
+) -> tuple[tuple[Symbol, ...], Entries] | None:
+    """Variables, coupled with each other, whose block of the Hessian is singular wherever it was tried, and the block.
+
+    Args:
+        scalar: L or H.
+        variables: with respect to which it is differentiated twice.
+        others: what else it may depend on.
+        constants: values of parameters.
+
+    Returns:
+        ``None`` if every block is regular at one point at least, or could not be evaluated at any. An empty block says
+        that no choice of values could make it regular.
+    """
+    entries = hessian(scalar, variables)
+    size = len(variables)
+    if not all((index, index) in entries for index in range(size)) and _structural_rank(entries, size) < size:
+        rows = {row for row, _ in entries}
+        missing = tuple(variable for index, variable in enumerate(variables) if index not in rows)
+        return missing, {}
+    for block in coupled_blocks(entries, size):
+        local = {
+            (i, j): entries[row, column]
+            for i, row in enumerate(block)
+            for j, column in enumerate(block)
+            if (row, column) in entries
+        }
+        if _is_singular(local, len(block), sample_points(variables, others, constants)):
+            return tuple(variables[index] for index in block), local
+    return None
+
+
+def _is_singular(entries: Entries, size: int, points: Iterable[dict[Symbol, Number]]) -> bool:
+    """Whether a block is singular at every point at which it can be evaluated, and there is one."""
+    if size == 1 and entries[0, 0].is_Rational:
+        return False
+    evaluated = False
+    for point in points:
+        known: dict[Expr, Number] = {}
+        try:
+            matrix = {place: evaluate(entry, point, known) for place, entry in entries.items()}
+        except ArithmeticError:
+            continue
+        evaluated = True
+        if _regular(matrix, size):
+            return False
+    return evaluated
+
+
+def null_direction(entries: Entries, variables: Sequence[Symbol]) -> str:
+    """A combination of variables along which a singular block vanishes, where cheap: few of them, rational entries."""
+    size = len(variables)
+    if not entries or size > LARGEST_NULL_SPACE or not all(entry.is_Rational for entry in entries.values()):
+        return ""
+    vectors = Matrix(size, size, lambda row, column: entries.get((row, column), 0)).nullspace()
+    return ", ".join(f"{variable} = {value}" for variable, value in zip(variables, vectors[0], strict=True))
+
+
+def sample_points(
+    variables: Sequence[Symbol], others: Sequence[Symbol], constants: Mapping[Symbol, float]
+) -> Iterator[dict[Symbol, Number]]:
+    """Random points, always the same ones: the others of order 1/2, 1 and 10, the variables from 1/1000 to 1."""
+    generator = random.Random(20250101)
+    fixed = {constant: mp.mpf(value) for constant, value in constants.items()}
+
+    def spread(symbols: Sequence[Symbol], scale: float) -> dict[Symbol, Number]:
+        return {symbol: mp.mpf(scale * generator.uniform(-1, 1)) for symbol in symbols}
+
+    for own_scale in (0.1, 1e-3, 1.0):
+        for scale in (1.0, 0.5, 10.0):
+            yield fixed | spread(others, scale) | spread(variables, own_scale)
+
+
+def _structural_rank(entries: Entries, size: int) -> int:
+    # Imported here because SciPy is slow to import and most systems do not come here.
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import structural_rank
+
+    rows, columns = np.array(list(entries), dtype=np.int64).reshape(-1, 2).T
+    return int(structural_rank(csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(size, size))))
+
+
+def coupled_blocks(entries: Entries, size: int) -> list[list[int]]:
+    """Indices of velocities that are coupled with each other, block by block."""
+    neighbours: list[list[int]] = [[] for _ in range(size)]
+    for row, column in entries:
+        neighbours[row].append(column)
+    blocks, seen = [], [False] * size
+    for start in range(size):
+        block, pending = [], [start]
+        while pending:
+            index = pending.pop()
+            if not seen[index]:
+                seen[index] = True
+                block.append(index)
+                pending.extend(neighbours[index])
+        if block:
+            blocks.append(sorted(block))
+    return blocks
+
+
+def _regular(matrix: dict[tuple[int, int], Number], size: int) -> bool:
+    """Eliminate with complete pivoting in 60 digits, each row scaled by its largest entry, zeros left out."""
+    rows: list[dict[int, Number]] = [{} for _ in range(size)]
+    for (row, column), value in matrix.items():
+        rows[row][column] = value
+    rows = [{column: value / scale for column, value in row.items()} for row in rows if (scale := _largest(row))]
+    if len(rows) < size:
+        return False
+    while rows:
+        best = max(range(len(rows)), key=lambda index: _largest(rows[index]))
+        pivot_row = rows.pop(best)
+        if _largest(pivot_row) < NEGLIGIBLE:
+            return False
+        pivot = max(pivot_row, key=lambda column: abs(pivot_row[column]))
+        rows = [_eliminated(row, pivot_row, pivot) if pivot in row else row for row in rows]
+    return True
+
+
+def _largest(row: Mapping[int, Number]) -> Number:
+    return max(map(abs, row.values()), default=mp.zero)
+
+
+def _eliminated(row: Mapping[int, Number], pivot_row: Mapping[int, Number], pivot: int) -> dict[int, Number]:
+    factor = row[pivot] / pivot_row[pivot]
+    result = dict(row)
+    for column, value in pivot_row.items():
+        result[column] = result.get(column, mp.zero) - factor * value
+    del result[pivot]
+    return result

@@ -1,0 +1,1 @@
+"""Symmetries and what they conserve, by Noether's theorem: found, named, checked."""

@@ -1,0 +1,159 @@
+"""Which polynomials in q, p and t are tried as momentum maps, and arithmetic on them.
+
+In index notation: the state is q_0 .. q_(m-1), p_0 .. p_(m-1), entries 0 .. 2 m - 1.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, combinations_with_replacement
+from typing import TypeAlias
+
+import numpy as np
+import sympy
+from sympy import Expr, prime
+
+from scvi_codegen.mechanics.forms import mass_entries
+from scvi_codegen.mechanics.symmetry.bodies import Body, bodies
+from scvi_codegen.mechanics.symmetry.invariants import Column, Monomial, Polynomial
+from scvi_codegen.mechanics.system import MechanicalSystem
+
+__all__ = [
+    "Terms",
+    "bodies_of",
+    "boost_columns",
+    "combined",
+    "gauge_columns",
+    "independent",
+    "is_shift",
+    "monomial_columns",
+    "planes_of",
+    "rigid_columns",
+    "turn",
+]
+
+Terms: TypeAlias = Mapping[Monomial, Expr]
+"""A polynomial whose coefficients depend on parameters."""
+
+MOST_CYCLIC = 12
+
+
+def monomial_columns(m: int, *, curved: bool) -> Iterator[dict[Monomial, int]]:
+    """All monomials of the ansatz, those first that are to occur in few momentum maps."""
+    q, p = range(m), range(m, 2 * m)
+    planes = sorted(combinations(q, 2), reverse=True)
+    turns = [*planes, *((i, i) for i in q), *((j, i) for i, j in planes)]
+    factors: list[tuple[int, tuple[int, ...]]] = [(0, (i,)) for i in p]
+    factors += [(0, (i,)) for i in q] * curved
+    factors += [(0, (i, m + j)) for i, j in turns]
+    factors += [(k, pair) for k in (0, 1) for pair in (*combinations(p, 2), *((i, i) for i in p))] * curved
+    factors += [(k, (i,)) for k in (1, 2) for i in p]
+    factors += [(1, (i, m + j)) for i, j in turns]
+    columns = [{Monomial(*factor): 1} for factor in factors]
+    yield from columns
+    yield from (column for column in gauge_columns(m, quadratic=True) if column not in columns)
+
+
+def gauge_columns(m: int, *, quadratic: bool) -> Iterator[dict[Monomial, int]]:
+    """Monomials of f: of degree 2 in q (1 in t), 1 in q (3 in t), 0 in q (4 in t)."""
+    q = range(m)
+    yield from ({Monomial(k, (i,)): 1} for k in range(4) for i in q)
+    pairs = (*combinations(q, 2), *((i, i) for i in q)) if quadratic else ()
+    yield from ({Monomial(k, pair): 1} for k in (0, 1) for pair in pairs)
+    yield from ({Monomial(k, ()): 1} for k in range(1, 5))
+
+
+def rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
+    """Momenta of cyclic coordinates, translations and rotations of everything, and t."""
+    m, free = system.dimension, system.formula.free_symbols
+    cyclic = [i for i, q in enumerate(system.coordinates) if q not in free][:MOST_CYCLIC]
+    yield from ({Monomial(0, (m + i,)): 1} for i in cyclic)
+    found = bodies_of(system)
+    groups = zip(*(body.columns for body in found), strict=True) if found else [range(m)]
+    yield from ({Monomial(0, (m + i,)): 1 for i in group} for group in groups)
+    yield from (turn(m, found, plane) for plane in planes_of(found))
+    yield {Monomial(1, ()): 1}
+
+
+def is_shift(column: Polynomial) -> bool:
+    """Whether it is a sum of single momenta."""
+    return all(len(monomial.factors) == 1 for monomial in column)
+
+
+def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list[Polynomial]:
+    """The translations among the columns times t, less positions times the masses that they move, and t^2."""
+    m, constants = system.dimension, set(system.parameters)
+    masses = {place: x for place, x in mass_entries(system).items() if x.free_symbols <= constants}
+    boosts: list[Polynomial] = []
+    for shift in filter(is_shift, rigid):
+        moved = {monomial.factors[0] - m for monomial in shift}
+        boost: dict[Monomial, Expr | int] = {Monomial(1, monomial.factors): 1 for monomial in shift}
+        for (i, j), mass in masses.items():
+            if i in moved:
+                boost[Monomial(0, (j,))] = boost.get(Monomial(0, (j,)), 0) - mass
+        boosts.append(boost)
+    return [*boosts, {Monomial(2, ()): 1}]
+
+
+def bodies_of(system: MechanicalSystem) -> tuple[Body, ...]:
+    """Bodies by names such as jupiter_x, x_jupiter or x1; two or three coordinates with other names are one body."""
+    names = [q.name for q in system.coordinates]
+    swapped = [re.sub(r"^([xyz])_?(\w+)$", r"\2_\1", name) for name in names]
+    alone = (Body(name="", columns=tuple(range(len(names)))),) if 2 <= len(names) <= 3 else ()
+    return bodies(names) or bodies(swapped) or alone
+
+
+def planes_of(found: Sequence[Body]) -> list[tuple[int, int]]:
+    """Pairs of axes, in the sense of a right-handed rotation: about x, y, z; or the one of the plane."""
+    size = len(found[0].columns) if found else 0
+    return [(1, 2), (2, 0), (0, 1)] if size == 3 else [(0, 1)] if size == 2 else []
+
+
+def turn(m: int, found: Sequence[Body], plane: tuple[int, int]) -> dict[Monomial, int]:
+    """The angular momentum of all bodies."""
+    pairs = [(body.columns[plane[0]], body.columns[plane[1]]) for body in found]
+    return {Monomial(0, (i, m + j)): 1 for i, j in pairs} | {Monomial(0, (j, m + i)): -1 for i, j in pairs}
+
+
+def combined(row: Mapping[int, Expr], columns: Sequence[Column]) -> Terms:
+    """A combination of polynomials."""
+    terms: dict[Monomial, Expr] = {}
+    for c, coefficient in row.items():
+        column = columns[c]
+        assert not isinstance(column, Expr)
+        for monomial, factor in column.items():
+            terms[monomial] = terms.get(monomial, sympy.S.Zero) + factor * coefficient
+    return {monomial: coefficient for monomial, coefficient in terms.items() if coefficient != 0}
+
+
+def independent(found: list[Terms]) -> list[Terms]:
+    """Without those that are products of linear ones; ``found`` spans the products that it has."""
+    linear = [terms for terms in found if all(len(monomial.factors) <= 1 for monomial in terms)]
+    kept, known = list(linear), [*linear, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2))]
+    rank = _rank(known)
+    for terms in sorted((terms for terms in found if terms not in linear), key=len):
+        if _rank([*known, terms]) > rank:
+            kept, known, rank = [*kept, terms], [*known, terms], rank + 1
+    return kept
+
+
+def _product(a: Terms, b: Terms) -> Terms:
+    product: dict[Monomial, Expr] = {}
+    for (one, x), (other, y) in itertools.product(a.items(), b.items()):
+        both = Monomial(one.power + other.power, tuple(sorted(one.factors + other.factors)))
+        product[both] = product.get(both, sympy.S.Zero) + x * y
+    return product
+
+
+def _rank(found: Sequence[Terms]) -> int:
+    """Of polynomials, with numbers in place of the parameters."""
+    places = {monomial: k for k, monomial in enumerate({monomial: None for terms in found for monomial in terms})}
+    constants = sorted(set().union(*(x.free_symbols for terms in found for x in terms.values())), key=str)
+    numbers = {constant: sympy.Rational(prime(k + 5), 7) for k, constant in enumerate(constants)}
+    matrix = np.zeros((len(found), len(places)))
+    for k, terms in enumerate(found):
+        for monomial, coefficient in terms.items():
+            matrix[k, places[monomial]] = float(coefficient.xreplace(numbers))
+    return int(np.linalg.matrix_rank(matrix))

@@ -1,0 +1,294 @@
+"""Polynomials in q, p and t that every motion conserves, found by linear algebra.
+
+A polynomial J = sum_c x_c phi_c(q, p, t) is conserved if sum_c x_c dphi_c/dt vanishes along all motions, that is, at
+all points (:mod:`scvi_codegen.mechanics.symmetry.sampling`): x spans the null space of the matrix of rates at enough
+random points, in binary64. Its reduced row echelon form is sparse. The entries depend on the parameters; they are
+recognised as rational numbers times powers of parameters, and of sums of parameters that occur in the system, from
+their values at random parameters. What is found is believed if its rate vanishes to 40 digits at random points and
+parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+from sympy import Expr, Symbol
+
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.mechanics.forms import mass_entries
+from scvi_codegen.mechanics.symmetry.sampling import Motion, Sample, array_value
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["Column", "Monomial", "Polynomial", "conserved"]
+
+Array = NDArray[np.float64]
+
+NULL = 1e-9
+"""Singular values below, of a matrix with entries of size 1, are 0."""
+ROUNDING = 1e-11
+"""Rates that are smaller, beside the largest, are 0."""
+PIVOT = 1e-6
+ZERO = 1e-8
+RECOGNISED = 1e-7
+LARGEST_INTEGER = 1000
+HIGHEST_POWER = 16
+"""Of a parameter in a coefficient; beyond, a fit of logarithms has recognised nothing."""
+AT_ONCE = 4096
+"""Points of one evaluation: so many numbers are kept for every part of the formulas."""
+MORE_POINTS = 12
+"""Points beyond as many as columns."""
+MORE_PARAMETERS = 4
+"""Values of the parameters beyond as many as are needed to recognise a coefficient."""
+VERIFIED_AT = 3
+NEGLIGIBLE = mp.mpf(10) ** -40
+
+
+@dataclass(frozen=True, slots=True)
+class Monomial:
+    """t^power times the product of entries of the state (q, p), by index."""
+
+    power: int
+    factors: tuple[int, ...]
+
+    def rate(self, sample: Sample) -> Any:
+        """Its time derivative."""
+        t, total = sample.t, 0.0 * sample.t
+        if self.power:
+            total = total + self.power * t ** (self.power - 1) * math.prod(sample.state[i] for i in self.factors)
+        for k, i in enumerate(self.factors):
+            others = math.prod(sample.state[j] for j in (*self.factors[:k], *self.factors[k + 1 :]))
+            total = total + t**self.power * sample.rates[i] * others
+        return total
+
+
+Polynomial: TypeAlias = Mapping[Monomial, Expr | int]
+Column: TypeAlias = Polynomial | Expr
+"""A function phi_c: a polynomial, or any expression in q, p, t and parameters."""
+
+
+def conserved(
+    system: MechanicalSystem, motion: Motion, columns: Sequence[Column], *, fractions: bool = False
+) -> list[dict[int, Expr]]:
+    """A basis of the conserved combinations of ``columns``: the coefficient of each column that occurs, by its index.
+
+    Columns that come first occur in as few of them as possible. Coefficients have denominators if ``fractions`` are
+    allowed and make them shorter. A combination with a coefficient that is not recognised is left out.
+    """
+    search = _Search(motion, columns)
+    (rows,) = search.null_spaces(range(len(columns)), 1)
+    if rows is None or not len(rows):
+        return []
+    support = [int(c) for c in np.flatnonzero(rows.any(axis=0))]
+    factors = _factors(system, motion)
+    found = search.null_spaces(support, len(factors) + MORE_PARAMETERS if factors else 1)
+    spaces = [space for space in found if space is not None and space.shape == (len(rows), len(support))]
+    if len(spaces) < len(found):
+        return []
+    known = [(factor, search.values_of(factor)) for factor in factors]
+    recognised = [_recognised_row(np.array(spaces)[:, k], support, known, fractions) for k in range(len(rows))]
+    return [
+        {c: coefficient.xreplace(motion.numbers) for c, coefficient in row.items()}
+        for row in recognised
+        if row is not None and search.verified(row)
+    ]
+
+
+class _Search:
+    """Rates of columns at random points, for random values of the parameters."""
+
+    def __init__(self, motion: Motion, columns: Sequence[Column]) -> None:
+        self.motion, self.columns = motion, columns
+        self.slopes: dict[int, dict[int, Expr]] = {}
+        self.drawn: dict[Symbol, Array] = {}
+
+    def null_spaces(self, chosen: Sequence[int], count: int) -> list[Array | None]:
+        """The null space of the chosen columns for ``count`` values of the parameters, (d, columns) each.
+
+        ``None`` where the system is not defined at enough points. Parameters have the signs of their default values and
+        are of size 1, or are near the default values where the system is not defined there.
+        """
+        for near in (False, True):
+            self.drawn = _drawn(self.motion.constants, count, near=near)
+            together = max(1, AT_ONCE // (2 * (len(chosen) + MORE_POINTS)))
+            found = [
+                space
+                for first in range(0, count, together)
+                for space in self._null_spaces(chosen, slice(first, first + together))
+            ]
+            if all(space is not None for space in found):
+                break
+        return found
+
+    def _null_spaces(self, chosen: Sequence[int], part: slice) -> Iterator[Array | None]:
+        """Those for some of the values drawn."""
+        size = len(chosen) + MORE_POINTS
+        points = 2 * size  # some may lie where the system is not defined
+        parameters = {given: np.repeat(values[part], points) for given, values in self.drawn.items()}
+        count = max([len(values) // points for values in parameters.values()], default=1)
+        with np.errstate(all="ignore"):
+            sample = self.motion.arrays(parameters, count * points)
+            terms = [self.terms(c, sample) for c in chosen]
+            rates = np.array([np.sum(own, axis=0) for own in terms]).T
+            sizes = np.array([np.abs(own).max(axis=0) for own in terms]).T
+        for own_rates, own_sizes in zip(np.split(rates, count), np.split(sizes, count), strict=True):
+            good = np.flatnonzero(np.isfinite(own_rates).all(axis=1))[:size]
+            yield _null_space(own_rates[good], own_sizes[good]) if len(good) == size else None
+
+    def terms(self, c: int, sample: Sample) -> list[Any]:
+        """What the time derivative of a column is the sum of."""
+        column = self.columns[c]
+        if not isinstance(column, Expr):
+            return [
+                (sample.value(factor) if isinstance(factor, Expr) else factor) * monomial.rate(sample)
+                for monomial, factor in column.items()
+            ]
+        state = (*self.motion.arguments[: len(self.motion.momenta)], *self.motion.momenta, self.motion.time)
+        if c not in self.slopes:
+            self.slopes[c] = gradient(column, state)
+        rates = (*sample.rates, 1.0)
+        return [sample.value(slope) * rates[i] for i, slope in self.slopes[c].items()] or [0.0 * sample.t]
+
+    def values_of(self, factor: Expr) -> Array:
+        """A function of the parameters for the values drawn last."""
+        known: dict[Any, Any] = dict(self.drawn)
+        return np.asarray(array_value(factor, known), dtype=float)
+
+    @cached_property
+    def points(self) -> list[Sample]:
+        """Points in 60 digits, none if the system is defined nowhere."""
+        for near in (False, True):
+            drawn = _drawn(self.motion.constants, 1, near=near)
+            found = list(self.motion.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, VERIFIED_AT))
+            if found:
+                return found
+        return []
+
+    def verified(self, row: Mapping[int, Expr]) -> bool:
+        """Whether the combination is conserved to 40 digits at all these points."""
+        for sample in self.points:
+            try:
+                terms = [sample.value(x) * term for c, x in row.items() for term in self.terms(c, sample)]
+            except ArithmeticError:  # a root of a parameter that may be negative
+                return False
+            if abs(mp.fsum(terms)) > NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))):
+                return False
+        return bool(self.points)
+
+
+def _drawn(constants: Mapping[Symbol, float], count: int, *, near: bool) -> dict[Symbol, Array]:
+    """``count`` random values of each parameter."""
+    generator = np.random.default_rng(len(constants))
+    if near:
+        return {x: value + (abs(value) or 1.0) * generator.uniform(-0.1, 0.1, count) for x, value in constants.items()}
+    return {x: math.copysign(1.0, value) * generator.uniform(0.6, 1.7, count) for x, value in constants.items()}
+
+
+def _null_space(matrix: Array, sizes: Array) -> Array:
+    """The null space in reduced row echelon form, (d, columns).
+
+    Rows and columns are scaled by ``sizes`` of the terms that entries are sums of: what is small beside those is 0.
+    """
+    heights = sizes.max(axis=1, keepdims=True)
+    heights = np.where(heights > 0.0, heights, 1.0)
+    widths = np.sqrt(((sizes / heights) ** 2).mean(axis=0))
+    widths = np.maximum(widths, ROUNDING * (widths.max() or 1.0))
+    _, singular, directions = np.linalg.svd(matrix / heights / widths, full_matrices=False)
+    rows, pivots = _reduced(directions[singular <= NULL * math.sqrt(len(matrix))])
+    unscaled: Array = rows * widths[pivots, None] / widths
+    return unscaled
+
+
+def _reduced(rows: Array) -> tuple[Array, list[int]]:
+    """Reduced row echelon form of orthonormal rows, and the columns of its leading ones."""
+    pivots: list[int] = []
+    for c in range(rows.shape[1]):
+        done = len(pivots)
+        if done == len(rows):
+            break
+        best = done + int(np.abs(rows[done:, c]).argmax())
+        if abs(rows[best, c]) < PIVOT:
+            rows[done:, c] = 0.0
+            continue
+        rows[[done, best]] = rows[[best, done]]
+        rows[done] /= rows[done, c]
+        others = np.arange(len(rows)) != done
+        rows[others] -= rows[others, c, None] * rows[done]
+        pivots.append(c)
+    return np.where(np.abs(rows) > ZERO, rows, 0.0), pivots
+
+
+def _factors(system: MechanicalSystem, motion: Motion) -> list[Expr]:
+    """What coefficients may be products of: parameters, and sums of parameters that occur in the system."""
+    constants = set(motion.constants)
+    found: list[Expr] = list(motion.constants)
+    masses = mass_entries(system)
+    sums = [*system.formula.atoms(sympy.Add), *masses.values()]
+    sums.append(sympy.Add(*(entry for (i, j), entry in masses.items() if i == j)))
+    for total in sums:
+        own = sympy.Add(*(term for term in sympy.Add.make_args(total) if term.free_symbols <= constants))
+        primitive = own.primitive()[1]
+        if len(sympy.Add.make_args(primitive)) > 1 and primitive not in found and -primitive not in found:
+            found.append(primitive)
+    return [*found[: len(constants)], *sorted(found[len(constants) :], key=str)]
+
+
+def _recognised_row(
+    entries: Array, support: Sequence[int], factors: Sequence[tuple[Expr, Array]], fractions: bool
+) -> dict[int, Expr] | None:
+    """Coefficients by column; ``entries`` are (values of the parameters, columns)."""
+    powers: dict[int, dict[Expr, Fraction]] = {}
+    numbers: dict[int, Expr] = {}
+    for k, c in enumerate(support):
+        if not entries[:, k].any():
+            continue
+        found = _recognised(entries[:, k], factors)
+        if found is None:
+            return None
+        numbers[c], powers[c] = found
+    shifts: dict[Expr, Fraction] = {}
+    for factor, _ in factors:
+        own = sorted(power[factor] for power in powers.values())
+        shifts[factor] = own[(len(own) - 1) // 2] if fractions else min(Fraction(0), own[0])
+    return {
+        c: sympy.Mul(number, *(factor ** sympy.Rational(powers[c][factor] - shift) for factor, shift in shifts.items()))
+        for c, number in numbers.items()
+    }
+
+
+def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[Expr, dict[Expr, Fraction]] | None:
+    """The number and the powers of the factors whose product has these values."""
+    if not entries.all():
+        return None
+    if not all(values.all() for _, values in factors):
+        return None
+    logs = [np.ones(len(entries)), *(np.log(np.abs(values)) for _, values in factors)]
+    solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]
+    halves = np.rint(2.0 * solution[1:])
+    if np.abs(halves).max(initial=0.0) > 2 * HIGHEST_POWER:
+        return None
+    quotients = entries.copy()
+    for (_, values), twice in zip(factors, halves, strict=True):
+        quotients /= values ** int(twice / 2) if twice % 2 == 0 else np.abs(values) ** (twice / 2.0)
+    number = _number(float(np.median(quotients)))
+    if number is None or np.abs(quotients / float(number) - 1.0).max() > RECOGNISED:
+        return None
+    return number, {factor: Fraction(int(twice), 2) for (factor, _), twice in zip(factors, halves, strict=True)}
+
+
+def _number(value: float) -> Expr | None:
+    """The rational number of small integers near ``value``, or the root of one."""
+    for exact in (Fraction(value), Fraction(value) ** 2):
+        simple = exact.limit_denominator(LARGEST_INTEGER)
+        if simple and abs(float(exact / simple) - 1.0) < RECOGNISED:
+            rational = sympy.Rational(simple.numerator, simple.denominator)
+            return rational if exact == Fraction(value) else sympy.sign(value) * sympy.sqrt(rational)
+    return None

@@ -1,0 +1,181 @@
+"""A system at random points: positions, momenta and their rates of change, as arrays of binary64 or in 60 digits.
+
+Time derivatives of functions of (q, p, t) follow from these without solving for accelerations: along every motion
+dq/dt = v and dp/dt = L_q with p = L_v for a Lagrangian, dq/dt = H_p and dp/dt = -H_q for a Hamiltonian. With v (or p)
+at random, what vanishes at all points vanishes identically.
+"""
+
+from __future__ import annotations
+
+import functools
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+from sympy import Expr, Symbol
+
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.mechanics.forms import force, legendre_map
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.precision import Number, mp
+
+__all__ = ["Motion", "Sample", "array_value", "momentum_symbols", "motion_of"]
+
+Array = NDArray[np.float64]
+
+SEED = 20250101
+SPREADS = (1.0, 0.3, 0.1)
+"""Sizes of velocities or momenta: some Lagrangians exist for small ones only."""
+ATTEMPTS = 24
+LARGEST = 10**300
+LONGEST_NUMBER = 1000
+"""Numerators and denominators of numbers in a formula that are as good as parameters: measured, not derived."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Numbers, or arrays of them, at one point or many.
+
+    Attributes:
+        t: time.
+        state: q, then p, 2 m entries.
+        rates: their time derivatives.
+        value: of an expression in q, p, time and parameters.
+    """
+
+    t: Any
+    state: tuple[Any, ...]
+    rates: tuple[Any, ...]
+    value: Callable[[Expr], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How a system moves: v and L_q, or H_p and -H_q, as expressions of ``arguments``, time and ``constants``.
+
+    Attributes:
+        arguments: (q, v) of a Lagrangian, (q, p) of a Hamiltonian.
+        momenta: symbols of p.
+        transformed: p of a Lagrangian, v of a Hamiltonian.
+        forces: dp/dt.
+        hamiltonian: which of both.
+        time: t.
+        constants: default value by parameter; long numbers of the formula are parameters here.
+        numbers: what stands for a long number, with that number.
+    """
+
+    arguments: tuple[Symbol, ...]
+    momenta: tuple[Symbol, ...]
+    transformed: tuple[Expr, ...]
+    forces: tuple[Expr, ...]
+    hamiltonian: bool
+    time: Symbol
+    constants: Mapping[Symbol, float]
+    numbers: Mapping[Symbol, sympy.Rational]
+
+    def arrays(self, parameters: Mapping[Symbol, Array], count: int) -> Sample:
+        """``count`` points; NaN where the system is not defined. Parameters: one number, or one a point."""
+        generator = np.random.default_rng(SEED)
+        m = len(self.momenta)
+        values: dict[Any, Any] = {**parameters, self.time: generator.uniform(-1.5, 1.5, count)}
+        for k, argument in enumerate(self.arguments):
+            size = 1.5 if k < m else generator.choice(SPREADS, count)
+            values[argument] = size * generator.uniform(-1.0, 1.0, count)
+        with np.errstate(all="ignore"):
+            return self._sample(values, lambda expression: array_value(expression, values) + np.zeros(count))
+
+    def points(self, parameters: Mapping[Symbol, Number], count: int) -> Iterator[Sample]:
+        """At most ``count`` points at which the system is defined, one by one in 60 digits."""
+        generator = random.Random(SEED)
+        for attempt in range(ATTEMPTS):
+            if count == 0:
+                return
+            values: dict[Any, Any] = {**parameters, self.time: mp.mpf(generator.uniform(-1.5, 1.5))}
+            for k, argument in enumerate(self.arguments):
+                size = 1.5 if k < len(self.momenta) else SPREADS[attempt % len(SPREADS)]
+                values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
+            known: dict[Expr, Number] = {}
+            try:
+                found = self._sample(values, functools.partial(evaluate, values=values, known=known))
+            except ArithmeticError:
+                continue
+            count -= 1
+            yield found
+
+    def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any]) -> Sample:
+        m = len(self.momenta)
+        transformed, forces = (tuple(map(value, given)) for given in (self.transformed, self.forces))
+        q, second = (tuple(values[argument] for argument in part) for part in (self.arguments[:m], self.arguments[m:]))
+        p, v = (second, transformed) if self.hamiltonian else (transformed, second)
+        values |= dict(zip(self.momenta, p, strict=True))
+        return Sample(t=values[self.time], state=(*q, *p), rates=(*v, *forces), value=value)
+
+
+def motion_of(system: MechanicalSystem) -> Motion:
+    """The motion of a system, long numbers replaced by parameters."""
+    arguments, transformed = legendre_map(system)
+    if system.auxiliaries:
+        slopes = gradient(system.formula, system.coordinates)
+        forces = tuple(-slopes.get(i, sympy.S.Zero) for i in range(system.dimension))
+    else:
+        forces = force(system)
+    numbers = _long_numbers((*transformed, *forces))
+    if numbers:
+        replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}
+        transformed, forces = (tuple(e.xreplace(replaced) for e in part) for part in (transformed, forces))
+    return Motion(
+        arguments=arguments,
+        momenta=momentum_symbols(system),
+        transformed=transformed,
+        forces=forces,
+        hamiltonian=bool(system.auxiliaries),
+        time=system.time,
+        constants=system.constants | {given: float(number) for given, number in numbers.items()},
+        numbers=numbers,
+    )
+
+
+def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
+    """A symbol for the absolute value of each."""
+    found = set().union(*(expression.atoms(sympy.Rational) for expression in expressions))
+    sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
+    return {sympy.Dummy(real=True): number for number in sorted(sizes)}
+
+
+def momentum_symbols(system: MechanicalSystem) -> tuple[Symbol, ...]:
+    """The momenta of a Hamiltonian; for a Lagrangian ``p_`` and the coordinate, with ``_`` before it where taken."""
+    if system.auxiliaries:
+        return system.auxiliaries
+    taken = {given.name for given in (*system.coordinates, *system.velocities, *system.parameters)}
+    return tuple(symbol(_free(f"p_{q.name}", taken)) for q in system.coordinates)
+
+
+def _free(name: str, taken: set[str]) -> str:
+    return name if name not in taken else _free(f"_{name}", taken)
+
+
+def array_value(expression: Any, known: dict[Any, Any]) -> Any:
+    """Value of an expression at many points, NaN where it has none; ``known`` has its symbols and gets its parts."""
+    if expression not in known:
+        known[expression] = _array_node(expression, known)
+    return known[expression]
+
+
+def _array_node(expression: Any, known: dict[Any, Any]) -> Any:
+    if not expression.args:
+        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
+    arguments = [array_value(argument, known) for argument in expression.args]
+    if expression.is_Add:
+        return functools.reduce(np.add, arguments)
+    if expression.is_Mul:
+        return functools.reduce(np.multiply, arguments)
+    if expression.is_Pow:
+        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
+    name = type(expression).__name__
+    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)

@@ -1,0 +1,162 @@
+"""What systems given by a Lagrangian and by a Hamiltonian have in common: names, parameters, and one function.
+
+Everything behind the front end sees one thing, a function whose stationary action gives the motion:
+
+    L(q, v, t)            of a :class:`~scvi_codegen.mechanics.lagrangian.LagrangianSystem`, no auxiliaries,
+    p . v - H(q, p, t)    of a :class:`~scvi_codegen.mechanics.hamiltonian.HamiltonianSystem`, the momenta p its
+    auxiliaries
+
+(Hamilton's principle, and Hamilton's principle in phase space: paper, section 1.1). Auxiliaries are further unknowns at
+every point where the function is evaluated, and the action is stationary in them, too.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.display.cards import Html, card, listed, plain
+from scvi_codegen.display.mathml import mathml_terms
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.grammar import closest, format_expression, unsupported_part
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
+
+__all__ = ["MechanicalSystem", "named_parameters"]
+
+MOST_OPERATIONS = 200
+"""Of a formula that a notebook shows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MechanicalSystem(ABC):
+    """Coordinates, time and parameters with default values; the function is the subclass's.
+
+    Attributes:
+        name: what the system is called.
+        coordinates: the m coordinates, in order.
+        time: the symbol ``t``.
+        parameters: the symbols that stay adjustable in the compiled integrator; one may be absent from the function.
+        defaults: their default values, parallel to ``parameters``.
+    """
+
+    name: str
+    coordinates: tuple[Symbol, ...]
+    time: Symbol
+    parameters: tuple[Symbol, ...]
+    defaults: tuple[float, ...]
+
+    @property
+    @abstractmethod
+    def lagrangian(self) -> Expr:
+        """The function of (q, v, t) and of the auxiliaries whose action is stationary."""
+
+    @property
+    @abstractmethod
+    def auxiliaries(self) -> tuple[Symbol, ...]:
+        """Further variables of :attr:`lagrangian`, m or none."""
+
+    @property
+    @abstractmethod
+    def formula(self) -> Expr:
+        """The function that defines the system: L or H."""
+
+    @property
+    def dimension(self) -> int:
+        """The number m of coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def velocities(self) -> tuple[Symbol, ...]:
+        """The m velocities, parallel to ``coordinates``."""
+        return tuple(symbol(coordinate.name + DOT) for coordinate in self.coordinates)
+
+    @property
+    def constants(self) -> dict[Symbol, float]:
+        """Default value by parameter."""
+        return dict(zip(self.parameters, self.defaults, strict=True))
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether time occurs in the function: energy is then not conserved."""
+        return self.time in self.formula.free_symbols
+
+    def to_text(self) -> str:
+        """The function as text that ``from_text`` reads back."""
+        return format_expression(self.formula)
+
+    def with_parameters(self, **values: float) -> Self:
+        """Copy the system with other default values for the parameters named."""
+        names = [parameter.name for parameter in self.parameters]
+        for key in values:
+            if key not in names:
+                raise SystemDefinitionError(
+                    f"'{self.name}' has no parameter '{key}'{closest(key, names)} It has: {', '.join(names) or 'none'}"
+                )
+        changed = dict(zip(names, self.defaults, strict=True)) | values
+        return replace(self, defaults=tuple(number(key, value) for key, value in changed.items()))
+
+    def _repr_html_(self) -> str:
+        letter = "H" if self.auxiliaries else "L"
+        size = sympy.count_ops(self.formula)
+        formula = mathml_terms(self.formula, Symbol(letter)) if size <= MOST_OPERATIONS else ()
+        written = " ".join(piece for term in formula for piece in term) or plain(f"{letter}: {size} operations")
+        parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
+        return card(
+            self.name,
+            (
+                ("coordinates", listed([q.name for q in self.coordinates])),
+                *([("momenta", listed([p.name for p in self.auxiliaries]))] if self.auxiliaries else []),
+                ("parameters", listed(parameters)),
+            ),
+            Html(f"<div>{written}</div>"),
+        )
+
+    def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
+        """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise SystemDefinitionError(f"a system needs a name, not {self.name!r}")
+        if any("\ud800" <= character <= "\udfff" for character in self.name):
+            raise SystemDefinitionError(f"the name {self.name!r} has half of a character in it, which no file can hold")
+        for given in (*self.coordinates, *self.auxiliaries, self.time, *self.parameters):
+            if not isinstance(given, Symbol) or given != symbol(given.name):
+                raise SystemDefinitionError(
+                    f"{given!r} is not a real symbol: build systems with from_sympy or from_text"
+                )
+        if self.time.name != TIME:
+            raise SystemDefinitionError(f"time is called '{TIME}', not '{self.time}': build systems with from_sympy")
+        check_names(
+            *([given.name for given in group] for group in (self.coordinates, self.parameters, self.auxiliaries))
+        )
+        if len(self.defaults) != len(self.parameters):
+            raise SystemDefinitionError(
+                f"{len(self.parameters)} parameters, but {len(self.defaults)} default values: give one each"
+            )
+        for parameter, value in self.constants.items():
+            number(parameter.name, value)
+        self._check_symbols_of_formula(what, arguments, kinds)
+
+    def _check_symbols_of_formula(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
+        problem = unsupported_part(self.formula)
+        if problem:
+            raise SystemDefinitionError(f"in the {what} of '{self.name}': {problem}")
+        known = [*self.coordinates, *arguments, self.time, *self.parameters]
+        unknown = sorted(free.name for free in self.formula.free_symbols.difference(known))
+        if unknown:
+            hint = closest(unknown[0], [given.name for given in known])
+            raise SystemDefinitionError(
+                f"'{unknown[0]}' in the {what} is neither a coordinate, {kinds}, time nor a parameter{hint} "
+                "Give it a default value among the parameters, or list it as a coordinate"
+            )
+
+
+def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[str, float]:
+    """Default value by name, whether symbols or names were given."""
+    given = {given_name(key): value for key, value in (parameters or {}).items()}
+    if len(given) < len(parameters or {}):
+        raise SystemDefinitionError("two parameters have the same name: rename one of them")
+    return given

@@ -1,0 +1,133 @@
+"""Stage equations of a system given by its Hamiltonian: the momenta at the points become unknowns, too.
+
+Methods write their equations as if L were known. Where the function of the system is p . v - H their kernels depend on
+momenta p_n at the points; each family of points gets them as further blocks, with the rows in which the action is
+stationary in them,
+
+    0 = v_n - H_p(q_n, p_n)                                                                            (35f),
+
+and, where a multiplied residual is stationary (shooting), one pair of such rows a node. With d2H/dp2 regular the method
+is the one of the Lagrangian, step for step: (35f) is Legendre's transform at the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import sympy
+
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.mechanics.forms import auxiliary_multipliers, constitutive
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.tables.basis import extrapolation, identity_matrix
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+__all__ = ["with_auxiliaries"]
+
+EXTRAPOLATION_DEGREE = 8
+NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
+"""The paper's numbers of the shooting method in phase space."""
+BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E"}
+"""Of the momenta at the points of a family."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Group:
+    """M unknowns a point of one family: symbols, equations, and the matrix of their next guess."""
+
+    family: int
+    name: str
+    momenta: bool
+    symbols: tuple[sympy.Symbol, ...]
+    results: tuple[sympy.Expr, ...]
+    guess: Matrix
+
+
+def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSystem:
+    """The stage equations with the auxiliaries of the system at all points that need them; the same without any."""
+    groups = [group for f, family in enumerate(stages.families) for group in _groups(system, f, family)]
+    if not groups:
+        return stages
+    added = [(g, n) for g, group in enumerate(groups) for n in range(len(group.guess))]
+    rows = (*stages.rows, *(Row(number="35f", kind="stage", momentum=mp.zero) for _ in added))
+    guesses = [group.guess for group in groups]
+    number_q, number_p = stages.end_numbers
+    return replace(
+        stages,
+        blocks=(*stages.blocks, *(_block(groups[g], n) for g, n in added)),
+        rows=tuple(replace(row, number=NUMBERS.get(row.number, row.number)) for row in rows),
+        families=tuple(
+            _extended(family, [g for g, group in enumerate(groups) if group.family == f], groups, added)
+            for f, family in enumerate(stages.families)
+        ),
+        end_position=Table.joined(stages.end_position, Table.constant(1, len(added))),
+        end_numbers=(NUMBERS.get(number_q, number_q), NUMBERS.get(number_p, number_p)),
+        extrapolation=stages.extrapolation and _diagonal([stages.extrapolation, *guesses]),
+    )
+
+
+def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_Group]:
+    """The auxiliaries that occur in a family, and the multipliers of their equations."""
+    free = set().union(*(result.free_symbols for result in family.results))
+    free |= family.scalar.free_symbols if family.scalar is not None else set()
+    points = family.abscissae
+    guesses = {
+        system.auxiliaries: extrapolation(points, 1, min(len(points) - 1, EXTRAPOLATION_DEGREE)),
+        auxiliary_multipliers(system): identity_matrix(len(points)),
+    }
+    for symbols, guess in guesses.items():
+        if free & set(symbols):
+            momenta = symbols == system.auxiliaries
+            name = BLOCK_NAMES[family.name] if momenta else "nu"
+            results = _stationary(system, family, symbols)
+            yield _Group(family=f, name=name, momenta=momenta, symbols=symbols, results=results, guess=guess)
+
+
+def _stationary(
+    system: MechanicalSystem, family: PointFamily, symbols: Sequence[sympy.Symbol]
+) -> tuple[sympy.Expr, ...]:
+    """What vanishes: the gradient of the family's scalar by these symbols, v - H_p where there is none."""
+    if family.scalar is None:
+        return constitutive(system)
+    slopes = gradient(family.scalar, symbols)
+    return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(symbols)))
+
+
+def _block(group: _Group, n: int) -> Block:
+    straight = (mp.zero, mp.zero)
+    return Block(name=f"{group.name}_{n + 1}", power=1, straight=straight, momentum=int(group.momenta), moves=False)
+
+
+def _extended(
+    family: PointFamily, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
+) -> PointFamily:
+    """A family with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
+    points, rows = len(family.abscissae), len(family.scatters[0].table.entries[0]) - 1
+    none = Table.constant(points, len(added))
+    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in family.gathers]
+    scatters = [replace(scatter, table=_inserted(scatter.table, none, rows)) for scatter in family.scatters]
+    known = Table.constant(points, len(family.gathers[0].table.entries[0]))
+    before, last = Table.constant(points, rows), Table.constant(points, 1)
+    for g in own:
+        place = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
+        gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, place), power=-1))
+        scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, place, last), power=0))
+    return replace(family, gathers=tuple(gathers), scatters=tuple(scatters))
+
+
+def _inserted(table: Table, columns: Table, at: int) -> Table:
+    """``columns`` before the last one of ``table``, that of p1."""
+    return Table.joined(table.columns(range(at)), columns, table.columns([at]))
+
+
+def _diagonal(blocks: Sequence[Matrix]) -> Matrix:
+    """The block diagonal matrix."""
+    size, offset = sum(map(len, blocks)), 0
+    lines: list[Vector] = []
+    for block in blocks:
+        after = size - offset - len(block)
+        lines += [(*(mp.zero,) * offset, *line, *(mp.zero,) * after) for line in block]
+        offset += len(block)
+    return tuple(lines)

@@ -1,0 +1,263 @@
+"""A folder with everything one integrator needs: C for C programs, an importable package for Python.
+
+    pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
+                   main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
+                   __init__.py  interface.json      ``import pendulum_svi`` gives ``pendulum_svi.stepper``
+                   model.toml  README.md            what it was made from, and how to use it
+
+The folder's name begins every C name. Importing it compiles the C text once, as it stands there, and never needs SymPy.
+``interface.json`` also records a checksum of each file, so that a file edited since is not overwritten unasked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import keyword
+import os
+import sys
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from string import Template
+from typing import IO, TYPE_CHECKING
+
+from scvi_codegen.errors import ModelFileError, PackageError, StateError
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.stepper import Stepper
+
+if TYPE_CHECKING:
+    from scvi_codegen.models.model_file import Model
+    from scvi_codegen.rendering.text import Embedded, ExampleRun
+
+__all__ = ["generate_package", "load_package"]
+
+INTERFACE_FILE = "interface.json"
+FORMAT = 1
+OUTPUTS = 20
+LONGEST_PREFIX = 64
+
+OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
+"""Folder names that would collide with ``main.c`` or hide what the package imports."""
+
+
+def generate_package(
+    model: Model,
+    folder: str | os.PathLike[str],
+    *,
+    solver: str = "auto",
+    force: bool = False,
+    embedded: Embedded | None = None,
+) -> Path:
+    """Write the integrator of a model into a folder, made if it is missing; other files in it are left alone.
+
+    Args:
+        model: system, method, and the initial state and step of the example.
+        folder: where to; its name becomes the prefix of the C names and the name of the Python package.
+        solver: of the stage equations, as for ``compile_stepper``.
+        force: overwrite files of the same names that were edited or written by someone else.
+        embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package.
+
+    Returns:
+        The folder.
+
+    Raises:
+        PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
+        MethodError: for a solver that the method does not have, and for a number beyond single precision.
+        StateError: if the initial velocities have no momenta.
+    """
+    target = Path(folder)
+    prefix = _prefix(target)
+    texts = _texts(model, prefix, solver, embedded)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        if not force:
+            _refuse_to_lose(target, texts)
+        for name, text in texts.items():
+            write_atomically(target / name, partial(_write, text))
+    except OSError as error:
+        raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error
+    return target
+
+
+def load_package(folder: str | os.PathLike[str]) -> Stepper:
+    """The stepper of a generated folder, compiled from the C text in it (from the cache if that is unchanged).
+
+    Raises:
+        PackageError: if the folder lacks a file or was written by another version.
+        BuildError: without a C compiler, or if it refuses the text.
+    """
+    target = Path(folder)
+    try:
+        record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
+        if not isinstance(record, dict) or record.get("format") != FORMAT:
+            raise PackageError(f"{target / INTERFACE_FILE} has another format: generate the folder again")
+        if "__init__.py" not in record["files"]:
+            raise PackageError(f"{target} is for a microcontroller: for Python generate it without --embedded")
+        interface = Interface.from_json(json.dumps(record["interface"]))
+        header, code = ((target / f"{interface.prefix}.{kind}").read_text(encoding="utf-8") for kind in "hc")
+        declarations = "\n".join(record["declarations"])
+    except OSError as error:
+        raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        if isinstance(error, PackageError):
+            raise
+        raise PackageError(f"{target / INTERFACE_FILE} is damaged ({error!r}): generate the folder again") from error
+    return Stepper(Source(prefix=interface.prefix, header=header, code=code, declarations=declarations), interface)
+
+
+def _write(text: str, file: IO[bytes]) -> None:
+    file.write(text.encode())
+
+
+def _prefix(folder: Path) -> str:
+    """The name of the folder, fit to begin C names and to be imported."""
+    from scvi_codegen.compiler import c_identifier  # here, because it imports SymPy
+
+    try:
+        name = folder.resolve().name
+        name.encode()
+    except ValueError as error:
+        raise PackageError(f"{str(folder)!r} cannot be the name of a folder: {error}") from error
+    cleaned = c_identifier(name)
+    if name != cleaned:
+        raise PackageError(
+            f"the folder's name begins every C name and is the name of the Python package; '{name}' does not serve "
+            f"(lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): call it '{cleaned}'"
+        )
+    if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
+        raise PackageError(f"'{name}' has a meaning in C or Python: call the folder '{name}_integrator'")
+    return name
+
+
+def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None) -> dict[str, str]:
+    """Text by file name, ``interface.json`` last."""
+    from scvi_codegen.compiler import generate_source
+    from scvi_codegen.rendering.text import render_example
+
+    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix, embedded=embedded)
+    texts = {f"{prefix}.h": source.header, f"{prefix}.c": source.code}
+    texts |= render_example(interface, _example(model), embedded or "double")
+    described = _model_text(model)
+    if described is not None:
+        texts["model.toml"] = described
+    texts["README.md"] = _readme(interface, with_model=described is not None, embedded=embedded)
+    if not embedded:
+        texts["__init__.py"] = _template("__init__.py")
+    return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
+
+
+def _example(model: Model) -> ExampleRun:
+    """The whole run of the model in at most about twenty lines of output."""
+    from scvi_codegen.rendering.text import ExampleRun
+
+    steps = max(1, model.step_count)
+    every = max(1, steps // OUTPUTS)
+    return ExampleRun(
+        q=model.q,
+        p=model.p if model.p is not None else _momenta(model),
+        parameters=model.system.defaults,
+        t=model.t,
+        h=model.h,
+        every=every,
+        outputs=steps // every,
+    )
+
+
+def _momenta(model: Model) -> tuple[float, ...]:
+    """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
+    from scvi_codegen.formulas.grammar import evaluate
+    from scvi_codegen.mechanics.forms import momentum
+    from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+    from scvi_codegen.tables.precision import mp
+
+    system = lagrangian_twin(model.system)
+    if system is None:
+        raise StateError("velocities do not determine the momenta of this Hamiltonian: give p, not q_dot")
+    symbols = (*system.coordinates, *system.velocities, system.time, *system.parameters)
+    numbers = (*model.q, *(model.velocity or ()), model.t, *system.defaults)
+    point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))
+    try:
+        return tuple(float(evaluate(expression, point)) for expression in momentum(system))
+    except ArithmeticError as error:
+        raise StateError(f"the initial velocities have no momenta: {error}") from error
+
+
+def _model_text(model: Model) -> str | None:
+    """The model file, or ``None`` for a method that a file cannot hold (a quadrature of the user's own)."""
+    from scvi_codegen.models.model_file import dump_model
+
+    try:
+        return dump_model(model)
+    except ModelFileError:
+        return None
+
+
+def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None) -> str:
+    defaults = zip(interface.parameters, interface.defaults, strict=True)
+    listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
+    return (
+        Template(_template("README_embedded.md" if embedded else "README.md"))
+        .substitute(
+            real="float" if embedded == "single" else "double",
+            prefix=interface.prefix,
+            macro=interface.prefix.upper(),
+            title=" ".join(interface.title.split()),
+            notes=", ".join(interface.notes),
+            coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
+            parameters=f"Parameters, with default values: {listed}." if listed else "There are no parameters.",
+            origin="`model.toml` is what it was generated from." if with_model else "",
+        )
+        .rstrip("\n")
+        + "\n"
+    )
+
+
+def _template(name: str) -> str:
+    from scvi_codegen.files.templates import template_folder
+
+    return (template_folder() / "package" / name).read_text(encoding="utf-8")
+
+
+def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
+    record = {
+        "format": FORMAT,
+        "interface": json.loads(interface.to_json()),
+        "declarations": source.declarations.split("\n"),
+        "files": {name: _checksum(text.encode()) for name, text in texts.items()},
+    }
+    return json.dumps(record, indent=1) + "\n"
+
+
+def _checksum(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _refuse_to_lose(folder: Path, texts: Mapping[str, str]) -> None:
+    """Raise :class:`PackageError` if a file to be written exists and was neither written by us nor is the same."""
+    known = _recorded(folder)
+    for name, text in texts.items():
+        try:
+            found = _checksum((folder / name).read_bytes())
+        except FileNotFoundError:
+            continue
+        if name == INTERFACE_FILE:
+            ours = known is not None
+        else:
+            ours = found in (_checksum(text.encode()), (known or {}).get(name))
+        if not ours:
+            raise PackageError(
+                f"{folder / name} was edited, or not written by this program: move it away, choose another folder, "
+                "or overwrite it with --force (from Python: force=True)"
+            )
+
+
+def _recorded(folder: Path) -> dict[str, str] | None:
+    """Checksums by file name from ``interface.json``, or ``None`` if that is missing or not ours."""
+    try:
+        record = json.loads((folder / INTERFACE_FILE).read_text(encoding="utf-8"))
+        files = record["files"] if isinstance(record["format"], int) else None
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return None
+    return files if isinstance(files, dict) else None

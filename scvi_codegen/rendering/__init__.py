@@ -1,0 +1,1 @@
+"""Program to C text: expressions printed, templates filled, texts remembered."""

@@ -1,0 +1,142 @@
+"""Events in C: formulas to a kernel, and the search for its zeros appended to the text of an integrator.
+
+The search uses nothing of an integrator but its public functions, so that it stands behind every method and solver, and
+the text without events stays what it is. What it does on a step is said in ``templates/parts/events.c.jinja``:
+
+* the functions are evaluated at its ends and at three states between them, each a step of a part of h, and polynomials
+  of degree 4 drawn through the values;
+* a polynomial tells how often its function crosses zero. Where an extremum is so near zero that its sign is in doubt
+  (nearer than the last two Chebyshev coefficients), the step is split there, ``SPLITS`` times over, and the function
+  decides;
+* each crossing is enclosed by steps of parts of h until the ends are neighbouring numbers.
+
+No pair of crossings is missed where a function is a polynomial of degree 4 in time along a step. Of others those are
+found that their polynomials of degree 4 hint at; one that turns back and forth more often within a step can hide some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.errors import EventError, SystemDefinitionError
+from scvi_codegen.formulas.grammar import closest, evaluated, parse_expression, unsupported_part
+from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
+from scvi_codegen.ir.program import Kernel
+from scvi_codegen.lowering.program import lower_kernel, lower_matrix, lower_vector
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.text import EventSearch, render_events
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["with_events"]
+
+DEGREE = 4
+SPLITS = 6
+
+
+@lru_cache(maxsize=64)
+def with_events(source: Source, interface: Interface, functions: tuple[str | Expr, ...]) -> Source:
+    """The text of an integrator with the search for zeros of functions of its state behind it.
+
+    Args:
+        source, interface: of the integrator, without events.
+        functions: text of the grammar or SymPy expressions in the names that the interface has.
+
+    Raises:
+        ExpressionError: for text outside the grammar, with its column.
+        EventError: naming the symbol or function at fault.
+    """
+    kernel, uses_velocity = _kernel(interface, functions)
+    declarations, code = render_events(_search(interface, kernel, uses_velocity), source)
+    return replace(
+        source,
+        header=source.header.replace(source.declarations, source.declarations + declarations),
+        code=source.code + code,
+        declarations=source.declarations + declarations,
+    )
+
+
+def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:
+    """The functions at u = (q, p, v), and whether any velocity occurs in them."""
+    names = _names(interface)
+    values = [_expression(function, names) for function in functions]
+    q = [symbol(name) for name in interface.coordinates]
+    v = [symbol(name + DOT) for name in interface.coordinates]
+    taken = {*q, *v, symbol(TIME), *(symbol(name) for name in interface.parameters)}
+    p = [sympy.Dummy() if symbol(name) in taken else symbol(name) for name in interface.momenta]
+    kernel = lower_kernel(
+        "event_functions",
+        arguments=(*q, *p, *v),
+        time=symbol(TIME),
+        parameters=tuple(symbol(name) for name in interface.parameters),
+        values=values,
+    )
+    return kernel, any(value.free_symbols.intersection(v) for value in values)
+
+
+def _names(interface: Interface) -> dict[str, Symbol]:
+    """What a function may use; a momentum's default name gives way to a coordinate or parameter of that name."""
+    velocities = [name + DOT for name in interface.coordinates]
+    return {
+        name: symbol(name)
+        for name in (*interface.coordinates, *velocities, *interface.momenta, TIME, *interface.parameters)
+    }
+
+
+def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
+    """One function in canonical symbols."""
+    if isinstance(function, str):
+        found = parse_expression(function, names)
+    elif isinstance(function, Expr):
+        found = _translated(function)
+    else:
+        raise EventError(f"the function of an event is text or a SymPy expression, not {function!r}")
+    problem = unsupported_part(found)
+    if problem:
+        raise EventError(f"in the event function '{function}': {problem}")
+    unknown = sorted(free.name for free in found.free_symbols.difference(names.values()))
+    if unknown:
+        raise EventError(
+            f"'{unknown[0]}' in the event function '{function}' is neither a coordinate, a velocity, a momentum, time "
+            f"nor a parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
+        )
+    if not found.free_symbols:
+        raise EventError(f"the event function '{function}' is constant: it never crosses zero")
+    return found
+
+
+def _translated(function: Expr) -> Expr:
+    """Functions of time, their derivatives and other symbols by their names."""
+    rules: dict[Expr, Expr] = {free: symbol(identifier(free.name)) for free in function.free_symbols}
+    for moving in function.atoms(AppliedUndef):
+        rules[moving] = symbol(identifier(moving.func.__name__))
+    for rate in function.atoms(sympy.Derivative):
+        if not isinstance(rate.expr, AppliedUndef) or rate.derivative_count != 1:
+            raise EventError(f"'{rate}' in the event function '{function}' is not the velocity of a coordinate")
+        rules[rate] = symbol(identifier(rate.expr.func.__name__) + DOT)
+    try:
+        return evaluated(function, rules)
+    except SystemDefinitionError as error:
+        raise EventError(f"in the event function '{function}': {error}") from error
+
+
+def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventSearch:
+    """Chebyshev's points of the second kind on [0, 1], and from values there to coefficients of powers on [-1, 1]."""
+    points = [-mp.cos(mp.pi * j / DEGREE) if 2 * j != DEGREE else mp.mpf(0) for j in range(DEGREE + 1)]
+    inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
+    coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
+    return EventSearch(
+        prefix=interface.prefix,
+        dimension=interface.dimension,
+        kernel=kernel,
+        uses_velocity=uses_velocity,
+        nodes=lower_vector(tuple((1 + x) / 2 for x in points)),
+        coefficients=lower_matrix(coefficients),
+        doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
+        splits=SPLITS,
+    )

@@ -1,0 +1,157 @@
+"""IR expressions to C text. Prints what it is given: no rewriting, only names, literals and parentheses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
+
+from scvi_codegen.ir.program import Constant, Expression, Kernel, Load, Operation, Sweep
+
+__all__ = [
+    "constants",
+    "lane_functions",
+    "print_expression",
+    "print_lane_statements",
+    "print_number",
+    "print_statements",
+    "scalar_functions",
+]
+
+Sources: TypeAlias = tuple[str, ...]
+"""Loads that differ from lane to lane: ``("u", "t")`` where lanes are points, ``("u", "parameters")`` where they are
+trajectories."""
+
+PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
+
+
+def print_number(value: float) -> str:
+    """A C double literal that reads back as the same binary64 number."""
+    return repr(float(value))
+
+
+def print_expression(expression: Expression) -> str:
+    """C text of an expression over ``u``, ``t``, ``parameters`` and temporaries ``w<k>``."""
+    return _print(expression, 0)
+
+
+def _print(expression: Expression, context: int) -> str:
+    if isinstance(expression, Constant):
+        text = print_number(expression.value)
+        return f"({text})" if text.startswith("-") and context else text
+    if isinstance(expression, Load):
+        return _load(expression)
+    operator, operands = expression.operator, expression.operands
+    if operator not in PRECEDENCE:
+        return f"{operator}({', '.join(_print(operand, 0) for operand in operands)})"
+    level = PRECEDENCE[operator]
+    if operator == "neg":
+        text = f"-{_print(operands[0], level + 1)}"
+    else:
+        left, right = operands
+        sign = f" {operator} " if level == 1 else operator
+        text = f"{_print(left, level)}{sign}{_print(right, level + 1)}"
+    return f"({text})" if level < context else text
+
+
+def _load(load: Load) -> str:
+    if load.source == "t":
+        return "t"
+    return f"w{load.index}" if load.source == "w" else f"{load.source}[{load.index}]"
+
+
+def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
+    """The functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
+    vectors = _Vectors(kernel, sources)
+    return _functions(kernel, vectors.has)
+
+
+def scalar_functions(kernel: Kernel) -> set[str]:
+    """All functions that occur in a kernel."""
+    return _functions(kernel, lambda expression: True)
+
+
+def constants(kernel: Kernel) -> Iterator[float]:
+    """The numbers written in a kernel."""
+    return (expression.value for expression in _expressions(kernel) if isinstance(expression, Constant))
+
+
+def _functions(kernel: Kernel, wanted: Callable[[Expression], bool]) -> set[str]:
+    operations = (expression for expression in _expressions(kernel) if isinstance(expression, Operation))
+    return {each.operator for each in operations if each.operator not in PRECEDENCE and wanted(each)}
+
+
+def _expressions(kernel: Kernel) -> Iterator[Expression]:
+    """Every expression of a kernel, with those it is made of."""
+    pending: list[Expression] = [*kernel.temporaries, *kernel.results]
+    while pending:
+        expression = pending.pop()
+        yield expression
+        if isinstance(expression, Operation):
+            pending.extend(expression.operands)
+
+
+def print_statements(kernel: Kernel) -> list[str]:
+    """The statements of a kernel of numbers."""
+    return [
+        f"const double w{k} = {print_expression(expression)};"
+        if kind == "w"
+        else f"{kind}[{k}] = {print_expression(expression)};"
+        for kind, k, expression in kernel.statements()
+    ]
+
+
+def print_lane_statements(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
+    """The same for vectors; what is the same in every lane stays a number, slopes go to their places in the mass."""
+    vectors = _Vectors(kernel, sources)
+    statements = []
+    for kind, k, expression in kernel.statements():
+        text, vector = _print_lanes(expression, vectors), vectors.has(expression)
+        if kind == "w":
+            statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
+        else:
+            target = f"value[{k}]" if kind == "value" else _place_in_mass(sweep, k)
+            statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")
+    return statements
+
+
+def _place_in_mass(sweep: Sweep, k: int) -> str:
+    i, j = sweep.mass_entries[k]
+    return f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]"
+
+
+class _Vectors:
+    """Which temporaries of a kernel differ from lane to lane."""
+
+    def __init__(self, kernel: Kernel, sources: Sources) -> None:
+        self.sources, self.temporaries = sources, set[int]()
+        for k, expression in enumerate(kernel.temporaries):
+            if self.has(expression):
+                self.temporaries.add(k)
+
+    def has(self, expression: Expression) -> bool:
+        """Whether the expression is a vector."""
+        if isinstance(expression, Load):
+            return expression.source in self.sources or (
+                expression.source == "w" and expression.index in self.temporaries
+            )
+        return isinstance(expression, Operation) and any(self.has(operand) for operand in expression.operands)
+
+
+def _print_lanes(expression: Expression, vectors: _Vectors) -> str:
+    return print_expression(_with_lane_calls(expression, vectors))
+
+
+def _with_lane_calls(expression: Expression, vectors: _Vectors) -> Expression:
+    """The same with ``f`` of a vector renamed ``lanes_f``, its plain arguments made vectors."""
+    if not isinstance(expression, Operation):
+        return expression
+    operands = tuple(_with_lane_calls(operand, vectors) for operand in expression.operands)
+    if expression.operator in PRECEDENCE or not vectors.has(expression):
+        return Operation(expression.operator, operands)
+    return Operation(
+        f"lanes_{expression.operator}",
+        tuple(
+            new if vectors.has(old) else Operation("lanes_of", (new,))
+            for old, new in zip(expression.operands, operands, strict=True)
+        ),
+    )

@@ -1,0 +1,401 @@
+"""Program to text: the only room that knows Jinja.
+
+Entry templates are named after the file they make; parts live in ``templates/parts``. Templates hold shape only: loops
+over the program's tables and the C that does not depend on it. Arithmetic arrives lowered and is printed by
+:mod:`scvi_codegen.rendering.printer` through filters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from itertools import chain
+from typing import Literal, TypeAlias, get_args
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from scvi_codegen.files.templates import template_folder
+from scvi_codegen.ir.program import CoupledSweep, Family, Kernel, Program, SeparableSweep, Sweep
+from scvi_codegen.rendering.printer import (
+    constants,
+    lane_functions,
+    print_lane_statements,
+    print_number,
+    print_statements,
+    scalar_functions,
+)
+from scvi_codegen.rendering.single_precision import SINGLE_UNIT, check_single, to_single
+from scvi_codegen.rendering.source import Interface, Source
+
+__all__ = [
+    "DEFAULT_TOLERANCE",
+    "EMBEDDED",
+    "MAX_ITERATIONS",
+    "Embedded",
+    "EventSearch",
+    "ExampleRun",
+    "render",
+    "render_embedded",
+    "render_events",
+    "render_example",
+]
+
+Embedded: TypeAlias = Literal["double", "single"]
+"""The precision of C text for a microcontroller."""
+
+EMBEDDED: tuple[Embedded, ...] = get_args(Embedded)
+
+DEFAULT_TOLERANCE = 2.0**-52
+"""Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
+
+MAX_ITERATIONS = 50
+ROUNDOFF_LEVEL = 1e-11
+SINGLE_ROUNDOFF_LEVEL = 1e-4
+KEEP_CHANGE = 1e-2
+KEEP_RATE = 0.1
+GOOD_GUESS = 1e-3
+"""Relative error below which the next guess is continued from two steps, not one."""
+MOST_TRIALS = 200
+SMALL_PART = 0.03
+STEEPNESS = 8.0
+BISECTIONS = 30
+"""Halvings of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60."""
+POINT_SOURCES = ("u", "t")
+TRAJECTORY_SOURCES = ("u", "parameters")
+ENSEMBLE_LANES = 8
+INVERSE_ROOT = "inverse_root_"
+LARGEST_INLINED = 150
+"""Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies
+3 per cent, a chain of 64 masses 20."""
+VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
+"""What glibc's libmvec has for every x86-64 vector width since 2.22."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleRun:
+    """What the generated ``main.c`` runs: initial state, step, and how often it prints."""
+
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    parameters: tuple[float, ...]
+    t: float
+    h: float
+    every: int
+    outputs: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSearch:
+    """What the search for zeros of functions of the state is made from.
+
+    Attributes:
+        prefix, dimension: of the integrator.
+        kernel: the functions at u = (q, p, v).
+        uses_velocity: whether v occurs in them.
+        nodes: (d + 1,) where they are evaluated on a part of a step, as fractions of it.
+        coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
+        doubts: of the last two of these, what part of them is in doubt.
+        splits: how many times over a step is split at most.
+    """
+
+    prefix: str
+    dimension: int
+    kernel: Kernel
+    uses_velocity: bool
+    nodes: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+    doubts: tuple[float, float]
+    splits: int
+
+
+def render(program: Program) -> Source:
+    """Header and source of a program; equal programs give equal bytes."""
+    return _render(program.prefix, _context(program))
+
+
+def render_embedded(program: Program, precision: Embedded) -> Source:
+    """The same for a microcontroller: iterations bounded when it is compiled, in the precision of its registers.
+
+    Raises:
+        MethodError: for a number that single precision cannot hold.
+    """
+    bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
+    context = _context(program) | {
+        "embedded": True,
+        "most_iterations": MAX_ITERATIONS,
+        "max_iterations": bound,
+        "iteration_limit": f"least(options->max_iterations, {bound})",
+        "halvings": 52,
+    }
+    if precision == "double":
+        return _render(program.prefix, context)
+    check_single((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program)))))
+    levels = {"real": "float", "halvings": 23, "tolerance": SINGLE_UNIT, "roundoff_level": SINGLE_ROUNDOFF_LEVEL}
+    source = _render(program.prefix, context | levels)
+    header, code, declarations = map(to_single, (source.header, source.code, source.declarations))
+    return Source(prefix=source.prefix, header=header, code=code, declarations=declarations)
+
+
+def _render(prefix: str, context: Mapping[str, object]) -> Source:
+    environment = _environment()
+    return Source(
+        prefix=prefix,
+        header=environment.get_template("stepper.h.jinja").render(context),
+        code=environment.get_template("stepper.c.jinja").render(context),
+        declarations=environment.get_template("parts/declarations.h.jinja").render(context),
+    )
+
+
+def render_ensemble(program: Program) -> Source | None:
+    """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
+    sweep = program.sweep
+    if not isinstance(sweep, SeparableSweep | CoupledSweep) or (isinstance(sweep, CoupledSweep) and sweep.projected):
+        return None
+    prefix = f"{program.prefix}_ensemble"
+    context = {
+        "program": program,
+        "prefix": prefix,
+        "purpose": _purposes(program),
+        "tolerance": DEFAULT_TOLERANCE,
+        "max_iterations": MAX_ITERATIONS,
+        "width": ENSEMBLE_LANES,
+        "lane_meaning": "trajectories",
+        **_vector_context(sweep, TRAJECTORY_SOURCES),
+    }
+    environment = _environment()
+    return Source(
+        prefix=prefix,
+        header=environment.get_template("ensemble.h.jinja").render(context),
+        code=environment.get_template("ensemble.c.jinja").render(context),
+        declarations=environment.get_template("parts/ensemble_declarations.h.jinja").render(context),
+    )
+
+
+def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
+    """Declarations and code of the search for events, to stand behind those of an integrator."""
+    needed = _inverse_roots(scalar_functions(search.kernel))
+    context = {
+        "prefix": search.prefix,
+        "dimension": search.dimension,
+        "kernel": search.kernel,
+        "uses_velocity": search.uses_velocity,
+        "nodes": search.nodes,
+        "coefficients": search.coefficients,
+        "doubts": search.doubts,
+        "splits": search.splits,
+        "events": search.kernel.values,
+        "small_part": SMALL_PART,
+        "steepness": STEEPNESS,
+        "trials": MOST_TRIALS,
+        "bisections": BISECTIONS,
+        "inverse_roots": [k for k in needed if f" {INVERSE_ROOT}{k}(double" not in source.code],
+    }
+    environment = _environment()
+    return (
+        environment.get_template("parts/events_declarations.h.jinja").render(context),
+        environment.get_template("parts/events.c.jinja").render(context),
+    )
+
+
+def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
+    """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
+    context = {"interface": interface, "prefix": interface.prefix, "start": start}
+    environment = _environment()
+    texts = {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
+    if precision == "single":
+        check_single((*start.q, *start.p, *start.parameters, start.t, start.h))
+        texts["main.c"] = to_single(texts["main.c"])
+    return texts
+
+
+def workspace_size(program: Program) -> int:
+    """Doubles of workspace: scratch, memory, and for Newton unknowns, point, update, pivots, rows and Jacobian."""
+    if not program.newton:
+        return scratch_size(program) + program.memory
+    rows = program.unknowns + program.dimension
+    jacobian = program.matrix_size(program.blocks + (1 if program.action else 0))
+    return scratch_size(program) + program.memory + program.unknowns + program.point + 3 * rows + jacobian
+
+
+def scratch_size(program: Program) -> int:
+    """Doubles for the kernels of one family, or for the mass matrix with its slopes."""
+    mass = program.matrix_size(1) + len(program.mass_entries)
+    return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
+
+
+def _context(program: Program) -> dict[str, object]:
+    return {
+        "program": program,
+        "prefix": program.prefix,
+        "kernels": program.kernels,
+        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, _scalar_kernels(program)))),
+        "purpose": _purposes(program),
+        "legendre": program.legendre,
+        "workspace": workspace_size(program),
+        "scratch": scratch_size(program),
+        "tolerance": DEFAULT_TOLERANCE,
+        "max_iterations": MAX_ITERATIONS,
+        "iteration_limit": "options->max_iterations",
+        "embedded": False,
+        "real": "double",
+        "roundoff_level": ROUNDOFF_LEVEL,
+        "keep_change": KEEP_CHANGE,
+        "keep_rate": KEEP_RATE,
+        **_lane_context(program.sweep),
+    }
+
+
+def _scalar_kernels(program: Program) -> tuple[Kernel, ...]:
+    return (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
+
+
+def _purposes(program: Program) -> dict[str, str]:
+    """One sentence a kernel, for the comment above it."""
+    purposes = {
+        "legendre": "Momenta L_v and mass matrix L_vv at u = (q, v).",
+        "lagrangian": "L at u = (q, v).",
+        "derivative_1_action": "dL/dt at u = (q, v, a).",
+        "derivative_2_action": "d^2L/dt^2 at u = (q, v, a, j).",
+        "derivative_3_action": "d^3L/dt^3 at u = (q, v, a, j, s).",
+        "hamiltonian": "H at u = (q, p).",
+        "momentum_maps": "What is conserved at u = (q, p), then the sums of the squares of the terms.",
+        "force_lanes": "L_q at all points.",
+        "velocity_lanes": "H_p at all points, u = (q, p).",
+        "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
+        "action_lanes": "L_q and L_v at all points, u = (q, v).",
+        "applied_force_lanes": "L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
+        "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
+    }
+    if program.hamiltonian:
+        purposes |= {
+            "force_lanes": "-H_q at all points, u = (q, p).",
+            "legendre": "H_p and H_pp at u = (q, p).",
+            "lagrangian": "p . v - H at u = (q, v, p).",
+        }
+    for family in program.families:
+        arguments = f"({', '.join(family.arguments)})"
+        purposes[family.value.name] = f"{_results(family)} at u = {arguments}."
+        purposes[family.slope.name] = f"The same, and the non-zero derivatives with respect to u = {arguments}."
+    return purposes
+
+
+def _results(family: Family) -> str:
+    if family.name == "node":
+        return "Derivatives of lambda . E" if "lambda" in family.arguments else "The Euler-Lagrange residual E"
+    if family.action_power:
+        return f"Derivatives of d^{family.action_power}L/dt^{family.action_power}"
+    slopes = " and ".join(f"L_{name}" for name in family.arguments)
+    return slopes if len(family.scatters) == len(family.gathers) else "L_v"
+
+
+def _lane_context(sweep: Sweep | None) -> dict[str, object]:
+    """What the templates of the fixed-point solver need; nothing without one."""
+    if sweep is None:
+        return {}
+    hot = "static inline __attribute__((always_inline)) " if _size(sweep) <= LARGEST_INLINED else "static "
+    return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points", "hot": hot}
+
+
+def _size(sweep: Sweep) -> int:
+    """Operations of all kernels with lanes."""
+    return sum(sum(kernel.operation_counts().values()) for kernel in sweep.kernels)
+
+
+def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]:
+    """Kernels in vectors, with the functions they call; ``sources`` differ from lane to lane."""
+    kernels = applied = sweep.kernels
+    if isinstance(sweep, SeparableSweep) and sources == TRAJECTORY_SOURCES:
+        applied = (*kernels, sweep.mass)
+    functions = set().union(*(lane_functions(kernel, sources) for kernel in applied))
+    roots = _inverse_roots(functions)
+    return {
+        "sweep": sweep,
+        "lane_kernels": kernels,
+        "lane_functions": sorted(functions - {f"{INVERSE_ROOT}{k}" for k in roots} | ({"sqrt"} if roots else set())),
+        "inverse_roots_in_lanes": roots,
+        "root_for_inverses": "sqrt" not in functions,
+        "series": _binomial_series,
+        "good_guess": GOOD_GUESS**2,
+        "vector_library": VECTOR_LIBRARY,
+        "vector_sources": sources,
+    }
+
+
+def _inverse_roots(functions: set[str]) -> list[int]:
+    """The k of all ``inverse_root_k``."""
+    return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in functions if name.startswith(INVERSE_ROOT))
+
+
+def _binomial_series(k: int) -> list[float]:
+    """Coefficients of e, .., e^4 in (1 - e)^(-k/2)."""
+    coefficients = [1.0]
+    for j in range(1, 5):
+        coefficients.append(coefficients[-1] * (k / 2 + j - 1) / j)
+    return coefficients[1:]
+
+
+def _signature(kernel: Kernel) -> str:
+    """C parameters of a kernel: only what it uses."""
+    parts = ["const double *u"] if kernel.uses_arguments else []
+    parts += ["double t"] if kernel.uses_time else []
+    parts += ["const double *parameters"] if kernel.uses_parameters else []
+    parts += ["double *value"]
+    parts += ["double *slope"] if len(kernel.results) > kernel.values else []
+    return ", ".join(parts)
+
+
+def _lane_signature(kernel: Kernel, sources: tuple[str, ...]) -> str:
+    """The same with vectors in place of numbers."""
+    signature = _signature(kernel).replace("const double *u", "const lanes *u").replace("double *value", "lanes *value")
+    signature = signature.replace("double *slope", "lanes *slope")
+    if "t" in sources:
+        return signature.replace("double t", "lanes t")
+    return signature.replace("const double *parameters", "const lanes *parameters")
+
+
+def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:
+    """The same parameters in a call."""
+    parts = [u] if kernel.uses_arguments else []
+    parts += [t] if kernel.uses_time else []
+    parts += [parameters] if kernel.uses_parameters else []
+    parts += [value]
+    parts += [slope] if slope is not None else []
+    return ", ".join(parts)
+
+
+def _power_of_h(k: int) -> str:
+    """C text of h^k as a factor."""
+    product = "*".join(["h"] * abs(k))
+    if k == 0:
+        return "1.0"
+    return product if k > 0 else f"1.0/({product})"
+
+
+def _counts(kernel: Kernel) -> str:
+    return ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(template_folder()),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.globals["power_of_h"] = _power_of_h
+    environment.filters |= {
+        "number": print_number,
+        "signature": _signature,
+        "call_arguments": _call_arguments,
+        "counts": _counts,
+        "pairs": lambda entries: ", ".join(f"{{{i}, {j}}}" for i, j in entries),
+        "transposed": lambda rows: tuple(zip(*rows, strict=True)),
+        "lane_signature": _lane_signature,
+        "statements": print_statements,
+        "lane_statements": print_lane_statements,
+    }
+    return environment

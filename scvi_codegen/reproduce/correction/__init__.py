@@ -1,0 +1,1 @@
+"""The chain-rule term that the printed SCVI lacks: derived, measured, drawn."""

@@ -1,0 +1,184 @@
+"""The pendulum with three points, twice: what the compiler derives, and the same by hand, to compare.
+
+By hand means: the generating function is written down in SymPy from the interpolant and the nodes, without any table of
+the compiler.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import sympy
+
+from scvi_codegen.derivation.equations import StepEquations, derive
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SCVI, SVI
+
+__all__ = [
+    "ByHand",
+    "MiddleValue",
+    "by_hand",
+    "compiled",
+    "eliminated",
+    "largest_difference",
+    "lost_terms",
+    "middle_value",
+    "multipliers_agree",
+    "two_points_agree",
+]
+
+QUADRATURE = "gauss-legendre:2"
+h, q_k, p_k, Q_1, Q_2, v_0, lambda_1, lambda_2 = sympy.symbols("h q_k p_k Q_1 Q_2 v_0 lambda_1 lambda_2", real=True)
+tau = sympy.Symbol("tau", real=True)
+
+
+PENDULUM = LagrangianSystem.from_text(
+    name="planar pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", parameters={}
+)
+
+
+@lru_cache(maxsize=2)
+def compiled(variational: bool) -> StepEquations:
+    """The compiler's equations of one step, SCVI(2) with two Gauss points, for L = q_dot^2/2 + cos(q)."""
+    return derive(PENDULUM, SCVI(2, QUADRATURE, variational=variational), radicals=True)
+
+
+def two_points_agree() -> bool:
+    """Whether the printed (34d), (34e) with two points are the equations (27a), (27c) of SVI, derivatives of L_d."""
+    shooting = derive(PENDULUM, SCVI(1, QUADRATURE, variational=False))
+    galerkin = derive(PENDULUM, SVI(1, QUADRATURE))
+    return all(
+        sympy.expand(one.residual - other.residual) == 0
+        for one, other in zip(shooting.idel_equations, galerkin.idel_equations, strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ByHand:
+    """One step by hand.
+
+    Attributes:
+        curve: q(tau).
+        velocities, accelerations: V_i and Acc_i at the nodes 1 and 2.
+        residuals: E_i.
+        action: L_d(q_k, Q_1, Q_2).
+    """
+
+    curve: sympy.Expr
+    velocities: tuple[sympy.Expr, sympy.Expr]
+    accelerations: tuple[sympy.Expr, sympy.Expr]
+    residuals: tuple[sympy.Expr, sympy.Expr]
+    action: sympy.Expr
+
+    @property
+    def generator(self) -> sympy.Expr:
+        """G = L_d + lambda . E."""
+        return self.action + lambda_1 * self.residuals[0] + lambda_2 * self.residuals[1]
+
+
+@lru_cache(maxsize=1)
+def by_hand() -> ByHand:
+    """Nodes -1, 0, 1; the slope at the middle and at the end of a parabola through three values, applied twice."""
+    curve = tau * (tau - 1) / 2 * q_k + (1 - tau**2) * Q_1 + tau * (tau + 1) / 2 * Q_2
+    velocities = _slopes(q_k, Q_1, Q_2)
+    accelerations = _slopes(v_0, *velocities)
+    action = sum(
+        h / 2 * ((2 / h * curve.diff(tau)) ** 2 / 2 + sympy.cos(curve)).subs(tau, point)
+        for point in (-1 / sympy.sqrt(3), 1 / sympy.sqrt(3))
+    )
+    residuals = tuple(a + sympy.sin(Q) for a, Q in zip(accelerations, (Q_1, Q_2), strict=True))
+    return ByHand(curve, velocities, accelerations, residuals, action)
+
+
+def _slopes(start: sympy.Expr, middle: sympy.Expr, end: sympy.Expr) -> tuple[sympy.Expr, sympy.Expr]:
+    return (end - start) / h, (start - 4 * middle + 3 * end) / h
+
+
+def largest_difference() -> float:
+    """Between the compiler's variational equations and the derivatives of G by hand, at some states."""
+    generator, derived = by_hand().generator, compiled(variational=True)
+    expected = {
+        "34d": p_k + generator.diff(q_k),
+        "dG/dQ": generator.diff(Q_1),
+        "dG/dv0": generator.diff(v_0),
+        "34e": generator.diff(Q_2),
+    }
+    rows = [(e.number, e.residual) for e in (*derived.equations, *derived.end_momentum) if e.number in expected]
+    return max(abs(float((row - expected[number]).xreplace(state))) for number, row in rows for state in _states())
+
+
+def _states() -> list[dict[sympy.Symbol, sympy.Expr]]:
+    symbols = (h, q_k, p_k, Q_1, Q_2, v_0, lambda_1, lambda_2)
+    return [{s: sympy.Float((i * k + 3) % 7 - 2.5) / 2 for i, s in enumerate(symbols)} for k in (2, 3, 5)]
+
+
+def eliminated() -> dict[sympy.Symbol, sympy.Expr]:
+    """The multipliers from the compiler's rows dG/dQ and dG/dv0, with X for the derivative of L_d after Q_1."""
+    derived = compiled(variational=True)
+    rows = {e.number: e.residual for e in derived.equations if e.kind == "multiplier"}
+    free = dict.fromkeys((lambda_1, lambda_2), 0)
+    inner = rows["dG/dQ"].subs(free)
+    equations = [rows["dG/dQ"] - inner + sympy.Symbol("X", real=True), rows["dG/dv0"]]
+    found: dict[sympy.Symbol, sympy.Expr] = sympy.solve(equations, [lambda_1, lambda_2], dict=True)[0]
+    return {symbol: _positive(value) for symbol, value in found.items()}
+
+
+def _positive(fraction: sympy.Expr) -> sympy.Expr:
+    """With the constant of the denominator positive."""
+    numerator, denominator = sympy.fraction(sympy.together(fraction))
+    sign = 1 if denominator.subs(h, 0) > 0 else -1
+    return sympy.expand(sign * numerator) / sympy.expand(sign * denominator)
+
+
+def lost_terms() -> tuple[sympy.Expr, sympy.Expr]:
+    """What the compiler's variational (34d) and (34e) have more than the printed ones."""
+    full, printed = compiled(variational=True), compiled(variational=False)
+
+    def row(derived: StepEquations) -> sympy.Expr:
+        return next(e.residual for e in derived.equations if e.number == "34d")
+
+    start = sympy.expand(row(full) - row(printed))
+    end = sympy.expand(full.end_momentum[0].residual - printed.end_momentum[0].residual)
+    return start, end
+
+
+@dataclass(frozen=True, slots=True)
+class MiddleValue:
+    """The inner value Q_1 as a function of both ends, which here needs no multipliers.
+
+    Attributes:
+        condition: h^2 times the sum of the two collocation equations, in which v_0 cancels; it vanishes.
+        slopes: dQ_1/dq_k and dQ_1/dQ_2, from differentiating the condition.
+        inner: X = dL_d/dQ_1 from the compiler, with the condition used.
+        leading: its first term for small steps, with the position q and the velocity v.
+    """
+
+    condition: sympy.Expr
+    slopes: tuple[sympy.Expr, sympy.Expr]
+    inner: sympy.Expr
+    leading: sympy.Expr
+
+
+@lru_cache(maxsize=1)
+def middle_value() -> MiddleValue:
+    """From the compiler's rows (34a) and dG/dQ."""
+    derived = compiled(variational=True)
+    condition = sympy.expand(h**2 * sum(e.residual for e in derived.equations if e.number == "34a"))
+    after_middle = condition.diff(Q_1)
+    slopes = tuple(condition.diff(end) / sympy.expand(-after_middle) for end in (q_k, Q_2))
+    row = next(e.residual for e in derived.equations if e.number == "dG/dQ")
+    inner = sympy.expand(row.subs(dict.fromkeys((lambda_1, lambda_2), 0)) + condition / (3 * h))
+    q, v = sympy.symbols("q v", real=True)
+    moving = inner.subs({Q_1: q + h * v / 2, Q_2: q + h * v, q_k: q})
+    leading = sympy.simplify(sympy.series(moving, h, 0, 3).removeO())
+    return MiddleValue(condition, slopes, inner, leading)
+
+
+def multipliers_agree() -> bool:
+    """Whether the multipliers' terms are X dQ_1/dq_k and X dQ_1/dQ_2, the chain rule."""
+    X, multipliers = sympy.Symbol("X", real=True), eliminated()
+    return all(
+        sympy.simplify(lost.subs(multipliers) - X * slope) == 0
+        for lost, slope in zip(lost_terms(), middle_value().slopes, strict=True)
+    )

@@ -1,0 +1,228 @@
+"""Figs. 18-20: the error of a single step of Kepler's problem over the step.
+
+The captions name neither the eccentricity nor, without doubt, what "N" counts. The lines of Fig. 18 tell: they have the
+slopes and the sizes of the errors on the circle, e = 0, with N points, which is degree N - 1. The same is run with
+e = 0.5, the eccentricity of Figs. 13-15, and there N is read as the degree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.reproduce.kepler.one_step import (
+    CIRCLE,
+    ELLIPSE,
+    LABELS,
+    QUANTITIES,
+    ROUNDOFF,
+    SCHEMES,
+    one_step,
+    shares_won,
+    slopes,
+    superiority,
+)
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
+from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["EXPERIMENTS"]
+
+Array = NDArray[np.float64]
+Line: TypeAlias = tuple[float, float]
+
+LEGEND = (2, 4, 6)
+STEPS = tuple(float(h) for h in np.geomspace(1e-3, 3.0, 36))
+Reading: TypeAlias = tuple[str, float, Callable[[int], int]]
+
+
+def _degree_of_points(n: int) -> int:
+    return n - 1
+
+
+def _degree_itself(n: int) -> int:
+    return n
+
+
+READINGS: tuple[Reading, ...] = (
+    ("circle, N points (degree N - 1)", CIRCLE, _degree_of_points),
+    ("e = 0.5, N the degree", ELLIPSE, _degree_itself),
+)
+PAPER_POWERS: Mapping[str, tuple[Line, ...]] = {
+    "q1": ((1.5, 2), (1e-2, 4), (1e-5, 6), (1e-4, 8), (1e-8, 12)),
+    "q2": ((1.5, 3), (1e-2, 5), (1e-5, 7), (1e-7, 10)),
+}
+"""(c, p) of the lines c h^p drawn by the paper in Fig. 18."""
+H_SETTING = (
+    "Kepler's problem, one step of h = 0.001 to 3 from the perihelion; SVI has as many Gauss points as its degree. The "
+    "error is that at the end of the step.",
+    "The caption says that N counts Chebyshev points and names no eccentricity. Left: so, degree N - 1, with e = 0. "
+    "Right: N the degree, as in other figures of section 3, with e = 0.5, that of Figs. 13-15.",
+    "Curves are of the compiled steps, solved to round-off. Slopes are for h to 0, from steps in 60 digits of the "
+    "Runge-Kutta methods that equal SVI (Gauss) and SC (collocation on its nodes).",
+)
+
+
+def _h_errors(scheme: str, degree: int, e: float, quantity: str) -> Array:
+    found = (one_step(scheme, degree, e, h) for h in STEPS)
+    return np.array([np.nan if errors is None else getattr(errors, quantity) for errors in found])
+
+
+def _slope(scheme: str, degree: int, e: float, quantity: str) -> float | None:
+    return slopes(scheme, degree, e)[QUANTITIES.index(quantity)]
+
+
+def _h_refinement(name: str, quantities: tuple[str, ...], title: str, _: Mapping[str, Result]) -> Result:
+    checks = [_check_powers()] if "q1" in quantities else [_check_slopes(quantities[0])]
+    return Result(
+        name=name,
+        title=title,
+        setting=H_SETTING,
+        checks=(*checks, _check_superior_h(quantities)),
+        tables=(_slopes_table(quantities), *(_h_table(quantity) for quantity in quantities)),
+        picture=Picture(draw=partial(_draw_h, curves=_h_curves(quantities)), width=9.0, height=4.4 * len(quantities)),
+    )
+
+
+def _check_powers() -> Check:
+    """Whether the powers of the paper's lines are those of the circle with N points."""
+    _, e, degree = READINGS[0]
+    found = {
+        quantity: {round(_slope(s, degree(n), e, quantity) or 0) for n in LEGEND for s in SCHEMES}
+        for quantity in PAPER_POWERS
+    }
+    drawn = {quantity: {round(power) for _, power in lines} for quantity, lines in PAPER_POWERS.items()}
+    same = sum(found[quantity] == drawn[quantity] for quantity in drawn)
+    return Check(
+        claim="The errors of q1 fall like h^2, h^4, h^6, h^8, h^12, those of q2 like h^3, h^5, h^7, h^10.",
+        measured=(
+            f"With N points: q1 {_listed(found['q1'])} and q2 {_listed(found['q2'])}; h^11 is a line of SVI with six "
+            f"points, whose order is 10. With N the degree: {_slopes_text('q1', 1)}; {_slopes_text('q2', 1)}."
+        ),
+        verdict=Verdict.PARTLY if 0 < same < len(drawn) else holds(same == len(drawn)),
+    )
+
+
+def _listed(powers: set[int]) -> str:
+    return ", ".join(f"h^{power}" for power in sorted(powers))
+
+
+def _check_slopes(quantity: str) -> Check:
+    """The slopes of both readings; an SVI keeps the momentum in any case."""
+    e_and_degrees = [(e, degree(n)) for _, e, degree in READINGS for n in LEGEND]
+    exact = all(_slope("SVI", d, e, quantity) is None for e, d in e_and_degrees)
+    faster = all((_slope("SVI", d, e, quantity) or 99) > (_slope("SC", d, e, quantity) or 0) for e, d in e_and_degrees)
+    return Check(
+        claim=f"The error of the {quantity} falls faster with h for SVI than for SC.",
+        measured=f"{_slopes_text(quantity, 0)} with N points; {_slopes_text(quantity, 1)} with N the degree.",
+        verdict=holds(exact if quantity == "momentum" else faster),
+        bears_on=("accuracy",),
+    )
+
+
+def _slopes_text(quantity: str, reading: int) -> str:
+    _, e, degree = READINGS[reading]
+    parts = []
+    for scheme in SCHEMES:
+        found = [_slope(scheme, degree(n), e, quantity) for n in LEGEND]
+        powers = ", ".join("no error" if slope is None else f"{slope:.1f}" for slope in found)
+        parts.append(f"{scheme} {'no error' if not any(found) else powers}")
+    return f"{quantity} {' and '.join(parts)}"
+
+
+def _check_superior_h(quantities: tuple[str, ...]) -> Check:
+    pairs = [
+        (_h_errors("SVI", degree(n), e, q), _h_errors("SC", degree(n), e, q))
+        for _, e, degree in READINGS
+        for n in LEGEND
+        for q in quantities
+    ]
+    lost = [h for svi, sc in pairs for h, one, other in zip(STEPS, svi, sc, strict=True) if one >= other > ROUNDOFF]
+    otherwise = f"; where it is not, h is {min(lost):.2g} or more" if lost else ""
+    return superiority([shares_won(svi, sc) for svi, sc in pairs], otherwise=otherwise)
+
+
+def _slopes_table(quantities: tuple[str, ...]) -> Table:
+    return Table(
+        columns=("reading", "N", "degree", "scheme", *(f"slope of {quantity}" for quantity in quantities)),
+        rows=tuple(
+            (reading, n, degree(n), scheme, *(_slope(scheme, degree(n), e, quantity) for quantity in quantities))
+            for reading, e, degree in READINGS
+            for scheme in SCHEMES
+            for n in LEGEND
+        ),
+        formats=dict.fromkeys((f"slope of {quantity}" for quantity in quantities), ".2f"),
+    )
+
+
+def _h_table(quantity: str) -> Table:
+    def column(scheme: str, degree: int, e: float) -> list[float | None]:
+        return [None if error != error else error for error in _h_errors(scheme, degree, e, quantity).tolist()]
+
+    names, columns = [], []
+    for _, e, degree in READINGS:
+        for scheme in SCHEMES:
+            for n in LEGEND:
+                names.append(f"{scheme} degree {degree(n)} e {e:g}")
+                columns.append(column(scheme, degree(n), e))
+    return Table(
+        name=f"errors-{quantity}", columns=("h", *names), rows=tuple(zip(STEPS, *columns, strict=True)), shown=False
+    )
+
+
+Curves: TypeAlias = Mapping[tuple[str, str], Mapping[tuple[str, int], Array]]
+
+
+def _h_curves(quantities: tuple[str, ...]) -> Curves:
+    return {
+        (reading, q): {(s, n): _h_errors(s, degree(n), e, q) for s in SCHEMES for n in LEGEND}
+        for q in quantities
+        for reading, e, degree in READINGS
+    }
+
+
+MARKERS = {2: "o", 4: "s", 6: "^"}
+
+
+def _draw_h(figure: Figure, curves: Curves) -> None:
+    for axes, ((reading, quantity), errors) in zip(panels(figure, len(curves) // 2, 2), curves.items(), strict=True):
+        for (scheme, n), values in errors.items():
+            shown = np.where(values > 0, values, np.nan)
+            style: dict[str, Any] = {"marker": MARKERS[n], "markersize": 3.0, "linewidth": 0.9, "markevery": 3}
+            axes.plot(STEPS, shown, color=COLORS[scheme], label=f"{scheme}, N = {n}", **style)
+        axes.set(xscale="log", yscale="log", ylim=(1e-17, 1e3))
+        axes.set(xlabel="step h", ylabel=f"error of {LABELS[quantity]}", title=reading)
+        if reading == READINGS[0][0]:
+            for constant, power in PAPER_POWERS.get(quantity, ()):
+                drawn = constant * np.array(STEPS) ** power
+                axes.plot(STEPS, drawn, ":", color=COLORS["exact"], linewidth=0.9)
+                first = int(np.argmax(drawn > 1e-16))
+                style = {"textcoords": "offset points", "xytext": (-15, 2) if first else (2, 5), "fontsize": 7}
+                axes.annotate(f"$h^{{{power:g}}}$", (STEPS[first], drawn[first]), color=COLORS["exact"], **style)
+        axes.legend(loc="upper left", ncols=2)
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    Experiment(
+        name="figure-18",
+        title="Kepler: error of q1 and q2 in one step over the step",
+        run=partial(_h_refinement, "figure-18", ("q1", "q2"), "Kepler two body, error of q1 and q2 with h-refinement"),
+    ),
+    Experiment(
+        name="figure-19",
+        title="Kepler: error of the momentum in one step over the step",
+        run=partial(_h_refinement, "figure-19", ("momentum",), "Kepler two body, error of momentum with h-refinement"),
+    ),
+    Experiment(
+        name="figure-20",
+        title="Kepler: error of the energy in one step over the step",
+        run=partial(_h_refinement, "figure-20", ("energy",), "Kepler two body, error of energy with h-refinement"),
+    ),
+)
+"""Figs. 18-20."""

@@ -1,0 +1,92 @@
+"""The structure of one step of Kepler's problem: what it does to dq ^ dp and to the angular momentum, and its order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.methods.method import Method
+from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, exact_flow
+from scvi_codegen.reproduce.laboratory.running import stepper_of
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["STATE", "STEP", "Structure", "structure_of", "symplecticity_defect"]
+
+Array = NDArray[np.float64]
+
+STATE = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
+"""(q, p) off the symmetry axes of the orbit (eccentricity 0.17), so that no error vanishes by symmetry."""
+STEP = 0.3
+SPAN = 2.4
+STEPS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+ABOVE_ROUNDOFF = 1e-13
+POINTS_OF_A_SLOPE = 3
+SLOPE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+WIDTH = 2e-3
+"""Of central differences of order six; round-off and truncation are then both near 1e-13."""
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """What a step keeps.
+
+    Attributes:
+        defect: max |J^T Omega J - Omega|, J the derivative of the step; 1e-13 is the noise of its measurement.
+        momentum: change of the angular momentum in the step.
+        order: slope of the error over h, where it is above round-off.
+    """
+
+    defect: float
+    momentum: float
+    order: float
+
+
+@lru_cache(maxsize=64)
+def structure_of(method: Method) -> Structure:
+    """One step of :data:`STEP` from :data:`STATE`, and runs over 2.4 for the order."""
+    stepper = stepper_of(SYSTEM, method, "newton")
+    q, p = stepper.step(*STATE, STEP)
+    return Structure(
+        symplecticity_defect(stepper, *STATE, STEP),
+        float(angular_momentum(q, p) - angular_momentum(*STATE)),
+        _order(stepper),
+    )
+
+
+def symplecticity_defect(stepper: Stepper, q: Array, p: Array, h: float) -> float:
+    """Max |J^T Omega J - Omega| of the step of h from (q, p)."""
+    m = len(q)
+    jacobian = _jacobian(lambda z: np.concatenate(stepper.step(z[:m], z[m:], h)), np.concatenate([q, p]))
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m))
+    return float(np.abs(jacobian.T @ omega @ jacobian - omega).max())
+
+
+def _jacobian(step: Callable[[Array], Array], state: Array) -> Array:
+    columns = [
+        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in SLOPE_WEIGHTS.items())
+        for unit in np.eye(len(state)) * WIDTH
+    ]
+    return np.array(columns).T
+
+
+def _order(stepper: Stepper) -> float:
+    """The slope through the smallest errors that are still above round-off."""
+    errors = {steps: error for steps in STEPS if (error := _error(stepper, steps)) > ABOVE_ROUNDOFF}
+    smallest: Sequence[int] = sorted(errors)[-POINTS_OF_A_SLOPE:]
+    slope, _ = np.polyfit(np.log([SPAN / n for n in smallest]), np.log([errors[n] for n in smallest]), 1)
+    return float(slope)
+
+
+def _error(stepper: Stepper, steps: int) -> float:
+    """Of the state after :data:`SPAN`; 0 where a step fails, so that it is left out."""
+    try:
+        run = stepper.integrate(*STATE, h=SPAN / steps, steps=steps, every=steps)
+    except StepFailedError:
+        return 0.0
+    exact = np.concatenate(exact_flow(*STATE, SPAN), axis=1)[0]
+    return float(np.abs(np.concatenate([run.q[-1], run.p[-1]]) - exact).max())

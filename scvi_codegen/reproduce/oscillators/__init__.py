@@ -1,0 +1,1 @@
+"""The paper's figures on systems of one degree of freedom: oscillator, pendulum, Duffing."""

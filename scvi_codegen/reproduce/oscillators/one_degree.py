@@ -1,0 +1,132 @@
+"""What is measured on runs with one degree of freedom: energy errors, drift, the area in the phase plane."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import MethodWarning
+from scvi_codegen.methods import SVI
+from scvi_codegen.reproduce.laboratory.drawing import largest_in_bins
+from scvi_codegen.reproduce.laboratory.experiment import Cell, Table, Verdict
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = [
+    "NO_DRIFT",
+    "area_change",
+    "area_factor",
+    "curves_table",
+    "drift",
+    "drifts",
+    "energy_error",
+    "energy_table",
+    "judged",
+    "largest",
+    "offset_from_curve",
+    "svi_with_points",
+]
+
+Array = NDArray[np.float64]
+
+NO_DRIFT = 1e-12
+"""An error below is round-off, wherever it walks."""
+
+
+def svi_with_points(degree: int, points: int) -> SVI:
+    """SVI with Gauss points of any number, fewer than the degree without a warning: the paper seems to use such."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MethodWarning)
+        return SVI(degree, f"gauss-legendre:{points}")
+
+
+def judged(*conditions: bool) -> Verdict:
+    """``HOLDS`` if all conditions do, ``FAILS`` if none does, else ``PARTLY``."""
+    if all(conditions):
+        return Verdict.HOLDS
+    return Verdict.PARTLY if any(conditions) else Verdict.FAILS
+
+
+def energy_error(run: Trajectory) -> Array:
+    """H - H(0) along a run."""
+    error: Array = run.energy() - run.energy()[0]
+    return error
+
+
+def largest(error: Array) -> float:
+    """The largest absolute value."""
+    return float(np.abs(error).max())
+
+
+def drift(error: Array) -> float:
+    """The mean over the last fifth of a run less that over the first: 0.8 of the final value of a straight line."""
+    part = max(1, len(error) // 5)
+    return float(error[-part:].mean() - error[:part].mean())
+
+
+def drifts(error: Array) -> bool:
+    """Whether more than a third of the largest error is drift, rather than oscillation; never for round-off."""
+    return largest(error) > NO_DRIFT and abs(drift(error)) > largest(error) / 3
+
+
+def area_change(run: Trajectory) -> float:
+    """The area inside the states of the last fifth of a run over that of the first fifth, less 1.
+
+    The states must surround the origin of the phase plane. Few states make the polygon smaller than the curve, by
+    about (2 pi / n)^2 / 3 for n of them.
+    """
+    part = len(run) // 5
+    first, last = (_enclosed_area(run.q[states, 0], run.p[states, 0]) for states in np.s_[:part, -part:])
+    return last / first - 1.0
+
+
+def _enclosed_area(q: Array, p: Array) -> float:
+    """The area of the polygon through points in the order of their angle about the origin."""
+    order = np.argsort(np.arctan2(p, q))
+    x, y = q[order], p[order]
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+
+
+def area_factor(stepper: Stepper, q: float, p: float, h: float, *, distance: float = 1e-4) -> float:
+    """The determinant of the derivative of one step, by central differences: 1 for a symplectic step."""
+
+    def difference(dq: float, dp: float) -> Array:
+        ahead, behind = (stepper.step([q + sign * dq], [p + sign * dp], h=h) for sign in (1.0, -1.0))
+        return (np.concatenate(ahead) - np.concatenate(behind)) / (2.0 * distance)
+
+    return float(np.linalg.det(np.array([difference(distance, 0.0), difference(0.0, distance)])))
+
+
+def offset_from_curve(run: Trajectory, *, distance: float = 1e-5) -> Array:
+    """How far each state lies outside the curve of the initial energy, to first order: (H - H(0)) / |grad H|."""
+
+    def slope(dq: float, dp: float) -> Array:
+        ahead, behind = (run.stepper.energy(run.q + s * dq, run.p + s * dp, run.t, run.parameters) for s in (1.0, -1.0))
+        difference: Array = (ahead - behind) / (2.0 * distance)
+        return difference
+
+    offset: Array = energy_error(run) / np.hypot(slope(distance, 0.0), slope(0.0, distance))
+    return offset
+
+
+def energy_table(runs: Mapping[str, Trajectory]) -> Table:
+    """Largest energy error, drift and change of the enclosed area of each run, by scheme."""
+    rows: list[tuple[Cell, ...]] = []
+    for scheme, run in runs.items():
+        error = energy_error(run)
+        rows.append((scheme, run.stepper.title.partition(": ")[2], largest(error), drift(error), area_change(run)))
+    return Table(
+        columns=("scheme", "method", "largest energy error", "drift of the energy", "change of the phase area"),
+        rows=tuple(rows),
+        formats={"largest energy error": ".2e", "drift of the energy": ".1e", "change of the phase area": ".1e"},
+    )
+
+
+def curves_table(name: str, t: Array, errors: Mapping[str, Array], *, bins: int = 1000) -> Table:
+    """The curves of a picture of errors over time; of long ones the largest |error| in each bin."""
+    columns = [largest_in_bins(t, error, bins=bins) for error in errors.values()]
+    rows = zip(columns[0][0].tolist(), *(values.tolist() for _, values in columns), strict=True)
+    return Table(name=name, columns=("t", *errors), rows=tuple(map(tuple, rows)), shown=False)

@@ -1,0 +1,362 @@
+"""Figures 3-6: the harmonic oscillator over many steps, and over one long step with growing degree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.methods import SVI, SpectralCollocation
+from scvi_codegen.methods.method import Method
+from scvi_codegen.models.problems import harmonic_oscillator
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
+from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of, trajectory
+from scvi_codegen.reproduce.oscillators.one_degree import (
+    curves_table,
+    drifts,
+    energy_error,
+    judged,
+    largest,
+    svi_with_points,
+)
+from scvi_codegen.runtime.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["EXPERIMENTS", "OSCILLATOR", "POSITION", "VELOCITY"]
+
+Array = NDArray[np.float64]
+
+OSCILLATOR = harmonic_oscillator()
+POSITION, VELOCITY = (0.0,), (1.0,)
+
+TITLES = {
+    "figure-3": "Harmonic oscillator: phase trajectories of SVI and SC, every fifth step",
+    "figure-4": "Harmonic oscillator: position error of SVI and SC",
+    "figure-5": "Harmonic oscillator: energy error of SVI and SC",
+    "figure-6": "Harmonic oscillator: error over one step h = 20 with growing degree",
+}
+
+DEGREE = 8
+POINTS = (7, 8, 9)
+"""Gauss points tried; the caption gives none."""
+
+METHODS: dict[str, Method] = {
+    **{f"SVI, {points} Gauss points": svi_with_points(DEGREE, points) for points in POINTS},
+    "SC": SpectralCollocation(DEGREE),
+}
+SVI_LABEL = f"SVI, {DEGREE} Gauss points"
+VISIBLE = 2e-3
+"""Of a picture's width: a line is not thinner."""
+
+LONG_STEP = 20.0
+DEGREES = {"SVI, s Gauss points": range(10, 31, 3), "SVI, s+1 Gauss points": range(10, 31, 3), "SC": range(10, 37, 3)}
+FITTED = (1e-13, 1e-1)
+"""Errors between which convergence is fitted: below is round-off, above the solution is not resolved."""
+PRINTED_BASES = {"SVI, s Gauss points": (1e14, 0.09), "SVI, s+1 Gauss points": (1e14, 0.09), "SC": (1e10, 0.21)}
+"""The lines of the paper's legend, C K^N, the steeper for SVI."""
+
+SYSTEM = "m = k = 1, q(0) = 0, p(0) = 1; the exact solution is q = sin t, p = cos t."
+NINE_POINTS = "9 Chebyshev points: degree 8."
+QUADRATURES = (
+    "The caption gives no quadrature; 8 Gauss points (as many as the degree) are drawn, 7 and 9 run beside them."
+)
+TOLERANCE = "The nonlinear iteration ends at 1e-14, the paper's rule."
+
+
+@lru_cache
+def _run(scheme: str, span: float) -> Trajectory:
+    return trajectory(OSCILLATOR, METHODS[scheme], POSITION, VELOCITY, h=1.0, span=span)
+
+
+@lru_cache
+def _position_error(scheme: str) -> Array:
+    run = _run(scheme, 100.0)
+    error: Array = run.q[:, 0] - np.sin(run.t)
+    return error
+
+
+def _phase_trajectories(_: Mapping[str, Result]) -> Result:
+    runs = {"SVI": _run(SVI_LABEL, 100.0), "SC": _run("SC", 100.0)}
+    apart = {
+        scheme: largest(np.hypot(run.q[:, 0] - np.sin(run.t), run.p[:, 0] - np.cos(run.t)))
+        for scheme, run in runs.items()
+    }
+    points = {scheme: (run.q[::5, 0], run.p[::5, 0]) for scheme, run in runs.items()}
+    rows = zip(runs["SVI"].t[::5].tolist(), *(x.tolist() for pair in points.values() for x in pair), strict=True)
+    return Result(
+        name="figure-3",
+        title=TITLES["figure-3"],
+        setting=(SYSTEM, "h = 1, T = 100.", NINE_POINTS, QUADRATURES, TOLERANCE),
+        checks=(
+            Check(
+                claim="Plotted every five steps, the phase trajectories of SVI and SC show their differences.",
+                measured=f"The states are off the exact ones by at most {apart['SVI']:.1e} (SVI) and {apart['SC']:.1e} "
+                f"(SC); a line of the picture is {VISIBLE:g} wide, so both lie on the exact states.",
+                verdict=holds(apart["SC"] > VISIBLE),
+            ),
+            Check(
+                claim="SVI is more accurate in phase than SC with the same points and step.",
+                measured=f"Largest error of a state: SVI {apart['SVI']:.1e}, SC {apart['SC']:.1e}.",
+                verdict=holds(apart["SVI"] < apart["SC"]),
+                bears_on=("accuracy",),
+            ),
+        ),
+        tables=(Table(columns=("t", "q SVI", "p SVI", "q SC", "p SC"), rows=tuple(map(tuple, rows)), shown=False),),
+        picture=Picture(draw=partial(_draw_phase, points)),
+    )
+
+
+def _draw_phase(points: Mapping[str, tuple[Array, Array]], figure: Figure) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 400)
+    for axes, (scheme, (q, p)) in zip(panels(figure, 1, 2), points.items(), strict=True):
+        axes.plot(np.sin(angle), np.cos(angle), color=COLORS["exact"], linewidth=0.8, label="exact")
+        axes.plot(q, p, "o", color=COLORS[scheme], markersize=4, label=scheme)
+        ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)
+        axes.set(
+            xlabel="q", ylabel="p", title=f"{scheme}, every fifth step", aspect="equal", xticks=ticks, yticks=ticks
+        )
+        axes.legend(loc="center")
+
+
+def _position_errors(_: Mapping[str, Result]) -> Result:
+    errors = {scheme: _position_error(scheme) for scheme in METHODS}
+    sizes = {scheme: largest(error) for scheme, error in errors.items()}
+    early = {scheme: largest(error[:21]) for scheme, error in errors.items()}
+    svi, sc = [scheme for scheme in METHODS if scheme != "SC"], "SC"
+    return Result(
+        name="figure-4",
+        title=TITLES["figure-4"],
+        setting=(SYSTEM, "h = 1, T = 100.", NINE_POINTS, QUADRATURES, TOLERANCE),
+        checks=(
+            Check(
+                claim="The position error of SC is several orders of magnitude bigger than that of SVI.",
+                measured="Largest errors: " + _listed(sizes) + ".",
+                verdict=judged(*(sizes[sc] > 100.0 * sizes[scheme] for scheme in svi)),
+                bears_on=("accuracy",),
+            ),
+            Check(
+                claim="The error of SC grows; that of SVI appears to be bounded and remains small.",
+                measured="From t <= 20 to t <= 100 the largest error grows by "
+                + ", ".join(f"{sizes[s] / early[s]:.1f} ({s}, to {sizes[s]:.1e})" for s in METHODS)
+                + "; 5 is growth in proportion to t, the lag of a phase. Errors below 1e-14 count as bounded.",
+                verdict=judged(*(sizes[s] < 1e-14 or sizes[s] < 2.0 * early[s] for s in svi)),
+                bears_on=("long-time",),
+            ),
+            Check(
+                claim="The axis of the panel of SVI is scaled by 1e-11; the number of quadrature points is not given.",
+                measured=f"Such an error belongs to 7 Gauss points, one fewer than the degree ({sizes[svi[0]]:.1e}); "
+                f"with 8 and 9 it is {sizes[svi[1]]:.1e} and {sizes[svi[2]]:.1e}, round-off.",
+                verdict=Verdict.SHOWN,
+            ),
+        ),
+        tables=(
+            Table(
+                columns=("scheme", "largest position error to t = 20", "to t = 100"),
+                rows=tuple((scheme, early[scheme], sizes[scheme]) for scheme in METHODS),
+                formats={"largest position error to t = 20": ".2e", "to t = 100": ".2e"},
+            ),
+            curves_table("curves", _run(sc, 100.0).t, errors),
+        ),
+        picture=Picture(draw=partial(_draw_position, _run(sc, 100.0).t, errors), height=3.4),
+    )
+
+
+def _draw_position(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
+    shown = (f"SVI, {DEGREE - 1} Gauss points", SVI_LABEL, "SC")
+    for axes, scheme in zip(panels(figure, 1, 3), shown, strict=True):
+        axes.plot(t, errors[scheme], color=COLORS[scheme[:3].rstrip(",")], linewidth=0.9)
+        limit = 1.15 * largest(errors[scheme])
+        axes.set(xlabel="t", ylim=(-limit, limit))
+        axes.set_title(scheme, loc="right")
+        axes.ticklabel_format(axis="y", scilimits=(0, 0))
+    figure.axes[0].set_ylabel("q - sin t")
+
+
+def _energy_errors(_: Mapping[str, Result]) -> Result:
+    errors = {scheme: energy_error(_run(scheme, 500.0)) for scheme in METHODS}
+    sizes = {scheme: largest(error) for scheme, error in errors.items()}
+    svi = [scheme for scheme in METHODS if scheme != "SC"]
+    return Result(
+        name="figure-5",
+        title=TITLES["figure-5"],
+        setting=(SYSTEM, "h = 1, T = 500.", NINE_POINTS, QUADRATURES, TOLERANCE),
+        checks=(
+            Check(
+                claim="The energy error of SC is much bigger than that of SVI.",
+                measured="Largest energy errors: " + _listed(sizes) + ".",
+                verdict=judged(*(sizes["SC"] > 100.0 * sizes[scheme] for scheme in svi)),
+                bears_on=("accuracy",),
+            ),
+            Check(
+                claim="The energy error of SC grows much faster than that of SVI.",
+                measured=f"Drift: {', '.join(f'{s}: ' + ('yes' if drifts(errors[s]) else 'no') for s in METHODS)}.",
+                verdict=holds(drifts(errors["SC"]) and not any(drifts(errors[scheme]) for scheme in svi)),
+                bears_on=("long-time",),
+            ),
+        ),
+        tables=(
+            Table(
+                columns=("scheme", "largest energy error"),
+                rows=tuple(sizes.items()),
+                formats={"largest energy error": ".2e"},
+            ),
+            curves_table("curves", _run("SC", 500.0).t, errors),
+        ),
+        picture=Picture(draw=partial(_draw_energy, _run("SC", 500.0).t, errors), width=7.0),
+    )
+
+
+def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
+    (axes,) = panels(figure, 1, 1)
+    draw_error(axes, t, errors["SC"], "SC")
+    for points, style in zip(POINTS, (":", "-", "--"), strict=True):
+        label = f"SVI, {points} Gauss points"
+        draw_error(axes, t, errors[label], "SVI", label, linestyle=style)
+    axes.set(xlabel="t", ylabel="|H - H(0)|", ylim=(1e-17, 1e-6))
+    axes.legend(loc="center right")
+
+
+@lru_cache
+def _refined(scheme: str) -> tuple[Array, Array]:
+    """Errors of q and of the energy after one step of h = 20, by degree."""
+    errors = []
+    for degree in DEGREES[scheme]:
+        stepper = stepper_of(OSCILLATOR, _of_degree(scheme, degree), "newton")
+        q, p = stepper.step(POSITION, VELOCITY, h=LONG_STEP, options=ROUNDOFF)
+        errors.append((abs(q[0] - np.sin(LONG_STEP)), abs(stepper.energy(q, p) - 0.5)))
+    of_q, of_energy = np.array(errors).T
+    return of_q, of_energy
+
+
+def _of_degree(scheme: str, degree: int) -> Method:
+    if scheme == "SC":
+        return SpectralCollocation(degree)
+    return SVI(degree, f"gauss-legendre:{degree + ('s+1' in scheme)}")
+
+
+def _fitted_base(degrees: Array, errors: Array) -> tuple[float, float] | None:
+    """(C, K) of the line C K^N through the errors that lie in ``FITTED``; ``None`` if there are too few."""
+    used = (errors > FITTED[0]) & (errors < FITTED[1])
+    if np.count_nonzero(used) < 3:
+        return None
+    slope, intercept = np.polyfit(degrees[used], np.log(errors[used]), 1)
+    return float(np.exp(intercept)), float(np.exp(slope))
+
+
+def _convergence(_: Mapping[str, Result]) -> Result:
+    errors = {scheme: _refined(scheme) for scheme in DEGREES}
+    degrees = {scheme: np.array(DEGREES[scheme], dtype=float) for scheme in DEGREES}
+    fits = {scheme: [_fitted_base(degrees[scheme], error) for error in errors[scheme]] for scheme in DEGREES}
+    rows = tuple(
+        (scheme, degree, float(of_q), float(of_energy))
+        for scheme in DEGREES
+        for degree, of_q, of_energy in zip(DEGREES[scheme], *errors[scheme], strict=True)
+    )
+    fitted = tuple(
+        (scheme, what, *(fit or (None, None)), *PRINTED_BASES[scheme])
+        for scheme in DEGREES
+        for what, fit in zip(("q", "energy"), fits[scheme], strict=True)
+    )
+    formats = {"error of q": ".2e", "error of the energy": ".2e", "C": ".1e", "printed C": ".0e"}
+    return Result(
+        name="figure-6",
+        title=TITLES["figure-6"],
+        setting=(
+            SYSTEM,
+            "One step, h = 20, errors at its end; N on the axis is the degree.",
+            "The caption gives no quadrature; SVI has as many Gauss points as the degree, s, and s + 1.",
+            "Newton's iteration to relative round-off: SC does not reach an absolute 1e-14 on a step this long.",
+            f"Lines C K^N are fitted to errors from {FITTED[0]:g} to {FITTED[1]:g}.",
+        ),
+        checks=(_geometric(fits), _bases(fits), _ahead(errors)),
+        tables=(
+            Table(columns=("scheme", "N", "error of q", "error of the energy"), rows=rows, formats=formats),
+            Table(
+                name="fits",
+                columns=("scheme", "error of", "C", "K", "printed C", "printed K"),
+                rows=fitted,
+                formats=formats,
+            ),
+        ),
+        picture=Picture(draw=partial(_draw_convergence, degrees, errors)),
+    )
+
+
+Fits = Mapping[str, list[tuple[float, float] | None]]
+
+
+def _geometric(fits: Fits) -> Check:
+    found = {
+        f"{what} of {scheme}": fit[1]
+        for scheme in fits
+        for what, fit in zip(("q", "energy"), fits[scheme], strict=True)
+        if fit
+    }
+    return Check(
+        claim="SVI and SC converge geometrically in the degree.",
+        measured=f"Fitted bases K: {', '.join(f'{key}: {base:.2f}' for key, base in found.items())}; the energy of SVI "
+        f"with s Gauss points has no error but round-off (at most {largest(_refined('SVI, s Gauss points')[1]):.0e}).",
+        verdict=judged(*(base < 0.5 for base in found.values())),
+        bears_on=("geometric",),
+    )
+
+
+def _bases(fits: Fits) -> Check:
+    pairs = {scheme: (fit[0][1], PRINTED_BASES[scheme][1]) for scheme, fit in fits.items() if fit[0]}
+    return Check(
+        claim="The errors follow 1e14 (0.09)^N (SVI) and 1e10 (0.21)^N (SC), the lines of the legend.",
+        measured="Fitted and printed K of q: "
+        + ", ".join(f"{scheme}: {base:.3f}, {printed:g}" for scheme, (base, printed) in pairs.items())
+        + "; bases that differ by less than 30 % count as the same. The constants are in the table.",
+        verdict=judged(*(abs(base / printed - 1.0) < 0.3 for base, printed in pairs.values())),
+    )
+
+
+def _ahead(errors: Mapping[str, tuple[Array, Array]]) -> Check:
+    """SVI against SC at the degrees that both have, where SC resolves the step and is above round-off."""
+    svi, sc = errors["SVI, s+1 Gauss points"], errors["SC"]
+    wins, cases = 0, 0
+    for ours, theirs in zip(svi, sc, strict=True):
+        compared = (theirs[: len(ours)] > FITTED[0]) & (theirs[: len(ours)] < FITTED[1])
+        wins += int(np.count_nonzero(compared & (ours < theirs[: len(ours)])))
+        cases += int(np.count_nonzero(compared))
+    return Check(
+        claim="SVI is more accurate than SC in configuration and energy at every N.",
+        measured=f"SVI with s + 1 Gauss points is more accurate in {wins} of {cases} errors of SC that lie between "
+        f"{FITTED[0]:g} and {FITTED[1]:g}.",
+        verdict=Verdict.HOLDS if wins == cases else Verdict.PARTLY if wins else Verdict.FAILS,
+        bears_on=("accuracy",),
+    )
+
+
+def _draw_convergence(degrees: Mapping[str, Array], errors: Mapping[str, tuple[Array, Array]], figure: Figure) -> None:
+    markers = dict(zip(errors, ("o-", "s--", "^-"), strict=True))
+    for axes, which, what in zip(panels(figure, 1, 2), (0, 1), ("q", "energy"), strict=True):
+        for scheme, pair in errors.items():
+            color = COLORS[scheme[:3].rstrip(",")]
+            shown = np.where(pair[which] > 0.0, pair[which], np.nan)
+            axes.semilogy(degrees[scheme], shown, markers[scheme], color=color, markersize=4, label=scheme)
+        for power, base, style in ((14, 0.09, ":"), (10, 0.21, "-.")):
+            line, label = 10.0**power * base ** degrees["SC"], f"paper: $10^{{{power}}}\\ {base:g}^N$"
+            axes.semilogy(degrees["SC"], line, style, color=COLORS["exact"], linewidth=1.0, label=label)
+        axes.set(xlabel="degree N", ylabel=f"error of {what}", ylim=(1e-17, 1e4))
+        axes.legend()
+
+
+def _listed(sizes: Mapping[str, float]) -> str:
+    return ", ".join(f"{scheme}: {size:.1e}" for scheme, size in sizes.items())
+
+
+RUNS = {
+    "figure-3": _phase_trajectories,
+    "figure-4": _position_errors,
+    "figure-5": _energy_errors,
+    "figure-6": _convergence,
+}
+EXPERIMENTS = tuple(Experiment(name=name, title=TITLES[name], run=run) for name, run in RUNS.items())

@@ -1,0 +1,263 @@
+"""Figures 9, 10, 21 and 22: the planar pendulum."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
+from scvi_codegen.methods.method import Method
+from scvi_codegen.models.problems import planar_pendulum
+from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, panels, thinned
+from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, holds
+from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
+from scvi_codegen.reproduce.oscillators.one_degree import (
+    area_change,
+    area_factor,
+    curves_table,
+    drift,
+    drifts,
+    energy_error,
+    energy_table,
+    judged,
+    largest,
+)
+from scvi_codegen.runtime.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["EXPERIMENTS"]
+
+Array = NDArray[np.float64]
+
+TITLES = {
+    "figure-9": "Pendulum: phase trajectories of SVI, SC and the 4th-order symplectic Runge-Kutta method",
+    "figure-10": "Pendulum: energy error of SVI, SC and the 4th-order symplectic Runge-Kutta method",
+    "figure-21": "Pendulum: phase trajectories of SCVI and SC with two points",
+    "figure-22": "Pendulum: energy error of SCVI and SC with two points",
+}
+
+PENDULUM = planar_pendulum()
+POSITION, VELOCITY = (0.5,), (0.0,)
+LONG_RUN: dict[str, Method] = {
+    "SVI, degree 3": SVI(3),
+    "SC, degree 3": SpectralCollocation(3),
+    "SRK4": Gauss(2),
+    "SVI, degree 4": SVI(4),
+    "SC, degree 4": SpectralCollocation(4),
+}
+TWO_POINTS: dict[str, Method] = {"SCVI": SCVI(1, "gauss-legendre:2"), "SC": SpectralCollocation(1)}
+DRAWN = ("SVI, degree 3", "SC, degree 3", "SRK4")
+SMALL_STEP = 0.005
+MOST_DOTS = 700
+DOTS = {"linestyle": "", "marker": ".", "markersize": 2}
+SMALL_AREA = 1e-3
+"""Relative change of an area that its polygon does not resolve."""
+
+SYSTEM = "m = l = g = 1, q(0) = 0.5, p(0) = 0."
+LONG_SETTING = (
+    SYSTEM,
+    "h = 0.5, T = 1000; nonlinear iteration to 1e-14, the paper's rule.",
+    "4 Chebyshev points: degree 3. Degree 4 runs beside it, as the paper's N is the degree elsewhere.",
+    "The caption gives no quadrature: SVI has as many Gauss points as the degree.",
+    "The symplectic Runge-Kutta method of order 4 is Gauss's of two stages.",
+)
+SHORT_SETTING = (
+    SYSTEM,
+    "h = 0.005, T = 60 pi; nonlinear iteration to 1e-12, the rule of section 4.",
+    "SCVI: degree 1, two Gauss points, (36)-(37); the stationary form and the printed one are the same map there.",
+    "SC: degree 1, one equation at the end of the step; this is the implicit Euler method.",
+)
+
+
+@lru_cache
+def _long_run(scheme: str) -> Trajectory:
+    return trajectory(PENDULUM, LONG_RUN[scheme], POSITION, VELOCITY, h=0.5, span=1000.0)
+
+
+@lru_cache
+def _two_points(scheme: str) -> Trajectory:
+    method = TWO_POINTS[scheme]
+    return trajectory(PENDULUM, method, POSITION, VELOCITY, h=SMALL_STEP, span=60.0 * math.pi, options=SECTION_4)
+
+
+def _level_curve() -> tuple[Array, Array]:
+    """The exact orbit in the phase plane, p^2/2 - cos q = -cos q(0)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 400)
+    q = POSITION[0] * np.cos(angle)
+    return q, -np.sign(np.sin(angle)) * np.sqrt(np.maximum(0.0, 2.0 * (np.cos(q) - np.cos(POSITION[0]))))
+
+
+def _phase_of_long_run(_: Mapping[str, Result]) -> Result:
+    runs = {scheme: _long_run(scheme) for scheme in LONG_RUN}
+    areas = {scheme: area_change(run) for scheme, run in runs.items()}
+    orbits = {scheme: thinned(runs[scheme].q[:, 0], runs[scheme].p[:, 0], most=MOST_DOTS) for scheme in DRAWN}
+    return Result(
+        name="figure-9",
+        title=TITLES["figure-9"],
+        setting=LONG_SETTING,
+        checks=(
+            Check(
+                claim="SVI and the symplectic Runge-Kutta method preserve the phase area.",
+                measured="Between the first and the last fifth of the run the area inside the states changes by "
+                f"{areas['SVI, degree 3']:.1e} (SVI) and {areas['SRK4']:.1e} (SRK4), relatively.",
+                verdict=holds(max(abs(areas["SVI, degree 3"]), abs(areas["SRK4"])) < SMALL_AREA),
+                bears_on=("long-time",),
+            ),
+            Check(
+                claim="A drift is observed in the phase trajectory of SC.",
+                measured=f"The area changes by {areas['SC, degree 3']:+.1%} (degree 4: {areas['SC, degree 4']:+.2%}).",
+                verdict=holds(abs(areas["SC, degree 3"]) > 10.0 * SMALL_AREA),
+                bears_on=("long-time",),
+            ),
+        ),
+        tables=(energy_table(runs),),
+        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve(), DOTS), width=10.0, height=3.7),
+    )
+
+
+def _draw_phase(
+    orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Array], style: Mapping[str, Any], figure: Figure
+) -> None:
+    limit = 1.05 * max(largest(np.concatenate(orbit)) for orbit in orbits.values())
+    for axes, (scheme, (q, p)) in zip(panels(figure, 1, len(orbits)), orbits.items(), strict=True):
+        draw_orbit(axes, q, p, _family(scheme), scheme, **style)
+        axes.plot(*exact, color="black", linestyle="--", linewidth=0.7, label="exact")
+        axes.set(xlabel="q", ylabel="p", title=scheme, aspect="equal", xlim=(-limit, limit), ylim=(-limit, limit))
+        axes.legend(loc="center", markerscale=3)
+
+
+def _family(scheme: str) -> str:
+    """The name of a scheme without its degree or order."""
+    return scheme.partition(",")[0].removesuffix("4")
+
+
+def _energy_of_long_run(_: Mapping[str, Result]) -> Result:
+    runs = {scheme: _long_run(scheme) for scheme in LONG_RUN}
+    errors = {scheme: energy_error(run) for scheme, run in runs.items()}
+    return Result(
+        name="figure-10",
+        title=TITLES["figure-10"],
+        setting=LONG_SETTING,
+        checks=_checks_of_energy(errors),
+        tables=(energy_table(runs), curves_table("curves", runs["SRK4"].t, errors)),
+        picture=Picture(draw=partial(_draw_energy, runs["SRK4"].t, errors), width=7.0),
+    )
+
+
+def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Check, ...]:
+    size = {scheme: largest(error) for scheme, error in errors.items()}
+    svi, sc, srk, finer_svi, finer_sc = errors
+    drifting = errors[sc]
+    return (
+        Check(
+            claim="SVI and the symplectic Runge-Kutta method preserve the energy very well over the whole time.",
+            measured=f"Largest error and drift: SVI {size[svi]:.1e}, {drift(errors[svi]):.0e}; SRK4 {size[srk]:.1e}, "
+            f"{drift(errors[srk]):.0e}; SVI of degree 4 {size[finer_svi]:.1e}, {drift(errors[finer_svi]):.0e}.",
+            verdict=judged(*(not drifts(errors[scheme]) for scheme in (svi, srk, finer_svi))),
+            bears_on=("long-time",),
+        ),
+        Check(
+            claim="The energy error of SC drifts.",
+            measured=f"It grows to {size[sc]:.1e} (degree 4: {size[finer_sc]:.1e}), "
+            f"{drift(drifting) / drifting[-1]:.0%} of it between the first and the last fifth of the run.",
+            verdict=judged(drifts(drifting), drifts(errors[finer_sc])),
+            bears_on=("long-time",),
+        ),
+        Check(
+            claim="SVI is more accurate in energy than SC with the same points and step.",
+            measured=f"SVI {size[svi]:.1e}, SC {size[sc]:.1e}; degree 4: {size[finer_svi]:.1e}, {size[finer_sc]:.1e}.",
+            verdict=judged(size[svi] < size[sc], size[finer_svi] < size[finer_sc]),
+            bears_on=("accuracy",),
+        ),
+        Check(
+            claim="SVI achieves a higher accuracy than the 4th-order symplectic Runge-Kutta method.",
+            measured=f"Its energy error is {size[srk] / size[svi]:.0f} times smaller.",
+            verdict=holds(size[svi] < size[srk]),
+            bears_on=("efficiency",),
+        ),
+    )
+
+
+def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
+    (axes,) = panels(figure, 1, 1)
+    for scheme, error in errors.items():
+        style = ":" if scheme.endswith("degree 4") else "-"
+        draw_error(axes, t, error, _family(scheme), scheme, linestyle=style)
+    axes.set(xlabel="t", ylabel="|H - H(0)|")
+    axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+
+
+def _phase_with_two_points(_: Mapping[str, Result]) -> Result:
+    runs = {scheme: _two_points(scheme) for scheme in TWO_POINTS}
+    areas = {scheme: area_change(run) for scheme, run in runs.items()}
+    factors = {
+        scheme: area_factor(stepper_of(PENDULUM, method), 0.3, 0.2, SMALL_STEP) - 1.0
+        for scheme, method in TWO_POINTS.items()
+    }
+    orbits = {scheme: (run.q[:, 0], run.p[:, 0]) for scheme, run in runs.items()}
+    return Result(
+        name="figure-21",
+        title=TITLES["figure-21"],
+        setting=SHORT_SETTING,
+        checks=(
+            Check(
+                claim="SCVI preserves the area in phase space, as a symplectic integrator does.",
+                measured=f"The determinant of one step at (0.3, 0.2) is 1 {factors['SCVI']:+.0e} by differences; the "
+                f"area inside the states changes by {areas['SCVI']:.0e} over the run.",
+                verdict=judged(abs(factors["SCVI"]) < 1e-10, abs(areas["SCVI"]) < SMALL_AREA),
+                bears_on=("scvi-structure",),
+            ),
+            Check(
+                claim="The trajectory of SC decays in phase space.",
+                measured=f"The determinant of one step is 1 {factors['SC']:+.1e}; the area changes by "
+                f"{areas['SC']:+.0%} between the first and the last fifth of the run.",
+                verdict=holds(areas["SC"] < -10.0 * SMALL_AREA),
+            ),
+        ),
+        tables=(energy_table(runs),),
+        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve(), {}), width=8.0, height=4.2),
+    )
+
+
+def _energy_with_two_points(_: Mapping[str, Result]) -> Result:
+    runs = {scheme: _two_points(scheme) for scheme in TWO_POINTS}
+    errors = {scheme: energy_error(run) for scheme, run in runs.items()}
+    sizes = {scheme: largest(error) for scheme, error in errors.items()}
+    depth = 1.0 - math.cos(POSITION[0])
+    return Result(
+        name="figure-22",
+        title=TITLES["figure-22"],
+        setting=SHORT_SETTING,
+        checks=(
+            Check(
+                claim="SCVI preserves the energy very well.",
+                measured=f"Largest error {sizes['SCVI']:.1e}, {sizes['SCVI'] / depth:.0e} of the energy above rest; "
+                f"drift {drift(errors['SCVI']):.0e}.",
+                verdict=judged(sizes["SCVI"] < 1e-5 * depth, not drifts(errors["SCVI"])),
+                bears_on=("scvi-structure",),
+            ),
+            Check(
+                claim="SC performs much more poorly in preserving the energy.",
+                measured=f"It loses {-errors['SC'][-1]:.1e}, {-errors['SC'][-1] / depth:.0%} of the energy above rest.",
+                verdict=holds(sizes["SC"] > 100.0 * sizes["SCVI"]),
+            ),
+        ),
+        tables=(energy_table(runs), curves_table("curves", runs["SC"].t, errors)),
+        picture=Picture(draw=partial(_draw_energy, runs["SC"].t, errors), width=7.0),
+    )
+
+
+RUNS = {
+    "figure-9": _phase_of_long_run,
+    "figure-10": _energy_of_long_run,
+    "figure-21": _phase_with_two_points,
+    "figure-22": _energy_with_two_points,
+}
+EXPERIMENTS = tuple(Experiment(name=name, title=TITLES[name], run=run) for name, run in RUNS.items())

@@ -1,0 +1,284 @@
+"""Section 4.3.1: the two-point SCVI of the planar pendulum, derived and compared with the paper's (36) and (37)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import sympy
+from sympy import Rational, Symbol, cos, sin, sqrt
+
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.mechanics.forms import euler_lagrange
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Block,
+    Check,
+    Experiment,
+    Formula,
+    Paragraph,
+    Result,
+    Table,
+    holds,
+)
+from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.tables.basis import differentiation_matrix
+from scvi_codegen.tables.nodes import chebyshev_lobatto, exact_points
+from scvi_codegen.tables.quadrature import exact_rule, gauss_legendre
+
+__all__ = ["EXPERIMENTS"]
+
+QUADRATURE = "gauss-legendre:2"
+METHOD = SCVI(1, QUADRATURE)
+STATES = ((0.5, 0.0, 0.005), (0.5, 0.0, 0.1), (1.2, -0.7, 0.3), (-2.0, 0.9, 0.5), (3.0, 0.1, 1.0))
+"""(q_k, p_k, h) of the steps checked in numbers; the first is the paper's."""
+
+SMALL = 1e-14
+
+q, p, h, v, new = (Symbol(name, real=True) for name in ("q_k", "p_k", "h", "v_k", "q_k+1"))
+rate, acceleration, angle = Symbol("q\u0307"), Symbol("q\u0308"), Symbol("q")
+tau = Symbol("tau")
+
+
+@lru_cache(maxsize=1)
+def pendulum() -> LagrangianSystem:
+    """M = l = g = 1."""
+    return LagrangianSystem.from_text(
+        name="planar pendulum of unit mass and length",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + cos(q)",
+        parameters={},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Scheme:
+    """The two-point scheme as derived: residuals of (36) and (37), new momentum, Jacobian in (q_{k+1}, v_k)."""
+
+    stage: sympy.Expr
+    momentum: sympy.Expr
+    end: sympy.Expr
+    jacobian: sympy.Matrix
+
+
+@lru_cache(maxsize=1)
+def derived_scheme() -> Scheme:
+    """Of the general derivation, with the paper's names."""
+    derived = derive(pendulum(), METHOD, radicals=True)
+    names = dict(
+        zip((*derived.unknowns, *derived.state[0], *derived.state[1], derived.step), (new, v, q, p, h), strict=True)
+    )
+    stage, momentum = (equation.residual.xreplace(names) for equation in derived.equations)
+    end = derived.end_momentum[0].residual.xreplace(names)
+    return Scheme(stage, momentum, end, sympy.Matrix(derived.jacobian.xreplace(names)))
+
+
+def printed_36() -> sympy.Expr:
+    """Left minus right of (36)."""
+    return new / h**2 - (-sin(new) + v / h + q / h**2)
+
+
+def printed_g() -> sympy.Expr:
+    """G_k of section 4.3.1."""
+    first, second = (3 + sqrt(3)) / 6, (3 - sqrt(3)) / 6
+    return -(3 + sqrt(3)) * h / 12 * sin(first * q + second * new) - (3 - sqrt(3)) * h / 12 * sin(
+        second * q + first * new
+    )
+
+
+def printed_37() -> sympy.Expr:
+    """(37), with the matrix entries A_k = -1/h and A1_k = 1/h that the paper gives."""
+    return -new / h + q / h + printed_g() + p
+
+
+def action() -> sympy.Expr:
+    """L_d(q_k, q_{k+1}) of (33), written here from the nodes and the rule."""
+    points, weights = exact_rule(gauss_legendre(2)) or ((), ())
+    curve = cardinals()[0] * q + cardinals()[1] * new
+    lagrangian = (2 / h * sympy.diff(curve, tau)) ** 2 / 2 + cos(curve)
+    return h / 2 * sum(weight * lagrangian.subs(tau, point) for point, weight in zip(points, weights, strict=True))
+
+
+def cardinals() -> tuple[sympy.Expr, ...]:
+    """l_0, l_1 on the nodes -1, 1."""
+    left, right = exact_points(chebyshev_lobatto(1)) or ()
+    return (tau - right) / (left - right), (tau - left) / (right - left)
+
+
+def printed_differentiation() -> sympy.Matrix:
+    """(11) with N = 1 on descending nodes."""
+    corner = Rational(2 * 1**2 + 1, 6)
+    x, c = (1, -1), (2, 2)
+    return sympy.Matrix(
+        2,
+        2,
+        lambda i, j: (
+            (corner if i == 0 else -corner) if i == j else Rational(c[i] * (-1) ** (i + j), c[j] * (x[i] - x[j]))
+        ),
+    )
+
+
+def section_4_3(results: Mapping[str, Result]) -> Result:
+    """Derivation, comparison, and a test in numbers."""
+    scheme = derived_scheme()
+    rows = [_row(stepper_of(pendulum(), METHOD), *state) for state in STATES]
+    return Result(
+        name="section-4.3",
+        title="The two-point SCVI of the planar pendulum",
+        setting=(
+            "m = l = g = 1, nodes -1 and 1, two Gauss points: the general derivation of SCVI, written with the names "
+            "of section 4.3.1.",
+            "Formulas are compared by exact algebra; then steps of the compiled integrator are put into them.",
+        ),
+        checks=(*_symbolic_checks(scheme), *_correction_checks(), _numerical_check(rows)),
+        tables=(
+            Table(
+                columns=(
+                    "q_k",
+                    "p_k",
+                    "h",
+                    "q_(k+1)",
+                    "p_(k+1)",
+                    "v_k",
+                    "residual of (37)",
+                    "error of p_(k+1)",
+                    "SVI - SCVI",
+                ),
+                rows=tuple(rows),
+                formats={"q_(k+1)": ".15f", "p_(k+1)": ".15f", "v_k": ".15f", "residual of (37)": ".1e"}
+                | {"error of p_(k+1)": ".1e", "SVI - SCVI": ".1e"},
+            ),
+        ),
+        body=tuple(_derivation(scheme)),
+    )
+
+
+def _row(stepper: Stepper, *state: float) -> tuple[float, ...]:
+    """A compiled step put into the printed formulas; v_k from (36)."""
+    at_q, at_p, step = state
+    q1, p1 = (float(x[0]) for x in stepper.step([at_q], [at_p], step, options=ROUNDOFF))
+    other = stepper_of(pendulum(), SVI(1, QUADRATURE)).step([at_q], [at_p], step, options=ROUNDOFF)
+    values = {q: at_q, p: at_p, h: step, new: q1}
+    speed = sympy.solve(printed_36(), v)[0].evalf(20, subs=values)
+    residual = step * printed_37().evalf(20, subs=values)
+    end = sympy.diff(action(), new).evalf(20, subs=values) - p1
+    apart = max(abs(float(other[0][0]) - q1), abs(float(other[1][0]) - p1))
+    return (*state, q1, p1, float(speed), float(residual), float(end), apart)
+
+
+def _vanishes(expression: sympy.Expr) -> bool:
+    """Decided by expansion, also inside sines and cosines: all coefficients are numbers of the field of sqrt(3)."""
+    return bool(sympy.expand(expression) == 0)
+
+
+def _symbolic_checks(scheme: Scheme) -> Iterator[Check]:
+    for number, found, printed, claim in (
+        ("36", scheme.stage, printed_36(), "(34a) has the form (36)"),
+        ("37", scheme.momentum, printed_37(), "(34d) can be rewritten as (37)"),
+    ):
+        same = _vanishes(found - printed)
+        yield Check(
+            claim=f"For two points {claim}.",
+            measured=f"The difference of the derived and the printed ({number}) "
+            + ("simplifies to 0." if same else f"is {sympy.simplify(found - printed)}."),
+            verdict=holds(same),
+        )
+    start, end = (
+        _vanishes(e) for e in (p + sympy.diff(action(), q) - scheme.momentum, sympy.diff(action(), new) - scheme.end)
+    )
+    yield Check(
+        claim="The scheme is symplectic.",
+        measured=f"With L_d of (33), p_k = -dL_d/dq_k {'is' if start else 'is not'} (37) and p_(k+1) = dL_d/dq_(k+1) "
+        f"{'is' if end else 'is not'} (34e): "
+        + ("L_d generates the step, which is symplectic." if start and end else "L_d does not generate the step."),
+        verdict=holds(start and end),
+        bears_on=("scvi-structure",),
+    )
+
+
+def _correction_checks() -> Iterator[Check]:
+    points, weights = exact_rule(gauss_legendre(2)) or ((), ())
+    listed = ", ".join(map(str, weights))
+    yield Check(
+        claim="The two-point Gauss formula has w = +-1 and tau = +-1/sqrt(3).",
+        measured=f"The points are {', '.join(map(str, points))}; the weights are {listed}, and so they are in the "
+        "paper's A_k, G_k and (37).",
+        verdict=holds(sorted(weights) == [-1, 1]),
+    )
+    left = q / h - new / h - printed_g()
+    rest = sympy.expand(left - printed_37() + 2 * printed_g())
+    corrected = _vanishes(left + 2 * printed_g() + p - printed_37())
+    yield Check(
+        claim="(27a) in matrix form is A~Q~ = G, (28).",
+        measured=f"With the printed entries A~Q~ - G differs from (37) by {rest} - 2 G; "
+        f"A~Q~ = -G - (p_k, 0, .., 0)^T {'is' if corrected else 'is not'} (37).",
+        verdict=holds(_vanishes(left - printed_37())),
+    )
+
+
+def _numerical_check(rows: Sequence[Sequence[float]]) -> Check:
+    residual, end, apart = (max(abs(row[i]) for row in rows) for i in (-3, -2, -1))
+    return Check(
+        claim="q_(k+1) and v_k follow from (36), (37), then p_(k+1) from (34e).",
+        measured=f"{len(rows)} steps of the compiled integrator, h from {rows[0][2]} to {rows[-1][2]}: h times the "
+        f"residual of (37) at most {residual:.1e}, error of p_(k+1) at most {end:.1e}; SVI of degree 1 gives the same "
+        f"step to {apart:.1e}.",
+        verdict=holds(max(residual, end, apart) < SMALL),
+    )
+
+
+def _tidy(expression: sympy.Expr) -> sympy.Expr:
+    """Sines and cosines with their coefficients in front, numbers over common denominators."""
+    stand_ins = {function: sympy.Dummy() for function in sorted(expression.atoms(sin, cos), key=str)}
+    plain = sympy.expand(expression.xreplace(stand_ins))
+    terms = [sympy.factor(plain.coeff(stand_in)) * _linear(f) for f, stand_in in stand_ins.items()]
+    return sympy.Add(plain.xreplace(dict.fromkeys(stand_ins.values(), sympy.S.Zero)), *terms)
+
+
+def _linear(function: sympy.Expr) -> sympy.Expr:
+    inside = sympy.expand(function.args[0])
+    return function.func(sum(sympy.together(inside.coeff(symbol)) * symbol for symbol in (q, new)))
+
+
+def _derivation(scheme: Scheme) -> Iterator[Block]:
+    system = pendulum()
+    names = dict(zip((*system.coordinates, *system.velocities), (angle, rate), strict=True))
+    equation = euler_lagrange(system)[0].xreplace(names)
+    equation = equation.xreplace(dict.fromkeys(equation.free_symbols - {angle, rate}, acceleration))
+    points, weights = exact_rule(gauss_legendre(2)) or ((), ())
+    yield Paragraph("The Lagrangian and its Euler-Lagrange equation:")
+    yield Formula(system.lagrangian.xreplace(names), Symbol("L"))
+    yield Formula(sympy.S.Zero, equation)
+    yield Paragraph("Nodes, quadrature points and weights; the paper prints w = +-1:")
+    yield Formula(sympy.ImmutableMatrix([exact_points(chebyshev_lobatto(1))]), Symbol("x"))
+    yield Formula(sympy.ImmutableMatrix([points]), tau)
+    yield Formula(sympy.ImmutableMatrix([weights]), Symbol("w"))
+    yield Paragraph("The curve at the quadrature points, q(d_i) = l_{0,1}(tau_i) q_k + l_{1,1}(tau_i) q_(k+1):")
+    for i, point in enumerate(points, start=1):
+        values = [sympy.together(cardinal.subs(tau, point)) for cardinal in cardinals()]
+        yield Formula(values[0] * q + values[1] * new, sympy.Function("q")(Symbol(f"d_{i}")))
+    yield Paragraph("The differentiation matrix (11) on [-1, 1], and its lower row scaled to [kh, (k + 1)h]:")
+    yield Formula(sympy.ImmutableMatrix(printed_differentiation()), Symbol("D__(1)"))
+    yield Formula(_scaled_row(), sympy.ImmutableMatrix([[Symbol("a_0"), Symbol("A")]]))
+    yield Paragraph("The equations for q_(k+1) and v_k, as derived:")
+    yield Formula(sympy.S.Zero, _tidy(scheme.stage), "36")
+    yield Formula(sympy.S.Zero, _tidy(scheme.momentum), "37")
+    yield Paragraph("the new momentum,")
+    yield Formula(_tidy(scheme.end), Symbol("p_k+1"), "34e")
+    yield Paragraph("and the Jacobian of (36), (37) with respect to (q_(k+1), v_k):")
+    yield Formula(sympy.ImmutableMatrix(scheme.jacobian.applyfunc(_tidy)), Symbol("J"))
+
+
+def _scaled_row() -> sympy.ImmutableMatrix:
+    """[a_0, A] from the differentiation matrix of the project, on ascending nodes."""
+    row = differentiation_matrix(chebyshev_lobatto(1).points)[1]
+    return sympy.ImmutableMatrix([[2 * sympy.nsimplify(sympy.Float(str(x), 30)) / h for x in row]])
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    Experiment(name="section-4.3", title="The two-point SCVI of the planar pendulum", run=section_4_3),
+)

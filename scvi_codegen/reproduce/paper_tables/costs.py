@@ -1,0 +1,325 @@
+"""Tables 6 and 7: what SRK, SVI and SC cost at the paper's settings, and what they give for it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.method import Method
+from scvi_codegen.models.problems import duffing, planar_pendulum
+from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
+from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in
+from scvi_codegen.runtime.stepper import Stepper
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["EXPERIMENTS"]
+
+ROUNDS = 15
+"""Timed runs of each scheme, in turn with the others."""
+
+SAME = 0.05
+"""Times that differ by less are called equal."""
+
+REFERENCE, FINER = SVI(12), 4
+"""What the final position is compared with, and how many of its steps make one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """What a table compares.
+
+    Attributes:
+        number: of the table.
+        problem: in words.
+        system, q, velocity, h, span: what is integrated.
+        methods: by scheme, SRK first.
+        seconds: printed CPU times by scheme.
+    """
+
+    number: int
+    problem: str
+    system: LagrangianSystem
+    q: tuple[float, ...]
+    velocity: tuple[float, ...]
+    h: float
+    span: float
+    methods: Mapping[str, Method]
+    seconds: Mapping[str, float]
+
+    @property
+    def steps(self) -> int:
+        """Steps that fill the span."""
+        return steps_in(self.span, self.h)
+
+
+SETTINGS: Mapping[int, Setting] = {
+    6: Setting(
+        number=6,
+        problem="planar pendulum",
+        system=planar_pendulum(),
+        q=(0.5,),
+        velocity=(0.0,),
+        h=0.5,
+        span=1000.0,
+        methods={"SRK": Gauss(2), "SVI": SVI(3), "SC": SpectralCollocation(3)},
+        seconds={"SRK": 13.73, "SVI": 4.94, "SC": 1.85},
+    ),
+    7: Setting(
+        number=7,
+        problem="Duffing oscillator",
+        system=duffing(),
+        q=(0.0,),
+        velocity=(1.0,),
+        h=0.6,
+        span=2000.0,
+        methods={"SRK": Gauss(3), "SVI": SVI(5), "SC": SpectralCollocation(5)},
+        seconds={"SRK": 86.98, "SVI": 39.18, "SC": 4.35},
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cost:
+    """Of one scheme: median seconds, largest relative energy error, final position error over the largest |q|."""
+
+    seconds: float
+    energy: float
+    position: float
+
+    @property
+    def seconds_a_digit(self) -> float:
+        """Time over the correct digits of the final position, infinite where there is none."""
+        digits = -math.log10(self.position)
+        return self.seconds / digits if digits > 0.0 else math.inf
+
+
+@lru_cache(maxsize=2)
+def costs(number: int) -> Mapping[str, Cost]:
+    """Time and errors by scheme."""
+    setting = SETTINGS[number]
+    steppers = {scheme: compile_stepper(setting.system, method) for scheme, method in setting.methods.items()}
+    timed: dict[str, list[float]] = {scheme: [] for scheme in steppers}
+    for _ in range(ROUNDS + 1):
+        for scheme, stepper in steppers.items():
+            timed[scheme].append(_seconds(stepper, setting))
+    end = _reference(setting, FINER)
+    return {
+        scheme: Cost(seconds=statistics.median(timed[scheme][1:]), **_errors(stepper, setting, end))
+        for scheme, stepper in steppers.items()
+    }
+
+
+def _seconds(stepper: Stepper, setting: Setting) -> float:
+    run = stepper.start(setting.q, stepper.momentum(setting.q, setting.velocity), h=setting.h, options=SECTION_3)
+    began = time.process_time()
+    run.record(setting.steps, every=setting.steps)
+    return time.process_time() - began
+
+
+def _errors(stepper: Stepper, setting: Setting, end: NDArray[np.float64]) -> dict[str, float]:
+    p = stepper.momentum(setting.q, setting.velocity)
+    run = stepper.integrate(setting.q, p, h=setting.h, steps=setting.steps, options=SECTION_3)
+    energy = run.energy()
+    return {
+        "energy": float(np.abs(energy / energy[0] - 1.0).max()),
+        "position": float(np.abs(run.q[-1] - end).max() / np.abs(run.q).max()),
+    }
+
+
+def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
+    """The position at the end of the last step."""
+    stepper = compile_stepper(setting.system, REFERENCE)
+    p, steps = stepper.momentum(setting.q, setting.velocity), setting.steps * finer
+    end: NDArray[np.float64] = stepper.integrate(
+        setting.q, p, h=setting.h / finer, steps=steps, every=steps, options=ROUNDOFF
+    ).q[-1]
+    return end
+
+
+def table_6(results: Mapping[str, Result]) -> Result:
+    """Planar pendulum."""
+    return _result(SETTINGS[6])
+
+
+def table_7(results: Mapping[str, Result]) -> Result:
+    """Duffing oscillator."""
+    return _result(SETTINGS[7])
+
+
+def _result(setting: Setting) -> Result:
+    found = costs(setting.number)
+    names = {scheme: method.name for scheme, method in setting.methods.items()}
+    doubt = float(np.abs(_reference(setting, FINER) - _reference(setting, 2 * FINER)).max())
+    return Result(
+        name=f"table-{setting.number}",
+        title=f"Computational cost of SRK, SVI and SC, {setting.problem}",
+        setting=(
+            f"{setting.problem.capitalize()}, h = {setting.h}, T = {setting.span:g} ({setting.steps} steps), "
+            "iteration ended by the paper's rule, TOL = 1e-14: "
+            f"SRK is {names['SRK']}, SVI is {names['SVI']}, SC is {names['SC']}.",
+            "The paper names neither the quadrature of SVI, here as many Gauss points as the degree, which makes it "
+            "the Gauss method of so many stages, nor the machine; ratios of times are compared.",
+            f"Processor time of one trajectory in compiled C, solver 'auto': medians of {ROUNDS} runs, the three "
+            "schemes in turn.",
+            f"The final position is compared with SVI of degree {REFERENCE.degree} at h/{FINER}, which differs from "
+            f"that at h/{2 * FINER} by {doubt:.0e}; its error is given relative to the largest |q| of the run.",
+        ),
+        checks=tuple(_checks(setting, found)),
+        tables=(_table(setting, found),),
+        picture=Picture(draw=partial(draw_costs, _bars(setting, found)), width=9.0, height=3.8),
+    )
+
+
+def _table(setting: Setting, found: Mapping[str, Cost]) -> Table:
+    return Table(
+        columns=(
+            "scheme",
+            "method",
+            "ms",
+            "over SRK",
+            "s (paper)",
+            "over SRK (paper)",
+            "energy error",
+            "position error",
+            "ms a digit",
+        ),
+        rows=tuple(
+            (
+                one.scheme,
+                one.method,
+                1e3 * cost.seconds,
+                one.ratio,
+                setting.seconds[one.scheme],
+                one.printed,
+                cost.energy,
+                cost.position,
+                1e3 * cost.seconds_a_digit if cost.position < 1.0 else None,
+            )
+            for one, cost in zip(_bars(setting, found), found.values(), strict=True)
+        ),
+        formats={"over SRK": ".2f", "s (paper)": ".2f", "over SRK (paper)": ".2f"}
+        | {"energy error": ".1e", "position error": ".1e"},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Bars:
+    """What the picture shows of a scheme: times over that of SRK, errors."""
+
+    scheme: str
+    method: str
+    ratio: float
+    printed: float
+    energy: float
+    position: float
+
+
+def _bars(setting: Setting, found: Mapping[str, Cost]) -> tuple[Bars, ...]:
+    return tuple(
+        Bars(
+            scheme=scheme,
+            method=setting.methods[scheme].name,
+            ratio=cost.seconds / found["SRK"].seconds,
+            printed=setting.seconds[scheme] / setting.seconds["SRK"],
+            energy=cost.energy,
+            position=cost.position,
+        )
+        for scheme, cost in found.items()
+    )
+
+
+def _checks(setting: Setting, found: Mapping[str, Cost]) -> Sequence[Check]:
+    srk, svi, sc = (found[scheme] for scheme in ("SRK", "SVI", "SC"))
+    ratio, printed = svi.seconds / srk.seconds, setting.seconds["SVI"] / setting.seconds["SRK"]
+    share = svi.seconds_a_digit / srk.seconds_a_digit
+    by_sc = svi.seconds / sc.seconds
+    return (
+        Check(
+            claim=f"SVI takes less time than SRK at the same step ({printed:.2f} of it).",
+            measured=f"SVI takes {ratio:.2f} of the time of SRK ({1e3 * svi.seconds:.2f} and "
+            f"{1e3 * srk.seconds:.2f} ms).",
+            verdict=_cheaper(ratio),
+            bears_on=("svi-cheaper", "efficiency"),
+        ),
+        Check(
+            claim="SVI is more accurate than SRK at the same step.",
+            measured=f"Energy error {svi.energy:.1e}, that of SRK {srk.energy:.1e}; error of the final position "
+            f"{svi.position:.1e}, that of SRK {srk.position:.1e}.",
+            verdict=_both(svi.energy < srk.energy, svi.position < srk.position),
+            bears_on=("svi-cheaper", "efficiency"),
+        ),
+        Check(
+            claim="SVI reaches higher accuracy at a lower cost than SRK.",
+            measured=f"A correct digit of the final position takes {_of_a_digit(svi)} with SVI and "
+            f"{_of_a_digit(srk)} with SRK{f', a ratio of {share:.2f}' if share > 0.0 else ''}.",
+            verdict=_cheaper(share),
+            bears_on=("svi-cheaper", "efficiency"),
+        ),
+        Check(
+            claim=f"SVI costs more than SC ({setting.seconds['SVI'] / setting.seconds['SC']:.1f} times).",
+            measured=f"SVI takes {by_sc:.2f} of the time of SC.",
+            verdict=_cheaper(1.0 / by_sc),
+        ),
+        Check(
+            claim="SVI is much more accurate than SC over the long run.",
+            measured=f"Energy error {svi.energy:.1e}, that of SC {sc.energy:.1e}; error of the final position "
+            f"{svi.position:.1e}, that of SC {sc.position:.1e}.",
+            verdict=_both(svi.energy < sc.energy / 10.0, svi.position < sc.position / 10.0),
+            bears_on=("accuracy", "efficiency"),
+        ),
+    )
+
+
+def _of_a_digit(cost: Cost) -> str:
+    milliseconds = 1e3 * cost.seconds_a_digit
+    return f"{milliseconds:.2f} ms" if math.isfinite(milliseconds) else "no time at all (there is none)"
+
+
+def _cheaper(ratio: float) -> Verdict:
+    """Whether a ratio of times says cheaper; in part if the times are equal."""
+    return Verdict.PARTLY if abs(ratio - 1.0) <= SAME else holds(ratio < 1.0)
+
+
+def _both(one: bool, other: bool) -> Verdict:
+    return Verdict.PARTLY if one != other else holds(one)
+
+
+def draw_costs(bars: Sequence[Bars], figure: Figure) -> None:
+    """Times over that of SRK, here and printed; errors."""
+    left, right = panels(figure, 1, 2)
+    colors = [COLORS[one.scheme] for one in bars]
+    _draw_pairs(left, [one.ratio for one in bars], [one.printed for one in bars], colors)
+    left.set(title="time over that of SRK (pale: as printed)")
+    _draw_pairs(right, [one.energy for one in bars], [one.position for one in bars], colors)
+    right.set(title="relative error: largest of energy, of final position (pale)", yscale="log")
+    for axes in (left, right):
+        axes.margins(y=0.12)
+        axes.set_xticks(range(len(bars)), [f"{one.scheme}\n{one.method}" for one in bars], fontsize=7)
+
+
+def _draw_pairs(axes: Axes, dark: Sequence[float], pale: Sequence[float], colors: Sequence[str]) -> None:
+    for heights, shift, alpha in ((dark, -0.2, 1.0), (pale, 0.2, 0.35)):
+        drawn = axes.bar(np.arange(len(heights)) + shift, heights, 0.36, color=colors, alpha=alpha)
+        axes.bar_label(drawn, fmt="{:.2g}", fontsize=7)
+
+
+EXPERIMENTS: tuple[Experiment, ...] = tuple(
+    Experiment(name=f"table-{number}", title=f"Computational cost, {SETTINGS[number].problem}", run=run)
+    for number, run in ((6, table_6), (7, table_7))
+)

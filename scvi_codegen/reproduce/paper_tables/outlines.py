@@ -1,0 +1,214 @@
+"""Tables 5 and 10: the paper's algorithms beside the outline of the C that is generated for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from scvi_codegen.compiler import generate_source
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.models.problems import planar_pendulum
+from scvi_codegen.rendering.outline import Function, functions_of, outline
+from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Listing, Paragraph, Result, Table, holds
+
+__all__ = ["EXPERIMENTS"]
+
+DEGREE = 4
+PREFIX = "pendulum"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """A step of an algorithm and where it is in the C text.
+
+    Attributes:
+        number: of the step.
+        text: as the paper has it.
+        counterpart: what stands for it, in a sentence.
+        evidence: fragments of text that must be found, by the function they must be in; ``""`` for the whole text.
+    """
+
+    number: int
+    text: str
+    counterpart: str
+    evidence: Mapping[str, tuple[str, ...]]
+
+
+POINTS = Step(
+    number=1,
+    text="choose the number of collocation points s + 1 and quadrature formula (w_i, tau_i)",
+    counterpart="An argument of the generator; the C text has the weights as a table.",
+    evidence={"": (f"QUADRATURE_WEIGHT[{DEGREE}]", f"/* Quadrature: {DEGREE} points.")},
+)
+ROOT = Step(
+    number=5,
+    text="update by performing a nonlinear rootfinding iteration, until max(|dQ|, |dP|) < TOL",
+    counterpart="newton solves with pivoted LU factors and stops when neither stages nor end momentum move by more "
+    "than the tolerance.",
+    evidence={
+        "newton": (
+            "factorise(",
+            "apply_update(",
+            "measure(&moved, change, size_p)",
+            "has_converged(",
+            "max_iterations",
+        ),
+        "has_converged": ("moved->absolute < options->tolerance",),
+    },
+)
+END = Step(
+    number=6,
+    text="compute (q_(k+1), p_(k+1))",
+    counterpart="q_(k+1) - q_k is the sum END_POSITION of the stages, p_(k+1) - p_k the last row of the equations.",
+    evidence={"solve": ("gather(END_POSITION", "dp"), "newton": ("increment[i] = data->rows[i * (B + 1) + B]",)},
+)
+REPEAT = Step(
+    number=7,
+    text="k <- k + 1, repeat STEP3 to STEP6",
+    counterpart="The loop of advance, which adds the increments with compensated sums.",
+    evidence={
+        f"{PREFIX}_advance": ("for (long long k = 0; k < steps; k++)", "solve(", "add_compensated(", "run->step++")
+    },
+)
+LINE = "newton_from_line"
+
+SVI_STEPS = (
+    POINTS,
+    Step(
+        number=2,
+        text="compute matrix A_k, k = 0, .., N - 1",
+        counterpart="It does not depend on k: tables of cardinal functions at the quadrature points, computed in 60 "
+        "digits when the text is generated.",
+        evidence={"": ("QUADRATURE_GATHER_0", "QUADRATURE_GATHER_1", "QUADRATURE_SCATTER_0", "QUADRATURE_SCATTER_1")},
+    ),
+    Step(
+        number=3,
+        text="choose an initial guess for the solution at the collocation points Q_k",
+        counterpart="The curve of the step before, continued; the straight line where there is none or it fails.",
+        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "STRAIGHT[b] * v[i]")},
+    ),
+    Step(
+        number=4,
+        text="compute G_k(Q) and its Jacobian",
+        counterpart="evaluate sums L_q and L_v, and their symbolic derivatives, over the quadrature points.",
+        evidence={
+            "evaluate": ("add_quadrature(",),
+            "add_quadrature": ("quadrature_value(", "quadrature_slope(", "scatter(", "scatter_slopes("),
+        },
+    ),
+    ROOT,
+    END,
+    REPEAT,
+)
+
+SCVI_STEPS = (
+    POINTS,
+    Step(
+        number=2,
+        text="compute matrix A",
+        counterpart="Tables that integrate accelerations at the nodes to velocities and positions, which is what A^-1 "
+        "and A^-2 do, computed in 60 digits when the text is generated.",
+        evidence={"": ("NODE_GATHER_0", "NODE_GATHER_1", "NODE_GATHER_2")},
+    ),
+    Step(
+        number=3,
+        text="choose initial guess of the collocation points Q and v0; a good guess for v0 can be obtained by "
+        "inverting the continuous Legendre transformation",
+        counterpart="The curve of the step before, continued; the straight line with the velocity that belongs to p_k "
+        "where there is none or it fails.",
+        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "STRAIGHT[b] * v[i]")},
+    ),
+    Step(
+        number=4,
+        text="compute the right hand side of (34a), (34d) and their Jacobians",
+        counterpart="evaluate: add_node has the Euler-Lagrange residuals (34a) with their multipliers, add_quadrature "
+        "the sums of (34d) and (34e).",
+        evidence={
+            "evaluate": ("add_quadrature(", "add_node("),
+            "add_node": ("node_value(", "node_slope("),
+            "add_quadrature": ("quadrature_value(", "quadrature_slope("),
+        },
+    ),
+    ROOT,
+    END,
+    REPEAT,
+)
+
+
+def table_5(results: Mapping[str, Result]) -> Result:
+    """SVI."""
+    return _result("table-5", "The iterative algorithm of SVI", SVI(DEGREE), SVI_STEPS)
+
+
+def table_10(results: Mapping[str, Result]) -> Result:
+    """SCVI."""
+    remark = (
+        "The multipliers, unknowns that the paper's algorithm does not have, make the derivative of L_d total: "
+        "with them the step is symplectic.",
+    )
+    return _result("table-10", "The iterative algorithm of SCVI", SCVI(DEGREE), SCVI_STEPS, remark)
+
+
+def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], remark: tuple[str, ...] = ()) -> Result:
+    code = generate_source(planar_pendulum(), method, solver="newton", prefix=PREFIX)[0].code
+    functions = functions_of(code)
+    missing = {step.number: _missing(step, code, functions) for step in steps}
+    found = [number for number, fragments in missing.items() if not fragments]
+    lost = "; ".join(f"STEP{number} lacks {', '.join(fragments)}" for number, fragments in missing.items() if fragments)
+    return Result(
+        name=name,
+        title=title,
+        setting=(
+            f"C generated for the planar pendulum by {method.name}, Newton's method: {len(functions)} functions, "
+            f"{len(code.splitlines())} lines.",
+            "Unknowns are stage velocities (SVI) or accelerations (SCVI) in place of positions at nodes, which lose "
+            "digits in differences when h is small.",
+            *remark,
+        ),
+        checks=(
+            Check(
+                claim=f"The algorithm has the steps STEP1 to STEP{len(steps)}.",
+                measured=f"{len(found)} of {len(steps)} steps have their counterpart in the C text"
+                + (f"; {lost}." if lost else ", each found by name in the function that has it."),
+                verdict=holds(not lost),
+            ),
+        ),
+        tables=(
+            Table(
+                columns=("step", "paper", "here", "functions", "found"),
+                rows=tuple(
+                    (
+                        step.number,
+                        step.text,
+                        step.counterpart,
+                        ", ".join(filter(None, step.evidence)) or "tables",
+                        "no" if missing[step.number] else "yes",
+                    )
+                    for step in steps
+                ),
+                formats={"step": "d"},
+            ),
+        ),
+        body=(
+            Paragraph("Calls from the loop over the steps down, with the comments of the functions:"),
+            Listing(outline(functions, f"{PREFIX}_advance")),
+        ),
+    )
+
+
+def _missing(step: Step, code: str, functions: Mapping[str, Function]) -> list[str]:
+    """Fragments that are not where they should be."""
+    return [
+        fragment
+        for name, fragments in step.evidence.items()
+        for fragment in fragments
+        if fragment not in (code if not name else functions[name].body if name in functions else "")
+    ]
+
+
+EXPERIMENTS: tuple[Experiment, ...] = (
+    Experiment(name="table-5", title="The iterative algorithm of SVI", run=table_5),
+    Experiment(name="table-10", title="The iterative algorithm of SCVI", run=table_10),
+)

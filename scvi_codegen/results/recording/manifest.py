@@ -1,0 +1,155 @@
+"""What a recorded run is: everything but its states, as one JSON file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from scvi_codegen.errors import RecordingError
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.native import building
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.version import __version__
+
+__all__ = ["MANIFEST", "Build", "Manifest", "read_manifest", "write_manifest"]
+
+MANIFEST = "manifest.json"
+FORMAT = 1
+TEXTS = ("header", "code", "declarations")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Build:
+    """The compiled code that made the states from some step on.
+
+    Attributes:
+        step: number of steps done before.
+        version: of this package.
+        compiler: what it says of itself.
+        fingerprint: of text, compiler, flags, Python and processor; equal ones make equal bits.
+    """
+
+    step: int
+    version: str
+    compiler: str
+    fingerprint: str
+
+    @classmethod
+    def of(cls, stepper: Stepper, step: int) -> Build:
+        """What compiles here."""
+        return cls(
+            step=step,
+            version=__version__,
+            compiler=building.compiler_title(),
+            fingerprint=building.fingerprint(stepper.source, flags=stepper.flags),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manifest:
+    """A run but for its states.
+
+    Attributes:
+        source, interface, flags: of its stepper.
+        options: when the stage equations count as solved; ``None`` for the defaults.
+        parameters: values in the order of ``interface.parameters``.
+        h: step size.
+        t: initial time.
+        every: distance between kept states in steps.
+        steps: number of steps wanted.
+        rows: states in a full file.
+        model: the model file it comes from, if it has one.
+        certificate: what was found out about the integrator, as JSON, if that was given.
+        builds: first the one it began with, then each that took over.
+    """
+
+    source: Source
+    interface: Interface
+    flags: tuple[str, ...]
+    options: SolverOptions | None
+    parameters: tuple[float, ...]
+    h: float
+    t: float
+    every: int
+    steps: int
+    rows: int
+    model: str | None
+    certificate: Any
+    builds: tuple[Build, ...]
+
+    def stepper(self) -> Stepper:
+        """The integrator, compiled or from the cache."""
+        return Stepper(self.source, self.interface, flags=self.flags)
+
+    def continued_by(self, build: Build) -> Manifest:
+        """The manifest once ``build`` takes over."""
+        same = build.fingerprint == self.builds[-1].fingerprint
+        return self if same else replace(self, builds=(*self.builds, build))
+
+    def about(self) -> dict[str, str]:
+        """What belongs beside the states wherever they go."""
+        texts = self.interface.about() | {"version": self.builds[0].version}
+        if self.model is not None:
+            texts["model"] = self.model
+        if self.certificate is not None:
+            texts["certificate"] = json.dumps(self.certificate)
+        return texts
+
+    def to_json(self) -> str:
+        """Text read back by :meth:`from_json`, with the C code line by line."""
+        source = asdict(self.source)
+        document = {
+            "format": FORMAT,
+            **{field: getattr(self, field) for field in PLAIN},
+            "options": None if self.options is None else asdict(self.options),
+            "builds": [asdict(build) for build in self.builds],
+            "interface": json.loads(self.interface.to_json()),
+            "source": source | {name: source[name].split("\n") for name in TEXTS},
+        }
+        return json.dumps(document, indent=1) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Manifest:
+        """The manifest of a text; ValueError, KeyError or TypeError if it is none."""
+        document = json.loads(text)
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
+        source = document["source"]
+        plain = {field: document[field] for field in PLAIN}
+        options = document["options"]
+        return cls(
+            **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
+            options=None if options is None else SolverOptions(**options),
+            builds=tuple(Build(**build) for build in document["builds"]),
+            interface=Interface.from_json(json.dumps(document["interface"])),
+            source=Source(prefix=source["prefix"], **{name: "\n".join(source[name]) for name in TEXTS}),
+        )
+
+
+PLAIN = ("flags", "parameters", "h", "t", "every", "steps", "rows", "model", "certificate")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest in a folder.
+
+    Raises:
+        RecordingError: if there is none, or it is damaged.
+    """
+    path = folder / MANIFEST
+    try:
+        return Manifest.from_json(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise RecordingError(f"'{folder}' holds no recorded run: there is no file '{path}'") from error
+    except OSError as error:
+        raise RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"'{path}' is damaged or of another version of this package: {error!r}") from error
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Put the manifest into a folder, whole; OSError if that fails."""
+    write_atomically(folder / MANIFEST, lambda file: file.write(manifest.to_json().encode()))

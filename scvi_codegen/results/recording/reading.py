@@ -1,0 +1,235 @@
+"""Recorded runs read back: arrays that are as long as the run, of which only what is looked at is in memory."""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from scvi_codegen.errors import RecordingError
+from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
+from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
+from scvi_codegen.results.recording.manifest import read_manifest
+from scvi_codegen.runtime.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.run import Run
+    from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["LazyArray", "RecordedRun", "load_run"]
+
+Array = NDArray[np.float64]
+PIECES_IN_MEMORY = 2
+
+
+def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
+    """The run recorded in a folder, as far as it goes now; another process may still be recording it.
+
+    Raises:
+        RecordingError: if there is none, or a file of it is missing or damaged.
+    """
+    return RecordedRun(Path(folder))
+
+
+class RecordedRun:
+    """A run in a folder, states read when they are looked at.
+
+    Indexing gives a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` goes through it in parts
+    that fit into memory, whatever its length.
+
+    Attributes:
+        folder: where it lies.
+        manifest: what runs.
+        t, q, p, iterations: of shape (n,), (n, m), (n, m), (n,), to be indexed; ``numpy.asarray`` reads them whole.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.manifest = folder, read_manifest(folder)
+        try:
+            self._paths = chunk_paths(folder)
+        except OSError as error:
+            raise RecordingError(f"'{folder}' cannot be read: {error.strerror or error}") from error
+        if not self._paths:
+            raise RecordingError(f"'{folder}' holds no states, not even the first: record it again")
+        self._last = read_chunk(self._paths[-1])
+        self._recent: OrderedDict[int, Piece] = OrderedDict()
+        self.t, self.q, self.p, self.iterations = (LazyArray(self, i) for i in range(len(COLUMNS)))
+
+    def __len__(self) -> int:
+        """The number n of states kept."""
+        return (len(self._paths) - 1) * self.manifest.rows + len(self._last)
+
+    def __repr__(self) -> str:
+        return f"<RecordedRun '{self.folder}': {len(self)} states, step {self.steps} of {self.manifest.steps}>"
+
+    def __getitem__(self, rows: slice) -> Trajectory:
+        """States by number, as a trajectory in memory; ``iterations`` counts as in the whole run."""
+        if not isinstance(rows, slice):
+            raise TypeError(
+                f"a recorded run is indexed by slices, as in run[-1000:], not by {rows!r}; see run.q, run.p"
+            )
+        return self._trajectory(tuple(self.gather(self.rows(rows), range(len(COLUMNS)))))
+
+    @cached_property
+    def stepper(self) -> Stepper:
+        """The integrator, compiled from the text in the manifest."""
+        return self.manifest.stepper()
+
+    @property
+    def steps(self) -> int:
+        """Steps done; the last of them is not among the states if it is not a multiple of ``manifest.every``."""
+        return self._last.step
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps wanted are done."""
+        return self.steps >= self.manifest.steps
+
+    def resumed(self) -> Run:
+        """The run where it stands, to go on with in memory; :func:`resume_run` goes on in the folder.
+
+        Raises:
+            BuildError: without a C compiler.
+        """
+        manifest = self.manifest
+        return self.stepper.restore(self._last.memory, parameters=manifest.parameters, options=manifest.options)
+
+    def pieces(self) -> Iterator[Trajectory]:
+        """The run in parts, one after the other."""
+        yield from map(self._trajectory, self._pieces())
+
+    def _pieces(self) -> Iterator[Piece]:
+        for path in self._paths[:-1]:
+            yield read_chunk(path).piece
+        if len(self._last):
+            yield self._last.piece
+
+    def piece(self, number: int) -> Piece:
+        """The states of file ``number``, of the files read last from memory."""
+        if number == len(self._paths) - 1:
+            return self._last.piece
+        if number not in self._recent:
+            self._recent[number] = read_chunk(self._paths[number]).piece
+            if len(self._recent) > PIECES_IN_MEMORY:
+                self._recent.popitem(last=False)
+        self._recent.move_to_end(number)
+        return self._recent[number]
+
+    def rows(self, rows: Any) -> NDArray[np.int64]:
+        """Numbers of rows, or one number; IndexError for one that is not there."""
+        if isinstance(rows, slice):
+            return np.arange(*rows.indices(len(self)), dtype=np.int64)
+        numbers = np.asarray(rows)
+        if numbers.dtype == bool:
+            if numbers.shape != (len(self),):
+                raise IndexError(f"there are {len(self)} rows, but truth values of shape {numbers.shape}")
+            return np.flatnonzero(numbers)
+        if not np.issubdtype(numbers.dtype, np.integer) and numbers.size:
+            raise IndexError(f"rows are chosen by numbers, slices or truth values, not by {rows!r}")
+        outside = (numbers < -len(self)) | (numbers >= len(self))
+        if outside.any():
+            raise IndexError(f"there is no row {int(numbers[outside].flat[0])} among {len(self)}")
+        return np.where(numbers < 0, numbers + len(self), numbers).astype(np.int64)
+
+    def gather(self, rows: NDArray[np.int64], columns: Sequence[int]) -> list[NDArray[Any]]:
+        """The rows of these numbers, of some columns; each file is read once."""
+        kinds = [no_states(self.manifest.interface.dimension)[column] for column in columns]
+        results = [np.empty((len(rows), *kind.shape[1:]), dtype=kind.dtype) for kind in kinds]
+        order = np.argsort(rows, kind="stable")
+        files = rows[order] // self.manifest.rows
+        for some in np.split(order, np.flatnonzero(np.diff(files)) + 1) if len(rows) else ():
+            number, places = int(rows[some[0]]) // self.manifest.rows, rows[some] % self.manifest.rows
+            for result, column in zip(results, columns, strict=True):
+                result[some] = self.piece(number)[column][places]
+        return results
+
+    def energy(self) -> Array:
+        """(n,) energies p.v - L."""
+        return np.concatenate([piece.energy() for piece in self.pieces()])
+
+    def states(self) -> States:
+        """The states as :mod:`scvi_codegen.files.export` writes them, read file by file."""
+        manifest = self.manifest
+        return States(
+            count=len(self),
+            pieces=self._pieces,
+            coordinates=manifest.interface.coordinates,
+            parameters=dict(zip(manifest.interface.parameters, manifest.parameters, strict=True)),
+            h=manifest.h,
+            about=manifest.about(),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`."""
+        write_states(self.states(), path)
+
+    def _trajectory(self, piece: tuple[Any, ...]) -> Trajectory:
+        t, q, p, iterations = piece
+        return Trajectory(
+            t=t,
+            q=q,
+            p=p,
+            iterations=iterations,
+            h=self.manifest.h,
+            parameters=np.array(self.manifest.parameters),
+            stepper=self.stepper,
+        )
+
+
+class LazyArray:
+    """One column of a recorded run, read when it is indexed: by a number, a slice, numbers or truth values of rows.
+
+    Whatever follows the rows is applied to what they give, as in ``run.q[::10, 0]``. ``numpy.asarray`` reads it whole,
+    ``dask.array.from_array(run.q)`` a file at a time.
+    """
+
+    def __init__(self, run: RecordedRun, column: int) -> None:
+        self._run, self._column = run, column
+        self._like = no_states(run.manifest.interface.dimension)[column]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(n,) or (n, m)."""
+        return (len(self._run), *self._like.shape[1:])
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the entries."""
+        return self._like.dtype
+
+    @property
+    def ndim(self) -> int:
+        """1 or 2."""
+        return self._like.ndim
+
+    @property
+    def chunks(self) -> tuple[int, ...]:
+        """Rows of a file, and all columns: what is best read at once."""
+        return (min(self._run.manifest.rows, max(1, len(self))), *self._like.shape[1:])
+
+    def __len__(self) -> int:
+        return len(self._run)
+
+    def __repr__(self) -> str:
+        return f"<LazyArray {COLUMNS[self._column]}{self.shape} of '{self._run.folder}'>"
+
+    def __iter__(self) -> Iterator[Any]:
+        for number in range(-(-len(self) // self._run.manifest.rows)):
+            yield from self._run.piece(number)[self._column]
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        if copy is False:
+            raise ValueError("the states are in files: they cannot be an array without a copy")
+        return np.asarray(self[:], dtype=dtype)
+
+    def __getitem__(self, index: Any) -> Any:
+        rows, *rest = index if isinstance(index, tuple) else (index,)
+        wanted = self._run.rows(rows)
+        (found,) = self._run.gather(np.atleast_1d(wanted), [self._column])
+        return found[(slice(None), *rest)] if wanted.ndim else found[(0, *rest)]

@@ -1,0 +1,346 @@
+"""Recording a run into a folder, and going on with it."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shlex
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError
+from scvi_codegen.files.atomic import sync_folder
+from scvi_codegen.files.export import Piece, chunk_rows
+from scvi_codegen.native.arguments import checked_count
+from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
+from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
+from scvi_codegen.results.recording.reading import RecordedRun, load_run
+from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["record_run", "resume_run"]
+
+CHECKPOINT_SECONDS = 10.0
+SHORTEST_PORTION, LONGEST_PORTION = 0.01, 0.1
+"""Seconds between looks at the clock: a run is never further from its last consistent state."""
+
+
+def record_run(
+    run: Run,
+    folder: str | os.PathLike[str],
+    *,
+    steps: int,
+    every: int = 1,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    checkpoint_steps: int | None = None,
+    rows: int | None = None,
+    model: str | None = None,
+    certificate: Any = None,
+    progress: Callable[[int], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> RecordedRun:
+    """Advance a run by ``steps`` and record every ``every``-th state, the initial one first, in a folder.
+
+    Args:
+        run: at its start, from ``stepper.start(q, p, h=h)``.
+        folder: made if it is missing; it must be empty, or hold a run that was ended before its first state.
+        steps: number of steps.
+        every: distance between kept states.
+        checkpoint_seconds: what is computed is written at least so often; no more is lost if the process is killed.
+        checkpoint_steps: write it also every so many steps.
+        rows: states in a file, by default about 16 MiB.
+        model: text of a model file (:func:`dump_model`), to be kept beside the states.
+        certificate: what was found out about the integrator: JSON data, an object with a method ``to_json``, or the
+            path of a JSON file.
+        progress: called now and then with the number of steps done.
+        stop: asked now and then whether to end here; what was computed is written.
+
+    Returns:
+        The run as it lies in the folder; ``finished`` unless ``stop`` ended it.
+
+    Raises:
+        StateError: on wrong numbers, or a run under way.
+        RecordingError: if the folder holds a run, or cannot be written; it then says how far the run in it goes.
+        StepFailedError: if a step fails; the states before are in the folder.
+    """
+    target = Path(folder)
+    if run.steps:
+        raise StateError(f"a run is recorded from its start, but this one has {run.steps} steps: start another")
+    manifest = Manifest(
+        source=run.stepper.source,
+        interface=run.stepper.interface,
+        flags=run.stepper.flags,
+        options=run.options,
+        parameters=tuple(map(float, run.parameters)),
+        h=run.h,
+        t=run.t,
+        every=checked_count(every, "every", least=1),
+        steps=checked_count(steps, "steps", least=0),
+        rows=chunk_rows(run.stepper.dimension) if rows is None else checked_count(rows, "rows", least=1),
+        model=model,
+        certificate=_certificate(certificate),
+        builds=(Build.of(run.stepper, 0),),
+    )
+    recorder = _Recorder(target, manifest, run, *_pace(checkpoint_seconds, checkpoint_steps))
+    with recorder.telling_where_it_stands():
+        _prepare(target)
+    with _locked(target):
+        with recorder.telling_where_it_stands():
+            _clear(target)
+            recorder.keep(_piece(run.record_states(0), 0))
+            recorder.write()
+            write_manifest(target, manifest)
+            sync_folder(target)
+        recorder.advance(progress, stop)
+    return load_run(target)
+
+
+def resume_run(
+    folder: str | os.PathLike[str],
+    *,
+    steps: int | None = None,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    checkpoint_steps: int | None = None,
+    progress: Callable[[int], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> RecordedRun:
+    """Go on with a recorded run where it stands, bit for bit as if it had never ended.
+
+    Args:
+        folder: of :func:`record_run`.
+        steps: number of steps of the whole run, if it is to be longer or shorter than it was meant to be.
+        checkpoint_seconds, checkpoint_steps, progress, stop: as of :func:`record_run`.
+
+    Returns:
+        The run as it lies in the folder.
+
+    Raises:
+        RecordingError: if the folder holds no run, is being written by another process, or cannot be written.
+        StepFailedError: if a step fails.
+
+    Warns:
+        RecordingWarning: if other code runs from here on (another compiler or processor, other flags), whose states may
+            differ in the last bits. The manifest says from which step.
+    """
+    target = Path(folder)
+    read_manifest(target)  # a folder without one is not locked
+    with _locked(target):
+        recorded = load_run(target)
+        run, manifest = recorded.resumed(), recorded.manifest
+        continued = manifest.continued_by(Build.of(run.stepper, run.steps))
+        if len(continued.builds) > len(manifest.builds):
+            _warn_of_another_build(manifest.builds[-1], continued.builds[-1])
+        if steps is not None:
+            continued = replace(continued, steps=checked_count(steps, "steps", least=0))
+        recorder = _Recorder(target, continued, run, *_pace(checkpoint_seconds, checkpoint_steps))
+        recorder.go_on_from(target)
+        with recorder.telling_where_it_stands():
+            _remove(unfinished(target))
+            write_manifest(target, continued)  # also finds out at once whether the folder can be written
+        recorder.advance(progress, stop)
+    return load_run(target)
+
+
+class _Recorder:
+    """A run, the states of the file that is being filled, and what of it is on the disk."""
+
+    def __init__(self, folder: Path, manifest: Manifest, run: Run, seconds: float, steps: int | None) -> None:
+        self.folder, self.manifest, self.run = folder, manifest, run
+        self.seconds, self.steps = seconds, steps
+        self.number, self.written = 0, -1
+        self.kept: tuple[list[Piece], int, bytes] = ([], run.steps, run.save())
+
+    def go_on_from(self, folder: Path) -> None:
+        """Take over the last file, to fill it up."""
+        paths = chunk_paths(folder)
+        chunk = read_chunk(paths[-1])
+        full = len(chunk) == self.manifest.rows
+        self.number = len(paths) - 1 + full
+        self.kept = ([] if full else [chunk.piece], chunk.step, chunk.memory)
+        self.written = chunk.step
+
+    def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
+        """Go as far as is wanted; whatever ends it, what was computed is written."""
+        try:
+            for done in self._portions():
+                if progress is not None:
+                    progress(done)
+                if stop is not None and stop():
+                    break
+        except RecordingError:
+            raise
+        except BaseException:
+            self.checkpoint()
+            raise
+        self.checkpoint()
+
+    def _portions(self) -> Iterator[int]:
+        """Advance in portions, write files that are full or due, and yield the number of steps done."""
+        manifest, run, portion, checked = self.manifest, self.run, 1, time.monotonic()
+        wanted = min(LONGEST_PORTION, max(SHORTEST_PORTION, self.seconds))
+        while run.steps < manifest.steps:
+            began = time.monotonic()
+            self._advance(min(portion, self._most_steps()))
+            now = time.monotonic()
+            portion = max(1, int(portion * min(2.0, wanted / max(now - began, 1e-6))))
+            if self._rows() == manifest.rows or now - checked >= self.seconds or self._at_checkpoint():
+                self.checkpoint()
+                checked = time.monotonic()
+            yield run.steps
+
+    def _advance(self, steps: int) -> None:
+        try:
+            self.keep(_piece(self.run.record_states(steps, every=self.manifest.every), 1))
+        except StepFailedError as error:
+            if error.trajectory is not None:
+                self.keep(_piece(error.trajectory, 1))
+            raise
+
+    def _most_steps(self) -> int:
+        """Up to the end, the last state of this file, or the next checkpoint."""
+        done, every, manifest = self.run.steps, self.manifest.every, self.manifest
+        last = ((self.number + 1) * manifest.rows - 1) * every
+        ends = [manifest.steps, last]
+        if self.steps is not None:
+            ends.append((done // self.steps + 1) * self.steps)
+        return min(ends) - done
+
+    def _at_checkpoint(self) -> bool:
+        return self.steps is not None and self.run.steps % self.steps == 0
+
+    def _rows(self) -> int:
+        return sum(len(piece[0]) for piece in self.kept[0])
+
+    def keep(self, piece: Piece) -> None:
+        """States and memory together, so that an interruption at any point leaves the one that fits the other."""
+        self.kept = ([*self.kept[0], piece], self.run.steps, self.run.save())
+
+    def checkpoint(self) -> None:
+        """Write what was computed since the last time.
+
+        Raises:
+            RecordingError: if that fails, with the step up to which the folder holds the run.
+        """
+        with self.telling_where_it_stands():
+            self.write()
+
+    def write(self) -> None:
+        """Put the file that is being filled in its place, and begin the next one if it is full."""
+        pieces, step, memory = self.kept
+        if step == self.written:
+            return
+        t, q, p, iterations = map(np.concatenate, zip(no_states(self.run.stepper.dimension), *pieces, strict=True))
+        piece = (t, q, p, iterations)
+        write_chunk(self.folder, self.number, Chunk(piece, step, memory))
+        self.written = step
+        full = len(t) == self.manifest.rows
+        self.number, self.kept = self.number + full, ([] if full else [piece], step, memory)
+
+    @contextmanager
+    def telling_where_it_stands(self) -> Iterator[None]:
+        """Turn the errors of the system into one that says what is safe and what to do."""
+        try:
+            yield
+        except RecordingError:
+            raise
+        except OSError as error:
+            raise RecordingError(self._where_it_stands(error)) from error
+
+    def _where_it_stands(self, error: OSError) -> str:
+        problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
+        if self.written < 0:
+            return f"{problem}; nothing was recorded"
+        t = self.manifest.t + self.written * self.manifest.h
+        return (
+            f"{problem}. It holds the run whole up to step {self.written} (t = {t:g}); {self.run.steps - self.written} "
+            "steps done since are not in it. Once it can be written, go on with "
+            f"'scvi-codegen run --resume {shlex.quote(str(self.folder))}' or resume_run"
+        )
+
+
+def _piece(trajectory: Trajectory, first: int) -> Piece:
+    """The states of a trajectory from one on."""
+    return trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
+
+
+def _pace(seconds: float, steps: int | None) -> tuple[float, int | None]:
+    if not seconds >= 0.0:
+        raise StateError(f"checkpoint_seconds must be a number of seconds, not {seconds!r}")
+    return seconds, None if steps is None else checked_count(steps, "checkpoint_steps", least=1)
+
+
+def _certificate(given: Any) -> Any:
+    """As JSON data."""
+    if isinstance(given, str | os.PathLike):
+        try:
+            return json.loads(Path(given).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise StateError(f"the certificate '{given}' cannot be read as JSON: {error}") from error
+    try:
+        return json.loads(given.to_json() if hasattr(given, "to_json") else json.dumps(given))
+    except (TypeError, ValueError) as error:
+        raise StateError(f"the certificate is not JSON data: {error}") from error
+
+
+def _prepare(folder: Path) -> None:
+    """Make the folder, or find that it may be used."""
+    folder.mkdir(exist_ok=True)
+    if (folder / MANIFEST).exists():
+        raise RecordingError(
+            f"'{folder}' holds a run already: go on with it ('scvi-codegen run --resume "
+            f"{shlex.quote(str(folder))}', resume_run), or choose another folder"
+        )
+    own = {*chunk_paths(folder), *unfinished(folder)}
+    for path in folder.iterdir():
+        if path not in own:
+            raise RecordingError(f"'{folder}' is not empty (it has '{path.name}'): choose another folder")
+
+
+def _clear(folder: Path) -> None:
+    """Remove what a process left that was killed before there was a manifest."""
+    if (folder / MANIFEST).exists():
+        raise RecordingError(f"'{folder}' was given a run by another process just now: choose another folder")
+    _remove([*chunk_paths(folder), *unfinished(folder)])
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
+        path.unlink()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the folder, so that no two processes record into it; the system lets go of it however the process ends."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        _lock(handle, folder)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, folder: Path) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise RecordingError(f"another process is recording into '{folder}': wait for it, or end it") from error
+    except OSError:
+        return  # some network disks have no locks
+
+
+def _warn_of_another_build(before: Build, now: Build) -> None:
+    warnings.warn(
+        f"from step {now.step} on other code runs than before ({now.compiler}; before: {before.compiler}): another "
+        "compiler, processor or Python. States may differ in the last bits from those of a run that was never "
+        "interrupted; the manifest keeps this",
+        RecordingWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,146 @@
+"""States between steps: a step of a part of h from the kept state before, by the method itself.
+
+Such a state is as accurate as the method, for every method and solver. It depends continuously on time, is the state
+kept at both ends of a step, and needs nothing that a run would have to store. A polynomial through what a step leaves
+behind costs less to evaluate, but is of order 4 (states and velocities at both ends), or of about half the order of the
+method (the curve of its stages). Measured on one revolution of Kepler's problem, e = 0.5, largest errors of the
+positions at 2001 times:
+
+    method, steps    states kept    between them    cubics through positions and velocities
+    SVI(4), 40       7.0e-8         7.0e-8          9.7e-5
+    SVI(8), 20       4.2e-11        4.2e-11         1.3e-3
+
+A state takes 0.65 microseconds there, four times as long as a step of the run, whose first guess is better.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.binding import step_failure
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["checked_times", "grid_tolerance", "states_at", "times_of_run"]
+
+Array = NDArray[np.float64]
+ROUNDINGS = 4.0
+ON_GRID = 1e-6
+
+
+def states_at(trajectory: Trajectory, times: Array) -> tuple[Array, Array]:
+    """(n, m) positions and momenta at (n,) times within the trajectory, in any order.
+
+    Raises:
+        StateError: for times outside, or if the states kept do not stand at whole steps (those of ``t_eval``).
+        StepFailedError: if a step of a part of h fails.
+    """
+    times = _within(times, trajectory.t[0], trajectory.t[-1])
+    _check_on_grid(trajectory)
+    forward = math.copysign(1.0, trajectory.h)
+    left = np.searchsorted(forward * trajectory.t, forward * times, side="right") - 1
+    t, q, p = trajectory.t[left], trajectory.q[left], trajectory.p[left]
+    whole = _whole_steps(times - t, trajectory.h)
+    between = np.flatnonzero(whole)
+    _take_whole_steps(trajectory, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
+    _take_parts(trajectory, t, times - t, q, p)
+    return q, p
+
+
+def _whole_steps(spans: Array, h: float) -> NDArray[np.int64]:
+    """Steps of h that fit into spans; one that only rounding makes too long fits."""
+    ratio = spans / h
+    nearest = np.rint(ratio)
+    fits = np.abs(ratio - nearest) <= ROUNDINGS * np.finfo(float).eps * np.maximum(1.0, nearest)
+    return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
+
+
+def _take_whole_steps(
+    trajectory: Trajectory,
+    left: NDArray[np.intp],
+    whole: NDArray[np.int64],
+    order: NDArray[np.intp],
+    t: Array,
+    q: Array,
+    p: Array,
+) -> None:
+    """Where several steps lie between kept states: one run from each of these, stopped at what is asked for."""
+    kept, run = -1, None
+    for k in order:
+        if run is None or left[k] != kept:
+            kept = left[k]
+            run = trajectory.stepper.start(
+                q[k], p[k], h=trajectory.h, t=t[k], parameters=trajectory.parameters, options=trajectory.options
+            )
+        run.skip(int(whole[k]) - run.steps)
+        t[k], q[k], p[k] = run.t, run.q, run.p
+
+
+def _take_parts(trajectory: Trajectory, t: Array, h: Array, q: Array, p: Array) -> None:
+    """From each state at t a step of its own h, in place."""
+    binding, m = trajectory.stepper.binding, trajectory.stepper.dimension
+    step, report, workspace = binding.function("step"), binding.new("report *"), binding.workspace()
+    parameters, options = binding.pointer(trajectory.parameters), binding.options(trajectory.options)
+    q_start, p_start = binding.pointer(q), binding.pointer(p)
+    numbers = np.flatnonzero(h)
+    for k, begin, length in zip(numbers.tolist(), t[numbers].tolist(), h[numbers].tolist(), strict=True):
+        q_k, p_k = q_start + k * m, p_start + k * m
+        status = step(begin, length, q_k, p_k, parameters, options, q_k, p_k, report, workspace)
+        if status:
+            raise step_failure(status, report, step=0, h=length)
+
+
+def checked_times(t: ArrayLike, name: str) -> Array:
+    """Finite times, any shape; a copy."""
+    try:
+        times = np.array(t, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise StateError(f"{name} must be real numbers: {error}") from error
+    if not np.isfinite(times).all():
+        checked_number(float(times[~np.isfinite(times)][0]), f"a time in {name}")
+    return times
+
+
+def times_of_run(t_eval: ArrayLike, t: float, h: float, steps: int) -> Array:
+    """(n,) times within a run of ``steps`` steps, sorted as it goes."""
+    times = checked_times(t_eval, "t_eval")
+    if times.ndim != 1:
+        raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
+    if (np.diff(times) * h < 0.0).any():
+        raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
+    return _within(times, t, t + steps * h)
+
+
+def _within(times: Array, first: float, last: float) -> Array:
+    """The times, those beyond an end by no more than rounding at it."""
+    low, high = min(first, last), max(first, last)
+    slack = ROUNDINGS * np.finfo(float).eps * max(abs(first), abs(last))
+    outside = times[(times < low - slack) | (times > high + slack)]
+    if outside.size:
+        raise StateError(
+            f"t = {outside[0]:.17g} is outside of the trajectory, which goes from {first:.17g} to {last:.17g}"
+        )
+    return np.clip(times, low, high)
+
+
+def grid_tolerance(trajectory: Trajectory) -> float:
+    """By how much of a step a kept state may seem to be off the grid of steps: times are rounded."""
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(trajectory.t).max() / abs(trajectory.h)
+    return float(max(ON_GRID, rounding))
+
+
+def _check_on_grid(trajectory: Trajectory) -> None:
+    """All states but the last, which an event may have ended, stand at whole steps from the first."""
+    steps = (trajectory.t[:-1] - trajectory.t[0]) / trajectory.h
+    if np.abs(steps - np.round(steps)).max(initial=0.0) > grid_tolerance(trajectory):
+        raise StateError(
+            "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
+            "integrate without t_eval, then ask for states between"
+        )

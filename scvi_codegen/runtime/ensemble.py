@@ -1,0 +1,437 @@
+"""Many trajectories at once: a trajectory a vector lane, blocks of lanes over the processor's cores.
+
+Each block runs in C without Python's lock, so threads share the work. One trajectory cannot spoil another: a lane whose
+step fails keeps its last good state and is continued alone by the single integrator (which has Newton's iteration to
+fall back on); if that fails too, its later states are NaN and its status says so. Results are the same, bit for bit,
+for any number of threads.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.native import building
+from scvi_codegen.native.arguments import checked_count, checked_number, checked_step, empty_array, real_array
+from scvi_codegen.native.binding import checked_options
+from scvi_codegen.runtime.trajectory import relative_changes
+
+if TYPE_CHECKING:
+    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.runtime.run import Run
+    from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["Ensemble", "EnsembleTrajectory", "integrate_ensemble"]
+
+Array = NDArray[np.float64]
+EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
+
+OK, INTERRUPTED = "ok", "interrupted"
+FIRST_PORTION = 64
+"""Steps of a block before the first look at the clock."""
+PORTION_SECONDS = 0.02
+"""Time between looks, in a block, for a wish to stop."""
+PROGRESS_SECONDS = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleTrajectory:
+    """States of k trajectories at common times, the initial one first.
+
+    Attributes:
+        t: (n,) times.
+        q, p: (n, k, m) positions and momenta; NaN after a failure.
+        status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
+            ``"interrupted"``).
+        steps: (k,) steps completed.
+        h: step size.
+        parameters: (k, number of parameters).
+        stepper: the compiled integrator.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    status: NDArray[np.str_]
+    steps: NDArray[np.int64]
+    h: float
+    parameters: Array
+    stepper: Stepper = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(k,) which trajectories reached the end."""
+        reached: NDArray[np.bool_] = self.status == OK
+        return reached
+
+    def energy(self) -> Array:
+        """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
+        energies = np.full(self.q.shape[:2], np.nan)
+        for j in range(len(self)):
+            good = self._reached(j)
+            try:
+                energies[good, j] = self.stepper.energy(
+                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                )
+            except StateError:
+                continue
+        return energies
+
+    def momentum_maps(self) -> Array:
+        """(n, k, c) values of what symmetries conserve, named ``stepper.momentum_map_names``; NaN as above."""
+        return self._momentum_maps()[0]
+
+    def momentum_errors(self) -> Array:
+        """(n, k, c) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        return relative_changes(*self._momentum_maps())
+
+    def _momentum_maps(self) -> tuple[Array, Array]:
+        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
+        for j in range(len(self)):
+            good = self._reached(j)
+            try:
+                values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
+                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                )
+            except StateError:
+                continue
+        return values, sizes
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.
+
+        In a CSV file trajectories are numbered from 0, parameters that differ between them have columns too, and states
+        after a failure are left out.
+
+        Raises:
+            StateError: for another suffix.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".npz":
+            write_atomically(path, self._write_npz)
+        elif suffix == ".csv":
+            write_atomically(path, self._write_csv)
+        else:
+            raise StateError(f"an ensemble is saved as .npz or .csv, not as {str(path)!r}")
+
+    def _reached(self, j: int) -> NDArray[np.bool_]:
+        """(n,) which states of a trajectory there are."""
+        return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
+
+    def _write_npz(self, file: IO[bytes]) -> None:
+        np.savez(
+            file,
+            t=self.t,
+            q=self.q,
+            p=self.p,
+            status=self.status,
+            steps=self.steps,
+            h=self.h,
+            parameters=self.parameters,
+            coordinates=np.array(self.stepper.coordinates),
+            parameter_names=np.array(self.stepper.parameters, dtype=str),
+            title=self.stepper.title,
+        )
+
+    def _write_csv(self, file: IO[bytes]) -> None:
+        names = self.stepper.coordinates
+        varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
+        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
+        file.write((",".join(header) + "\n").encode())
+        formats = ["%d"] + ["%.17g"] * (len(header) - 1)
+        for j in range(len(self)):
+            good = self._reached(j)
+            label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
+            table = np.column_stack([label, self.t[good], self.q[good, j], self.p[good, j]])
+            np.savetxt(file, table, delimiter=",", fmt=formats)
+
+
+def integrate_ensemble(
+    stepper: Stepper,
+    q: ArrayLike,
+    p: ArrayLike,
+    *,
+    h: float,
+    steps: int,
+    every: int = 1,
+    t: float = 0.0,
+    parameters: EnsembleParameters = None,
+    options: SolverOptions | None = None,
+    progress: Callable[[int], None] | None = None,
+    threads: int | None = None,
+) -> EnsembleTrajectory:
+    """See :meth:`scvi_codegen.runtime.stepper.Stepper.integrate_ensemble`."""
+    work = Ensemble(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
+    work.run(progress=progress, threads=threads)
+    return work.result()
+
+
+class Ensemble:
+    """An ensemble to be integrated: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``."""
+
+    def __init__(
+        self,
+        stepper: Stepper,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float,
+        steps: int,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+    ) -> None:
+        self.stepper, self.options = stepper, checked_options(options)
+        self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
+        self.steps = checked_count(steps, "steps", least=0)
+        self.every = checked_count(every, "every", least=1)
+        start_q, start_p = _states(stepper, q, "q"), _states(stepper, p, "p")
+        if start_q.shape != start_p.shape:
+            raise StateError(f"q has shape {start_q.shape}, p {start_p.shape}")
+        self.count = len(start_q)
+        self.parameters = _parameters(stepper, parameters, self.count)
+        kept = self.steps // self.every + 1
+        self.q, self.p = (empty_array((kept, self.count, stepper.dimension)) for _ in "qp")
+        self.q[:] = self.p[:] = np.nan
+        self.q[0], self.p[0] = start_q, start_p
+        self.status = np.full(self.count, OK, dtype="<U16")
+        self.done = np.zeros(self.count, dtype=np.int64)
+
+    def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
+        """All blocks, by ``threads`` workers; what ``progress`` raises stops them within moments.
+
+        Afterwards, also after an exception, :meth:`result` holds what was computed.
+        """
+        workers = checked_count(threads or os.cpu_count() or 1, "threads", least=1)
+        make, width = self._blocks()
+        firsts = range(0, self.count, width)
+        reached, stop = np.zeros(len(firsts)), threading.Event()
+
+        def drive(number: int) -> None:
+            block = make(firsts[number])
+            portion = min(FIRST_PORTION, self.steps)
+            while reached[number] < self.steps and not stop.is_set():
+                began = time.perf_counter()
+                block.advance(portion)
+                reached[number] += portion
+                faster = PORTION_SECONDS / max(time.perf_counter() - began, 1e-6)
+                portion = min(max(1, int(portion * min(8.0, faster))), self.steps - int(reached[number]))
+
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                pending = {pool.submit(drive, number) for number in range(len(firsts))}
+                while pending:
+                    finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
+                    for future in finished:
+                        future.result()
+                    if progress is not None:
+                        progress(int(reached.mean()))
+            finally:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+
+    def _blocks(self) -> tuple[Callable[[int], _LaneBlock | _SingleBlock], int]:
+        """How to make the block that begins with a trajectory, and how many trajectories it holds."""
+        source = self.stepper.ensemble
+        if source is None:
+            return lambda first: _SingleBlock(self, first), 1
+        module, prefix = building.load(source, flags=self.stepper.flags), source.prefix
+        width = len(module.ffi.new(f"{prefix}_block *").active)
+        return lambda first: _LaneBlock(self, first, module, prefix), width
+
+    def result(self) -> EnsembleTrajectory:
+        """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
+        unfinished = (self.status == OK) & (self.done < self.steps)
+        number = self.every * np.arange(len(self.q), dtype=np.float64)
+        return EnsembleTrajectory(
+            t=self.t0 + number * self.h,
+            q=self.q,
+            p=self.p,
+            status=np.where(unfinished, INTERRUPTED, self.status),
+            steps=self.done,
+            h=self.h,
+            parameters=self.parameters,
+            stepper=self.stepper,
+        )
+
+
+class _LaneBlock:
+    """A few trajectories, lanes of one C block, and those of them that had to leave it."""
+
+    def __init__(self, work: Ensemble, first: int, module: Any, prefix: str) -> None:
+        self.work, self.first, self.prefix = work, first, prefix
+        self.ffi, self.lib = module.ffi, module.lib
+        self.memory = self.ffi.new(f"{prefix}_block *")
+        self._call("start")(self.memory, work.t0, work.h)
+        self.active = np.frombuffer(self.ffi.buffer(self.memory.active), dtype=np.float64)
+        self.count, self.step = min(len(self.active), work.count - first), 0
+        self.left: dict[int, _Alone] = {}
+        self._fill()
+
+    def _call(self, name: str) -> Callable[..., Any]:
+        function: Callable[..., Any] = getattr(self.lib, f"{self.prefix}_{name}")
+        return function
+
+    def _fill(self) -> None:
+        """A trajectory into each lane; those too many repeat the last one and rest."""
+        work, call = self.work, self._call("set")
+        q, p = (self.ffi.from_buffer("double[]", array) for array in (work.q, work.p))
+        values, m, P = self.ffi.from_buffer("double[]", work.parameters), *work.q.shape[2:], work.parameters.shape[1]
+        v = self._velocities()
+        velocities = self.ffi.NULL if v is None else self.ffi.from_buffer("double[]", v)
+        for lane in range(len(self.active)):
+            k = min(lane, self.count - 1)
+            j = self.first + k
+            given = velocities if v is None else velocities + k * m
+            call(self.memory, lane, q + j * m, p + j * m, given, values + j * P if P else self.ffi.NULL)
+        self.active[self.count :] = 0.0
+        if v is not None:
+            self.active[: self.count] *= np.isfinite(v).all(axis=1)
+
+    def _velocities(self) -> Array | None:
+        """(count, m) initial velocities if the lanes need them, not numbers where there are none."""
+        if not getattr(self.lib, f"{self.prefix.upper()}_NEEDS_VELOCITIES"):
+            return None
+        work, v = self.work, np.full((self.count, self.work.stepper.dimension), np.nan)
+        for k in range(self.count):
+            j = self.first + k
+            with suppress(StateError):
+                v[k] = work.stepper.velocity(work.q[0, j], work.p[0, j], work.t0, work.parameters[j])
+        return v
+
+    def advance(self, size: int) -> None:
+        """``size`` steps on."""
+        work, begin, self.step = self.work, self.step, self.step + size
+        if len(self.left) < self.count:
+            row = begin // work.every + 1
+            stride = work.count * work.stepper.dimension
+            place = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
+            self._call("advance")(
+                self.memory,
+                self.count,
+                size,
+                work.every,
+                self._options(),
+                self.ffi.from_buffer("double[]", work.q) + place,
+                self.ffi.from_buffer("double[]", work.p) + place,
+                stride,
+            )
+        running = self.active[: self.count] > 0.0
+        work.done[self.first : self.first + self.count][running] = self.step
+        for lane in np.flatnonzero(~running):
+            self._leave(int(lane), begin)
+
+    def _leave(self, lane: int, begin: int) -> None:
+        """What a call that began after ``begin`` steps stored of a resting lane gives way to a run of its own."""
+        work, j = self.work, self.first + lane
+        if lane not in self.left:
+            step = int(self.memory.last_step[lane])
+            q, p, *carries = (
+                np.array([row[lane] for row in getattr(self.memory, name)]) for name in ("q", "p", "carry_q", "carry_p")
+            )
+            self.left[lane] = _Alone(work, j, q, p, step, (carries[0], carries[1]))
+            begin = step
+        rows = slice(begin // work.every + 1, self.step // work.every + 1)
+        work.q[rows, j] = work.p[rows, j] = np.nan
+        self.left[lane].advance_to(self.step)
+
+    def _options(self) -> Any:
+        options = self.work.options
+        if options is None:
+            return self.ffi.NULL
+        values = [options.tolerance, options.max_iterations, int(options.absolute)]
+        return self.ffi.new(f"{self.prefix}_options *", values)
+
+
+class _SingleBlock:
+    """One trajectory, of a method without lanes."""
+
+    def __init__(self, work: Ensemble, first: int) -> None:
+        self.step, self.run = 0, _Alone(work, first, work.q[0, first], work.p[0, first])
+
+    def advance(self, size: int) -> None:
+        """``size`` steps on."""
+        self.step += size
+        self.run.advance_to(self.step)
+
+
+class _Alone:
+    """Trajectory j by the single integrator, from its state after ``step`` steps."""
+
+    def __init__(
+        self, work: Ensemble, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
+    ) -> None:
+        self.work, self.j = work, j
+        self.run: Run | None = None
+        work.done[j] = step
+        try:
+            run = work.stepper.start(q, p, h=work.h, t=work.t0, parameters=work.parameters[j], options=work.options)
+        except StateError:  # a sum of finite terms that overflowed
+            work.status[j] = "not finite"
+        else:
+            run.resume_at(step, carries)
+            self.run = run
+
+    def advance_to(self, step: int) -> None:
+        """On to ``step``, unless it failed before."""
+        work, j, run = self.work, self.j, self.run
+        if run is None:
+            return
+        row = run.steps // work.every + 1
+        try:
+            trajectory = run.record(step - run.steps, every=work.every)
+        except StepFailedError as failure:
+            work.status[j], trajectory, self.run = failure.status, failure.recorded, None
+        work.done[j] = run.steps
+        rows = slice(row, row + len(trajectory) - 1)
+        work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
+
+
+def _states(stepper: Stepper, value: ArrayLike, name: str) -> Array:
+    """(k, m) finite numbers."""
+    array = real_array(value, name)
+    if array.ndim == 1:
+        array = array[np.newaxis]
+    if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
+        raise StateError(f"{name} must have shape (k, {stepper.dimension}), not {array.shape}")
+    if not np.isfinite(array).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(array)))
+        raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}")
+    return array
+
+
+def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Array:
+    """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
+    names = stepper.parameters
+    values = np.tile(stepper.defaults, (count, 1))
+    if isinstance(given, Mapping):
+        for name, value in given.items():
+            column = real_array(value, f"the parameter {name}")
+            if column.shape not in ((), (count,)):
+                raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
+            values[:, stepper.parameter_index(name)] = column
+    elif given is not None:
+        array = real_array(given, "parameters")
+        if array.shape not in ((len(names),), (count, len(names))):
+            raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
+        values[:] = array
+    if not np.isfinite(values).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
+        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}")
+    return values

@@ -1,0 +1,139 @@
+"""The compiled search for zero crossings, run over the states of a trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import EventError, StateError
+from scvi_codegen.native.binding import step_failure
+from scvi_codegen.runtime.dense_output import grid_tolerance
+from scvi_codegen.runtime.events import Crossings
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.stepper import Stepper
+    from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["EventSearch", "crossings_of"]
+
+ROOM = 256
+"""Crossings that one call can report; a step with more makes room for twice as many."""
+
+
+class EventSearch:
+    """The crossings of a stepper's events along consecutive parts of one run.
+
+    Attributes:
+        ended: whether a terminal event was met; ``found[-1]`` is then its crossing.
+        found: structured arrays (t, function, q, p), in order of the run.
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.binding = stepper, stepper.binding
+        self.found: list[NDArray[Any]] = []
+        self.watch = self.binding.new("watch *")
+        for number, event in enumerate(stepper.events):
+            self.watch.direction[number] = event.direction
+            self.watch.remaining[number] = int(event.terminal)
+        m = stepper.dimension
+        fields = [("t", float), ("function", np.int32), ("q", float, (m,)), ("p", float, (m,))]
+        self._record = np.dtype(fields, align=True)
+        self._room = ROOM
+
+    @property
+    def ended(self) -> bool:
+        """Whether a terminal event was met."""
+        return bool(self.watch.ended)
+
+    def search(self, part: Trajectory, first: int = 0) -> int:
+        """Look between the states of a trajectory that has all of them; the number of steps before the search ended.
+
+        Args:
+            part: the trajectory.
+            first: number of its first state in the run, for messages.
+
+        Raises:
+            EventError: where a function is not finite.
+            StepFailedError: if a step of a part of h fails.
+        """
+        t, q, p = (np.ascontiguousarray(array) for array in (part.t, part.q, part.p))
+        parameters, options = self.binding.pointer(part.parameters), self.binding.options(part.options)
+        workspace, report = self.binding.workspace(), self.binding.new("report *")
+        filled = self.binding.number("long long *")
+        done = 0
+        while True:
+            crossings = self.binding.new(f"crossing[{self._room}]")
+            filled[0] = 0
+            status = self.binding.function("crossings")(
+                self.watch,
+                len(t) - done,
+                part.h,
+                self.binding.pointer(t[done:]),
+                self.binding.pointer(q[done:]),
+                self.binding.pointer(p[done:]),
+                parameters,
+                options,
+                self._room,
+                crossings,
+                filled,
+                report,
+                workspace,
+            )
+            count = int(filled[0])
+            self.found.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
+            done += int(report.steps)
+            if status:
+                raise self._failure(status, report, first + done, part)
+            if self.ended:
+                return done - 1
+            if done == len(t) - 1:
+                return done
+            self._room *= 2
+
+    def _failure(self, status: int, report: Any, step: int, part: Trajectory) -> Exception:
+        if self.watch.undefined:
+            function = self.stepper.events[self.watch.undefined - 1].function
+            return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
+        return step_failure(status, report, step=step, h=part.h)
+
+    def crossings(self) -> tuple[Crossings, ...]:
+        """What was found, by event."""
+        found = np.concatenate([np.empty(0, self._record), *self.found])
+        return tuple(
+            Crossings(event=event, t=mine["t"].copy(), q=mine["q"].copy(), p=mine["p"].copy())
+            for number, event in enumerate(self.stepper.events)
+            for mine in [found[found["function"] == number]]
+        )
+
+
+def crossings_of(stepper: Stepper, trajectory: Trajectory) -> tuple[Crossings, ...]:
+    """The crossings of the stepper's events along a trajectory that has all states of its run; none is terminal.
+
+    Raises:
+        StateError: if states between were not kept.
+        EventError, StepFailedError: as :meth:`EventSearch.search`.
+    """
+    lengths = np.diff(trajectory.t) / trajectory.h
+    tolerance = grid_tolerance(trajectory)
+    whole = np.abs(lengths - 1.0) <= tolerance
+    if not whole[:-1].all() or (lengths > 1.0 + tolerance).any():
+        raise StateError(
+            "events are looked for between consecutive steps, but this trajectory was kept with every > 1 or t_eval"
+        )
+    search = EventSearch(stepper)
+    for number in range(len(stepper.events)):
+        search.watch.remaining[number] = 0
+    steps = int(whole.sum())
+    search.search(_part(trajectory, slice(steps + 1), trajectory.h))
+    if steps < len(whole):  # an event ended the last step
+        search.search(_part(trajectory, slice(steps, None), float(trajectory.t[-1] - trajectory.t[-2])))
+    return search.crossings()
+
+
+def _part(trajectory: Trajectory, states: slice, h: float) -> Trajectory:
+    """Some of the states, with steps of h."""
+    kept = {name: getattr(trajectory, name)[states] for name in ("t", "q", "p", "iterations")}
+    return replace(trajectory, h=h, **kept)

@@ -1,0 +1,187 @@
+"""The result of an integration: arrays, diagnostics, files and tables."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
+from scvi_codegen.errors import StateError
+from scvi_codegen.files.export import States, to_dataframe, to_xarray, write_states
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.runtime.events import Crossings, Event, EventLike
+    from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["Trajectory", "relative_changes"]
+
+Array = NDArray[np.float64]
+
+MOST_DRAWN, MOST_CURVES = 400, 6
+"""States, and coordinates, that a notebook draws."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trajectory:
+    """States along a run, the initial one first.
+
+    Attributes:
+        t: (n,) times.
+        q: (n, m) positions.
+        p: (n, m) momenta.
+        iterations: (n,) Newton iterations since the state before, 0 for the first.
+        h: step size (negative: backward).
+        parameters: (k,) values in the order of ``stepper.parameters``.
+        stepper: the compiled integrator.
+        options: convergence of the stage equations, ``None`` for the defaults.
+        events: the zero crossings found, parallel to ``stepper.events``.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    iterations: NDArray[np.int32]
+    h: float
+    parameters: Array
+    stepper: Stepper = field(repr=False)
+    options: SolverOptions | None = field(default=None, repr=False)
+    events: tuple[Crossings, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def energy(self) -> Array:
+        """(n,) energies p.v - L, constant along exact trajectories when L does not depend on time."""
+        energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
+        return energies
+
+    def momentum_maps(self) -> Array:
+        """(n, k) values of what symmetries conserve, in the order of ``stepper.momentum_map_names``."""
+        return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
+
+    def momentum_errors(self) -> Array:
+        """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
+        return relative_changes(values, sizes)
+
+    def states(self) -> States:
+        """The states as :mod:`scvi_codegen.files.export` writes them."""
+        interface = self.stepper.interface
+        piece = (self.t, self.q, self.p, self.iterations)
+        return States(
+            count=len(self),
+            pieces=lambda: iter([piece]),
+            coordinates=interface.coordinates,
+            parameters=dict(zip(interface.parameters, map(float, self.parameters), strict=True)),
+            h=self.h,
+            about=interface.about(),
+        )
+
+    @property
+    def ended_by(self) -> Event | None:
+        """The terminal event that ended the run, at whose crossing the last state is, or ``None``."""
+        for found in self.events:
+            if found.event.terminal and len(found) >= int(found.event.terminal):
+                return found.event
+        return None
+
+    def at(self, t: ArrayLike) -> tuple[Array, Array]:
+        """States between those kept: steps of a part of h, as accurate as the method and continuous in t.
+
+        A whole step is the state kept there, so nothing jumps; where only every so-many-th was kept, the steps between
+        are taken again, to round-off. Backward runs as well.
+
+        Args:
+            t: a time, or (n,) times in any order, within the trajectory.
+
+        Returns:
+            (q, p), each (m,) for a number and (n, m) for times.
+
+        Raises:
+            StateError: for times outside, and of a trajectory made with ``t_eval``.
+        """
+        return self.stepper.states_at(self, t)
+
+    def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
+        """Zero crossings of functions along the trajectory, looked for now; it needs all states (``every=1``).
+
+        Args:
+            events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
+        """
+        return self.stepper.with_events(events).crossings(self)
+
+    def _repr_html_(self) -> str:
+        every = max(1, -(-len(self) // MOST_DRAWN))
+        series = list(zip(self.stepper.coordinates, self.q[::every].T, strict=True))[:MOST_CURVES]
+        energies = self._energies(every)
+        rows = [(plain(name), sparkline(values.tolist(), name), _range(values)) for name, values in series]
+        if energies is not None:
+            rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
+        names = zip(self.stepper.parameters, self.parameters, strict=True)
+        facts = (
+            ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, h = {self.h:g}")),
+            ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
+            ("coordinates", listed(self.stepper.coordinates)),
+            ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
+            ("iterations", plain(f"{self.iterations.sum()}")),
+        )
+        return card(self.stepper.title, facts, grid(rows))
+
+    def _energies(self, every: int) -> Array | None:
+        """Of each so many states, ``None`` where a state has no energy."""
+        try:
+            energies: Array = self.stepper.energy(self.q[::every], self.p[::every], self.t[::every], self.parameters)
+        except StateError:
+            return None
+        return energies
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, atomically.
+
+        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and texts title,
+        system, method, version. A CSV file has columns t, the coordinates x, the momenta p_x, iterations.
+
+        Raises:
+            StateError: for another suffix.
+            MissingLibraryError: without h5py or zarr (extra ``data``).
+        """
+        write_states(self.states(), path)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Variables q and p (t, coordinate), iterations (t); h, parameters and titles as attributes.
+
+        Raises:
+            MissingLibraryError: without xarray (extra ``data``).
+        """
+        return to_xarray(self.states())
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A line a state, by time: columns for each coordinate x and momentum p_x, and iterations.
+
+        Raises:
+            MissingLibraryError: without pandas (extra ``data``).
+        """
+        return to_dataframe(self.states())
+
+
+def relative_changes(values: Array, sizes: Array) -> Array:
+    """Changes since the first along axis 0, relative to the largest size; NaN where sizes are beyond all numbers."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        scales = np.fmax.reduce(sizes, axis=0)
+        changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+    return np.where(np.isinf(scales), np.nan, changes)
+
+
+def _range(values: Array) -> Html:
+    """From the least to the greatest value, and by how much they differ."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return plain(f"{low:.10g} to {high:.10g}, a difference of {high - low:.2g}")

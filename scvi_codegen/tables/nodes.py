@@ -1,0 +1,397 @@
+"""Nodes on [-1, 1]: where a trial curve of degree s takes its s + 1 coefficients.
+
+Chebyshev points are sines of rational multiples of pi. Legendre-Gauss, Lobatto and Radau points are the roots of Jacobi
+polynomials (Davis & Rabinowitz, *Methods of Numerical Integration*, 2nd ed. 1984, section 2.7), found by Newton's
+method on the three-term recurrence with twenty guard digits: no eigenvalue problem, no monomials.
+"""
+
+from __future__ import annotations
+
+import difflib
+import operator
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, TypeAlias, TypeVar
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
+
+__all__ = [
+    "NODE_FAMILIES",
+    "Expressions",
+    "Nodes",
+    "ascending_points",
+    "chebyshev_gauss",
+    "chebyshev_gauss_points",
+    "chebyshev_lobatto",
+    "chebyshev_lobatto_points",
+    "checked_count",
+    "equispaced",
+    "exact_family_points",
+    "exact_points",
+    "family_named",
+    "is_antisymmetric",
+    "legendre_gauss",
+    "legendre_gauss_points",
+    "legendre_lobatto",
+    "legendre_lobatto_points",
+    "nodes_by_name",
+    "radau_left",
+    "radau_left_points",
+    "radau_right",
+    "radau_right_points",
+    "to_number",
+]
+
+GUARD = 20
+MOST_POINTS = 128
+"""Of a rule or a curve: a second of 60-digit arithmetic, and far beyond what double precision has a use for."""
+
+Expressions: TypeAlias = tuple[Any, ...]
+"""A tuple of SymPy expressions (SymPy is imported only where one is made)."""
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nodes:
+    """Distinct ascending points on [-1, 1] that carry a polynomial of degree ``degree``.
+
+    ``points`` has ``degree + 1`` entries; floats, integers, fractions, decimal strings and SymPy numbers are converted
+    to numbers of 60 digits. Raises ``MethodError`` when they are not ascending, not in [-1, 1], or too few or many.
+    """
+
+    name: str
+    degree: int
+    points: Vector
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "degree", checked_count(self.degree, "the degree", 1))
+        object.__setattr__(self, "points", ascending_points(self.points, "node"))
+        if len(self.points) != self.degree + 1:
+            raise MethodError(
+                f"degree {self.degree} needs {self.degree + 1} nodes, got {len(self.points)}; "
+                f"give {self.degree + 1} points or set degree={len(self.points) - 1}"
+            )
+
+    @property
+    def contains_ends(self) -> bool:
+        """Whether the first node is -1 and the last is 1, exactly."""
+        return bool(self.points[0] == -1 and self.points[-1] == 1)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether x and -x are nodes together, to 50 digits."""
+        return is_antisymmetric(self.points)
+
+
+def to_number(value: Any) -> Number:
+    """Round an int, float, fraction, decimal string, mpmath or SymPy number to 60 digits.
+
+    A float stands for its exact binary value. Raises ``MethodError`` for anything else, infinities and nan.
+    """
+    try:
+        number = mp.mpf(mp.convert(str(value.evalf(DIGITS + GUARD)) if hasattr(value, "evalf") else value))
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise MethodError(f"{value!r} is not a real number; give a number or a constant expression") from error
+    if not mp.isfinite(number):
+        raise MethodError(f"{value!r} is not finite; give a finite number")
+    return number
+
+
+def ascending_points(values: Iterable[Any], what: str) -> Vector:
+    """Return ``values`` as numbers, checked to be strictly ascending and in [-1, 1]; ``what`` names one of them."""
+    points = tuple(map(to_number, values))
+    for index, point in enumerate(points):
+        if abs(point) > 1:
+            raise MethodError(f"{what} {index} is {mp.nstr(point, 8)}, outside [-1, 1]; map the interval to [-1, 1]")
+        if index and point <= points[index - 1]:
+            raise MethodError(
+                f"{what} {index} is {mp.nstr(point, 8)}, not above the one before it; sort them, each once"
+            )
+    return points
+
+
+def is_antisymmetric(points: Vector) -> bool:
+    """Whether reversing the points changes their signs and nothing else, to 50 digits."""
+    tolerance = mp.mpf(10) ** (10 - DIGITS)
+    return all(abs(left + right) <= tolerance for left, right in zip(points, reversed(points), strict=True))
+
+
+def checked_count(value: Any, what: str, least: int, most: int = MOST_POINTS) -> int:
+    """Return ``value`` as an int, or raise ``MethodError`` when it is not one or not between ``least`` and ``most``."""
+    if isinstance(value, bool) or not hasattr(value, "__index__"):
+        raise MethodError(f"{what} must be an integer, got {value!r}; give an integer of at least {least}")
+    count = operator.index(value)
+    if count < least:
+        raise MethodError(f"{what} must be at least {least}, got {count}; give {least} or more")
+    if count > most:
+        raise MethodError(f"{what} must be at most {most}; take fewer, and more steps")
+    return count
+
+
+def family_named(name: str, families: Mapping[str, Item], what: str) -> Item:
+    """Return ``families[name]``, or raise ``MethodError`` with the known names and the closest match."""
+    if name in families:
+        return families[name]
+    close = difflib.get_close_matches(str(name), families, n=1, cutoff=0.4)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    raise MethodError(f"unknown {what} {name!r}: {hint}the known names are {', '.join(families)}")
+
+
+def jacobi_value_and_slope(count: int, alpha: int, beta: int, x: Number) -> tuple[Number, Number]:
+    """Return the Jacobi polynomial of degree ``count >= 1`` and its derivative at ``x`` in (-1, 1).
+
+    Three-term recurrence and derivative formula: Abramowitz & Stegun 22.7.1 and 22.8.1.
+    """
+    both = alpha + beta
+    before, value = mp.one, alpha + 1 + (both + 2) * (x - 1) / 2
+    for k in range(2, count + 1):
+        twice = 2 * k + both
+        middle = (twice - 1) * (twice * (twice - 2) * x + alpha**2 - beta**2) * value
+        last = 2 * (k + alpha - 1) * (k + beta - 1) * twice * before
+        before, value = value, (middle - last) / (2 * k * (k + both) * (twice - 2))
+    twice = 2 * count + both
+    slope = count * (alpha - beta - twice * x) * value + 2 * (count + alpha) * (count + beta) * before
+    return value, slope / (twice * (1 - x * x))
+
+
+def jacobi_root(count: int, alpha: int, beta: int, index: int) -> Number:
+    """Return root ``index`` (0 is the smallest) by Newton's method from an asymptotic guess.
+
+    The guess is cos((2k + alpha - 1/2) pi / (2 count + alpha + beta + 1)), k counted from the largest root: the leading
+    term of Darboux's asymptotic formula, close enough for quadratic convergence at every degree.
+    """
+    x = mp.cospi(mp.mpf(4 * (count - index) + 2 * alpha - 1) / (4 * count + 2 * (alpha + beta + 1)))
+    converged = mp.mpf(10) ** (-mp.dps // 2 - 5)
+    while True:
+        value, slope = jacobi_value_and_slope(count, alpha, beta, x)
+        x -= value / slope
+        if abs(value / slope) < converged:
+            return x
+
+
+@cache
+def jacobi_roots(count: int, alpha: int, beta: int) -> Vector:
+    """Return the ascending roots of the Jacobi polynomial of degree ``count >= 0`` and integer ``alpha, beta >= 0``.
+
+    The guard digits are kept: ``Nodes`` and ``Quadrature`` round, once.
+    """
+    with mp.workdps(DIGITS + GUARD):
+        roots = [jacobi_root(count, alpha, beta, index) for index in range(count)]
+        if alpha == beta:
+            roots = [(root - mirror) / 2 for root, mirror in zip(roots, reversed(roots), strict=True)]
+    return tuple(roots)
+
+
+def reflected(values: Expressions) -> Expressions:
+    """Return exact points mirrored at 0, ascending again."""
+    return tuple(-value for value in reversed(values))
+
+
+def legendre_gauss_points(count: int) -> Vector:
+    """Return the ``count`` roots of the Legendre polynomial P_count."""
+    return jacobi_roots(count, 0, 0)
+
+
+def legendre_lobatto_points(count: int) -> Vector:
+    """Return -1, the roots of P'_{count-1} (Jacobi, alpha = beta = 1) and 1; ``count >= 2``."""
+    return (-mp.one, *jacobi_roots(count - 2, 1, 1), mp.one)
+
+
+def radau_left_points(count: int) -> Vector:
+    """Return the roots of P_{count-1} + P_count: -1 and the Jacobi roots for alpha = 0, beta = 1."""
+    return (-mp.one, *jacobi_roots(count - 1, 0, 1))
+
+
+def radau_right_points(count: int) -> Vector:
+    """Return the roots of P_{count-1} - P_count: the Jacobi roots for alpha = 1, beta = 0, and 1."""
+    return (*jacobi_roots(count - 1, 1, 0), mp.one)
+
+
+def sines(numerators: Iterable[int], denominator: int) -> Vector:
+    """Return sin(k pi / denominator) for each numerator k; odd in k to the last bit."""
+    with mp.workdps(DIGITS + GUARD):
+        return tuple(mp.sinpi(mp.mpf(k) / denominator) for k in numerators)
+
+
+def chebyshev_lobatto_points(count: int) -> Vector:
+    """Return -cos(j pi / N), j = 0..N = count - 1, written as sin((2j - N) pi / 2N)."""
+    return sines(range(1 - count, count, 2), 2 * (count - 1))
+
+
+def chebyshev_gauss_points(count: int) -> Vector:
+    """Return the roots of the Chebyshev polynomial T_count: -cos((2j + 1) pi / (2 count))."""
+    return sines(range(1 - count, count, 2), 2 * count)
+
+
+def equispaced_points(count: int) -> Vector:
+    """Return ``count >= 2`` points from -1 to 1 with equal gaps."""
+    return tuple(mp.mpf(j) / (count - 1) for j in range(1 - count, count, 2))
+
+
+def nodes_of(name: str, degree: int, points: Callable[[int], Vector]) -> Nodes:
+    """Return the family member of this degree, after checking the degree."""
+    return Nodes(name=name, degree=degree, points=points(checked_count(degree, "the degree", 1) + 1))
+
+
+@lru_cache(maxsize=None, typed=True)
+def chebyshev_lobatto(degree: int) -> Nodes:
+    """Return the Chebyshev-Gauss-Lobatto nodes -cos(j pi / degree), both ends among them.
+
+    >>> [float(x) for x in chebyshev_lobatto(2).points]
+    [-1.0, 0.0, 1.0]
+    """
+    return nodes_of("chebyshev-lobatto", degree, chebyshev_lobatto_points)
+
+
+@lru_cache(maxsize=None, typed=True)
+def legendre_lobatto(degree: int) -> Nodes:
+    """Return -1, 1 and the extrema of the Legendre polynomial of this degree."""
+    return nodes_of("legendre-lobatto", degree, legendre_lobatto_points)
+
+
+@lru_cache(maxsize=None, typed=True)
+def equispaced(degree: int) -> Nodes:
+    """Return nodes with equal gaps, both ends among them; interpolation on them is unstable beyond degree 10 or so."""
+    return nodes_of("equispaced", degree, equispaced_points)
+
+
+@lru_cache(maxsize=None, typed=True)
+def legendre_gauss(degree: int) -> Nodes:
+    """Return the degree + 1 roots of the Legendre polynomial P_{degree+1}: no end among them."""
+    return nodes_of("legendre-gauss", degree, legendre_gauss_points)
+
+
+@lru_cache(maxsize=None, typed=True)
+def chebyshev_gauss(degree: int) -> Nodes:
+    """Return the degree + 1 roots of the Chebyshev polynomial T_{degree+1}: no end among them."""
+    return nodes_of("chebyshev-gauss", degree, chebyshev_gauss_points)
+
+
+@lru_cache(maxsize=None, typed=True)
+def radau_left(degree: int) -> Nodes:
+    """Return the degree + 1 left Radau points: -1 among them, 1 not."""
+    return nodes_of("radau-left", degree, radau_left_points)
+
+
+@lru_cache(maxsize=None, typed=True)
+def radau_right(degree: int) -> Nodes:
+    """Return the degree + 1 right Radau points: 1 among them, -1 not."""
+    return nodes_of("radau-right", degree, radau_right_points)
+
+
+NODE_FAMILIES: Mapping[str, Callable[[int], Nodes]] = {
+    "chebyshev-lobatto": chebyshev_lobatto,
+    "legendre-lobatto": legendre_lobatto,
+    "equispaced": equispaced,
+    "legendre-gauss": legendre_gauss,
+    "chebyshev-gauss": chebyshev_gauss,
+    "radau-left": radau_left,
+    "radau-right": radau_right,
+}
+
+
+def nodes_by_name(name: str, degree: int) -> Nodes:
+    """Return the nodes of the named family; ``MethodError`` lists the names when there is no such family."""
+    return family_named(name, NODE_FAMILIES, "node family")(degree)
+
+
+def exact_points(nodes: Nodes) -> Expressions | None:
+    """Return the nodes as SymPy rationals and radicals, or None where no short closed form is known.
+
+    Closed forms: equispaced always; Chebyshev whenever SymPy knows the cosines as radicals (Lobatto degree 1 to 6, 8,
+    10, 12, ...); Legendre-Lobatto up to degree 5; Legendre-Gauss up to degree 4; Radau up to degree 2. Nodes that a
+    user made carry no closed form, whatever their name.
+    """
+    family = NODE_FAMILIES.get(nodes.name)
+    if family is None or family(nodes.degree) != nodes:
+        return None
+    return exact_family_points(nodes.name, nodes.degree + 1)
+
+
+def exact_family_points(name: str, count: int) -> Expressions | None:
+    """Return the ``count`` ascending points of the node family as SymPy radicals, or None (see ``exact_points``)."""
+    exact: Mapping[str, Callable[[int], Expressions | None]] = {
+        "chebyshev-lobatto": lambda n: exact_sines(range(1 - n, n, 2), 2 * (n - 1)),
+        "legendre-lobatto": exact_lobatto,
+        "equispaced": exact_equispaced,
+        "legendre-gauss": exact_gauss,
+        "chebyshev-gauss": lambda n: exact_sines(range(1 - n, n, 2), 2 * n),
+        "radau-left": exact_radau_left,
+        "radau-right": exact_radau_right,
+    }
+    return family_named(name, exact, "node family")(count)
+
+
+def exact_sines(numerators: Iterable[int], denominator: int) -> Expressions | None:
+    """Return sin(k pi / denominator) as radicals, or None when SymPy keeps a sine or cosine."""
+    import sympy as sp
+
+    values = tuple(sp.sin(sp.Rational(k, denominator) * sp.pi) for k in numerators)
+    return None if any(value.has(sp.sin, sp.cos) for value in values) else values
+
+
+def exact_equispaced(count: int) -> Expressions:
+    """Return the rationals (2j - N) / N, N = count - 1."""
+    import sympy as sp
+
+    return tuple(sp.Rational(j, count - 1) for j in range(1 - count, count, 2))
+
+
+def mirrored(positive: Expressions | None, count: int) -> Expressions | None:
+    """Return the symmetric points of which ``positive`` are the positive ones, ascending."""
+    if positive is None:
+        return None
+    import sympy as sp
+
+    return (*reflected(positive), *([sp.Integer(0)] if count % 2 else []), *positive)
+
+
+def exact_gauss(count: int) -> Expressions | None:
+    """Return the Legendre-Gauss points for count <= 5 (Abramowitz & Stegun, table 25.4, in radicals)."""
+    from sympy import Rational, sqrt
+
+    four, five = 2 * sqrt(30) / 35, 2 * sqrt(70) / 63
+    positive: dict[int, Expressions] = {
+        1: (),
+        2: (sqrt(3) / 3,),
+        3: (sqrt(15) / 5,),
+        4: (sqrt(Rational(3, 7) - four), sqrt(Rational(3, 7) + four)),
+        5: (sqrt(Rational(5, 9) - five), sqrt(Rational(5, 9) + five)),
+    }
+    return mirrored(positive.get(count), count)
+
+
+def exact_lobatto(count: int) -> Expressions | None:
+    """Return the Legendre-Lobatto points for count <= 6 (Abramowitz & Stegun, table 25.6, in radicals)."""
+    from sympy import Integer, Rational, sqrt
+
+    six = 2 * sqrt(7) / 21
+    inside: dict[int, Expressions] = {
+        2: (),
+        3: (),
+        4: (sqrt(5) / 5,),
+        5: (sqrt(21) / 7,),
+        6: (sqrt(Rational(1, 3) - six), sqrt(Rational(1, 3) + six)),
+    }
+    return mirrored((*inside[count], Integer(1)) if count in inside else None, count)
+
+
+def exact_radau_left(count: int) -> Expressions | None:
+    """Return the left Radau points for count <= 3, in radicals."""
+    from sympy import Integer, Rational, sqrt
+
+    inside: dict[int, Expressions] = {
+        1: (),
+        2: (Rational(1, 3),),
+        3: ((1 - sqrt(6)) / 5, (1 + sqrt(6)) / 5),
+    }
+    return (Integer(-1), *inside[count]) if count in inside else None
+
+
+def exact_radau_right(count: int) -> Expressions | None:
+    """Return the right Radau points for count <= 3, in radicals."""
+    left = exact_radau_left(count)
+    return None if left is None else tuple(value.expand() for value in reflected(left))

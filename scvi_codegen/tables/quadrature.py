@@ -1,0 +1,418 @@
+"""Quadrature rules on [-1, 1]: Gauss-Legendre, Lobatto, Radau, Clenshaw-Curtis and Fejer, to 60 digits.
+
+A rule of order p integrates polynomials of degree below p exactly. References: Davis & Rabinowitz, *Methods of
+Numerical Integration*, 2nd ed. 1984; Golub & Welsch, Math. Comp. 23 (1969) 221; Waldvogel, BIT 46 (2006) 195;
+Trefethen, SIAM Review 50 (2008) 67.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, TypeVar
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.nodes import (
+    Expressions,
+    ascending_points,
+    chebyshev_gauss_points,
+    chebyshev_lobatto_points,
+    checked_count,
+    exact_family_points,
+    family_named,
+    is_antisymmetric,
+    legendre_gauss_points,
+    legendre_lobatto_points,
+    radau_left_points,
+    radau_right_points,
+    to_number,
+)
+from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
+
+__all__ = [
+    "QUADRATURE_FAMILIES",
+    "Quadrature",
+    "clenshaw_curtis",
+    "exact_rule",
+    "fejer",
+    "gauss_legendre",
+    "gauss_lobatto",
+    "gauss_radau",
+    "hermite",
+    "is_made_by",
+    "quadrature_by_name",
+    "split_name",
+]
+
+GUARD = 20
+COMPUTED_TOLERANCE = mp.mpf("1e-12")
+CLAIMED_TOLERANCE = mp.mpf("1e-8")
+MOST_ORDER = 10**6
+MOST_CONDITIONS = 64
+"""Of a rule with derivatives, whose weights solve as many equations."""
+MOST_DIGITS = 9
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quadrature:
+    """A rule sum_n w_n f(x_n) for the integral of f over [-1, 1], or with derivatives sum_n sum_k w_kn f^(k)(x_n).
+
+    ``points`` are ascending in [-1, 1], ``weights`` as many, of any sign, with sum 2; floats, integers, fractions,
+    decimal strings and SymPy numbers are converted to 60 digits. ``derivative_weights`` has one row for f', one for f''
+    and so on. ``order`` is the p such that polynomials of degree below p are integrated exactly; left out (or 0) it is
+    computed from the Legendre moments, which must then vanish to 12 digits; given, it is checked to 8 digits. Raises
+    ``MethodError`` when any of this fails.
+    """
+
+    name: str
+    points: Vector
+    weights: Vector
+    derivative_weights: Matrix = ()
+    order: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", ascending_points(self.points, "quadrature point"))
+        object.__setattr__(self, "weights", tuple(map(to_number, self.weights)))
+        object.__setattr__(
+            self, "derivative_weights", tuple(tuple(map(to_number, line)) for line in self.derivative_weights)
+        )
+        for weights in (self.weights, *self.derivative_weights):
+            if len(self.points) != len(weights) or not self.points:
+                raise MethodError(
+                    f"quadrature {self.name!r} has {len(self.points)} points and {len(weights)} weights; "
+                    "give one weight for each point, and at least one point"
+                )
+        claimed = checked_count(self.order, "the order of a quadrature", 0, MOST_ORDER)
+        tolerance = CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE
+        found = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
+        if found == 0:
+            total = mp.nstr(mp.fsum(self.weights), 15)
+            raise MethodError(f"the weights of quadrature {self.name!r} have sum {total}; scale them to sum 2")
+        if found < claimed:
+            raise MethodError(
+                f"quadrature {self.name!r} has order {found}, not {claimed}: "
+                f"the Legendre moment of degree {found} does not vanish; correct the numbers or leave order out"
+            )
+        object.__setattr__(self, "order", claimed or found)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether points and weights are symmetric about 0, to 50 digits."""
+        tolerance = mp.mpf(10) ** (10 - DIGITS)
+        pairs = [
+            (left, (-1) ** k * right)
+            for k, weights in enumerate((self.weights, *self.derivative_weights))
+            for left, right in zip(weights, reversed(weights), strict=True)
+        ]
+        return is_antisymmetric(self.points) and all(abs(left - right) <= tolerance for left, right in pairs)
+
+    @property
+    def conditions(self) -> int:
+        """The number of values that the rule uses: points, times 1 and the derivatives."""
+        return len(self.points) * (1 + len(self.derivative_weights))
+
+    @property
+    def abscissae(self) -> Vector:
+        """The points mapped to [0, 1]: c = (x + 1) / 2."""
+        return tuple((1 + point) / 2 for point in self.points)
+
+    @property
+    def unit_weights(self) -> Vector:
+        """The weights for [0, 1], with sum 1: b = w / 2."""
+        return tuple(weight / 2 for weight in self.weights)
+
+    @property
+    def unit_derivative_weights(self) -> Matrix:
+        """The same of the derivatives by c in [0, 1]: the k-th divided by 2^(k+1)."""
+        return tuple(tuple(w / 2 ** (k + 1) for w in line) for k, line in enumerate(self.derivative_weights, 1))
+
+
+def moment_order(points: Vector, weights: Matrix, tolerance: Number) -> int:
+    """Return the first degree whose Legendre polynomial is not integrated to ``tolerance``, at most 2 n a derivative.
+
+    Legendre polynomials are the well-conditioned test: for a Gauss rule the moment of degree 2n is of size 1, while
+    that of x^(2n) is below 4^-n.
+    """
+    most = 2 * len(points) * len(weights)
+    none: Matrix = ((mp.zero,) * len(points),) * len(weights)
+    before, values = none, ((mp.one,) * len(points), *none[1:])
+    for degree in range(most):
+        moment = mp.fsum(mp.fdot(w, f) for w, f in zip(weights, values, strict=True))
+        if abs(moment - (2 if degree == 0 else 0)) > tolerance:
+            return degree
+        before, values = values, next_legendre(degree, points, values, before)
+    return most
+
+
+def next_legendre(degree: int, points: Vector, values: Matrix, before: Matrix) -> Matrix:
+    """Return P_(degree + 1) and its derivatives at the points, one row a derivative, from those of the two below."""
+    lines = []
+    for k, (line, last) in enumerate(zip(values, before, strict=True)):
+        lower = values[k - 1] if k else line
+        terms = zip(points, line, lower, last, strict=True)
+        lines.append(
+            tuple(((2 * degree + 1) * (x * f + k * slope) - degree * old) / (degree + 1) for x, f, slope, old in terms)
+        )
+    return tuple(lines)
+
+
+def legendre_value(degree: int, x: Number) -> Number:
+    """Return P_degree(x) by the three-term recurrence (Abramowitz & Stegun 22.7.10)."""
+    before, value = mp.zero, mp.one
+    for k in range(degree):
+        before, value = value, ((2 * k + 1) * x * value - k * before) / (k + 1)
+    return value
+
+
+def gauss_type(name: str, points: Vector, order: int, weight: Callable[[Number, Number], Number]) -> Quadrature:
+    """Return the rule on ``points`` whose weights are a formula of x and P_{n-1}(x)^2, evaluated with guard digits."""
+    with mp.workdps(DIGITS + GUARD):
+        weights = [weight(x, legendre_value(len(points) - 1, x) ** 2) for x in points]
+    return Quadrature(name=f"{name}:{len(points)}", points=points, weights=tuple(weights), order=order)
+
+
+@lru_cache(maxsize=None, typed=True)
+def gauss_legendre(n: int) -> Quadrature:
+    """Return the n-point Gauss-Legendre rule, of order 2n.
+
+    Points: the roots of P_n. Weights: 2 (1 - x^2) / (n P_{n-1}(x))^2, which is 2 / ((1 - x^2) P_n'(x)^2)
+    (Davis & Rabinowitz, section 2.7; the classical alternative is the eigenproblem of Golub & Welsch 1969).
+
+    >>> rule = gauss_legendre(2)
+    >>> rule.name, rule.order, [float(w) for w in rule.weights]
+    ('gauss-legendre:2', 4, [1.0, 1.0])
+    """
+    n = checked_count(n, "the number of Gauss-Legendre points", 1)
+    return gauss_type("gauss-legendre", legendre_gauss_points(n), 2 * n, lambda x, P2: 2 * (1 - x * x) / (n * n * P2))
+
+
+@lru_cache(maxsize=None, typed=True)
+def gauss_lobatto(n: int) -> Quadrature:
+    """Return the n-point Gauss-Lobatto rule (both ends are points, n >= 2), of order 2n - 2.
+
+    Points: -1, 1 and the roots of P'_{n-1}. Weights: 2 / (n (n - 1) P_{n-1}(x)^2) (Davis & Rabinowitz, section 2.7).
+    """
+    n = checked_count(n, "the number of Gauss-Lobatto points", 2)
+    return gauss_type("gauss-lobatto", legendre_lobatto_points(n), 2 * n - 2, lambda x, P2: 2 / (n * (n - 1) * P2))
+
+
+@lru_cache(maxsize=None, typed=True)
+def gauss_radau(n: int, side: Literal["left", "right"] = "left") -> Quadrature:
+    """Return the n-point Gauss-Radau rule with a point at -1 (``"left"``) or at 1 (``"right"``), of order 2n - 1.
+
+    Points on the left: the roots of P_{n-1} + P_n. Weights: (1 - x) / (n P_{n-1}(x))^2, for the right side (1 + x)
+    (Davis & Rabinowitz, section 2.7).
+    """
+    n = checked_count(n, "the number of Gauss-Radau points", 1)
+    if side not in ("left", "right"):
+        raise MethodError(f"the side of a Gauss-Radau rule is 'left' or 'right', got {side!r}; choose one of them")
+    points, sign = (radau_left_points(n), -1) if side == "left" else (radau_right_points(n), 1)
+    return gauss_type(f"gauss-radau-{side}", points, 2 * n - 1, lambda x, P2: (1 + sign * x) / (n * n * P2))
+
+
+def cosine_sum(angle: Any, cosine: Callable[[Any], Any], count: int, last: int) -> Any:
+    """Return 1 - sum_{k=1}^{count//2} b_k cos(2 k angle) / (4k^2 - 1), where b_k is 1 for 2 k = ``last``, else 2.
+
+    Exact or numerical, as ``angle`` and ``cosine`` are: both Chebyshev rules, and both their forms, are this sum.
+    """
+    terms = ((1 if 2 * k == last else 2) * cosine(2 * k * angle) / (4 * k * k - 1) for k in range(1, count // 2 + 1))
+    return cosine(0) - sum(terms)
+
+
+def clenshaw_curtis_weights(n: int, pi: Any, cosine: Callable[[Any], Any]) -> tuple[Any, ...]:
+    """Return the Clenshaw-Curtis weights in the arithmetic of ``pi`` and ``cosine``."""
+    N = n - 1
+    sums = [cosine_sum(j * pi / N, cosine, N, N) for j in range(n)]
+    return tuple((1 if j in (0, N) else 2) * value / N for j, value in enumerate(sums))
+
+
+def fejer_weights(n: int, pi: Any, cosine: Callable[[Any], Any]) -> tuple[Any, ...]:
+    """Return the weights of Fejer's first rule in the arithmetic of ``pi`` and ``cosine``."""
+    return tuple(2 * cosine_sum((2 * j + 1) * pi / (2 * n), cosine, n, 0) / n for j in range(n))
+
+
+@lru_cache(maxsize=None, typed=True)
+def clenshaw_curtis(n: int) -> Quadrature:
+    """Return the n-point Clenshaw-Curtis rule (n >= 2) on -cos(j pi / N), N = n - 1; of order n, or n + 1 for odd n.
+
+    Weights: (c_j / N) (1 - sum_{k=1}^{N//2} b_k cos(2 j k pi / N) / (4k^2 - 1)) with c_j = 1 at the ends, else 2, and
+    b_k = 1 for 2k = N, else 2 (Waldvogel 2006; Trefethen 2008).
+    """
+    n = checked_count(n, "the number of Clenshaw-Curtis points", 2)
+    with mp.workdps(DIGITS + GUARD):
+        weights = symmetrised(clenshaw_curtis_weights(n, +mp.pi, mp.cos))
+    points = chebyshev_lobatto_points(n)
+    return Quadrature(name=f"clenshaw-curtis:{n}", points=points, weights=weights, order=n + n % 2)
+
+
+@lru_cache(maxsize=None, typed=True)
+def fejer(n: int) -> Quadrature:
+    """Return Fejer's first rule with n points -cos((2j + 1) pi / 2n); of order n, or n + 1 for odd n.
+
+    Weights: (2 / n) (1 - 2 sum_{k=1}^{n//2} cos((2j + 1) k pi / n) / (4k^2 - 1)) (Waldvogel 2006).
+    """
+    n = checked_count(n, "the number of Fejer points", 1)
+    with mp.workdps(DIGITS + GUARD):
+        weights = symmetrised(fejer_weights(n, +mp.pi, mp.cos))
+    return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
+
+
+@lru_cache(maxsize=None, typed=True)
+def hermite(n: int, derivatives: int = 1) -> Quadrature:
+    """Return the rule that integrates the Hermite interpolant of f and its derivatives at n Lobatto points.
+
+    Order n (1 + derivatives), one more where that is odd. Two points with f' is the corrected trapezoidal rule of order
+    4, f(-1) + f(1) + (f'(-1) - f'(1)) / 3 (Davis & Rabinowitz, section 2.8).
+
+    >>> rule = hermite(2)
+    >>> rule.name, rule.order, [float(w) for w in rule.derivative_weights[0]]
+    ('hermite:2', 4, [0.3333333333333333, -0.3333333333333333])
+    """
+    n = checked_count(n, "the number of Hermite points", 2)
+    kinds = 1 + checked_count(derivatives, "the number of derivatives of a Hermite rule", 1)
+    count = checked_count(n * kinds, "the number of values and derivatives of a Hermite rule", 4, MOST_CONDITIONS)
+    points = legendre_lobatto_points(n)
+    with mp.workdps(DIGITS + GUARD + 2 * count):
+        rows = mp.matrix(
+            [[mp.ff(j, k) * x ** max(j - k, 0) for k in range(kinds) for x in points] for j in range(count)]
+        )
+        moments = mp.matrix([(1 - (-1) ** (j + 1)) / mp.mpf(j + 1) for j in range(count)])
+        solved = list(mp.lu_solve(rows, moments))
+    lines = [tuple(+w for w in solved[k * n : (k + 1) * n]) for k in range(kinds)]
+    name = f"hermite:{n}" if kinds == 2 else f"hermite-{derivatives}:{n}"
+    return Quadrature(name=name, points=points, weights=lines[0], derivative_weights=tuple(lines[1:]))
+
+
+def symmetrised(weights: Vector) -> Vector:
+    """Return the mean of the weights and their mirror image: symmetric to the last bit."""
+    return tuple((left + right) / 2 for left, right in zip(weights, reversed(weights), strict=True))
+
+
+QUADRATURE_FAMILIES: Mapping[str, Callable[[int], Quadrature]] = {
+    "gauss-legendre": gauss_legendre,
+    "gauss-lobatto": gauss_lobatto,
+    "gauss-radau-left": lambda n: gauss_radau(n, "left"),
+    "gauss-radau-right": lambda n: gauss_radau(n, "right"),
+    "clenshaw-curtis": clenshaw_curtis,
+    "fejer": fejer,
+    "hermite": hermite,
+    "hermite-2": lambda n: hermite(n, 2),
+    "hermite-3": lambda n: hermite(n, 3),
+}
+
+
+def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item, int]:
+    """Read ``"family:count"`` and return the family and the count; ``MethodError`` says what is wrong with either."""
+    family, _, count = str(name).partition(":")
+    found = family_named(family, families, what)
+    if not (count.isascii() and count.isdigit() and len(count) <= MOST_DIGITS):
+        raise MethodError(f"{what} {name!r} lacks its number of points; write {family!r} as '{family}:3', say")
+    return found, int(count)
+
+
+def is_made_by(by_name: Callable[[str], Item], name: str, item: Item) -> bool:
+    """Whether ``item`` is what its name stands for, not something a user made under that name."""
+    try:
+        return by_name(name) == item
+    except MethodError:
+        return False
+
+
+def quadrature_by_name(name: str) -> Quadrature:
+    """Return the rule of a name such as ``"gauss-legendre:8"``; every rule's ``name`` reads back to itself.
+
+    Raises ``MethodError`` for an unknown family (with the known ones and the closest) or a missing or too small count.
+    """
+    family, count = split_name(name, QUADRATURE_FAMILIES, "quadrature")
+    return family(count)
+
+
+POINT_FAMILIES: Mapping[str, str] = {
+    "gauss-legendre": "legendre-gauss",
+    "gauss-lobatto": "legendre-lobatto",
+    "gauss-radau-left": "radau-left",
+    "gauss-radau-right": "radau-right",
+    "clenshaw-curtis": "chebyshev-lobatto",
+    "fejer": "chebyshev-gauss",
+}
+
+
+def exact_rule(quadrature: Quadrature) -> tuple[Expressions, Expressions] | None:
+    """Return (points, weights) as SymPy rationals and radicals, or None where no short closed form is known.
+
+    Closed forms: Gauss-Legendre n <= 5, Lobatto n <= 6, Radau n <= 3; Clenshaw-Curtis and Fejer wherever SymPy knows
+    the cosines as radicals. A rule that a user made carries no closed form, whatever its name.
+    """
+    family, count = quadrature.name.partition(":")[0], len(quadrature)
+    if family not in POINT_FAMILIES:
+        return None
+    if quadrature.name != f"{family}:{count}" or not is_made_by(quadrature_by_name, quadrature.name, quadrature):
+        return None
+    points = exact_family_points(POINT_FAMILIES[family], count)
+    return None if points is None else (points, exact_weights(family, count))
+
+
+def exact_weights(family: str, count: int) -> Expressions:
+    """Return the weights of a rule whose points have a closed form, in radicals."""
+    import sympy as sp
+
+    if family in ("clenshaw-curtis", "fejer"):
+        weights = clenshaw_curtis_weights if family == "clenshaw-curtis" else fejer_weights
+        return tuple(sp.expand(weight) for weight in weights(count, sp.pi, sp.cos))
+    if family == "gauss-radau-right":
+        return tuple(reversed(exact_weights("gauss-radau-left", count)))
+    if family == "gauss-radau-left":
+        return exact_radau_weights()[count - 1]
+    table = exact_gauss_weights() if family == "gauss-legendre" else exact_lobatto_weights()
+    half = table[count]
+    return (*half, *reversed(half[: count // 2]))
+
+
+def rationals(*values: tuple[int, int]) -> Expressions:
+    """Return SymPy rationals from numerators and denominators."""
+    import sympy as sp
+
+    return tuple(sp.Rational(*value) for value in values)
+
+
+def exact_gauss_weights() -> Mapping[int, Expressions]:
+    """Return the Gauss-Legendre weights up to the middle, by number of points (Davis & Rabinowitz, section 2.7)."""
+    from sympy import sqrt
+
+    return {
+        1: rationals((2, 1)),
+        2: rationals((1, 1)),
+        3: rationals((5, 9), (8, 9)),
+        4: ((18 - sqrt(30)) / 36, (18 + sqrt(30)) / 36),
+        5: ((322 - 13 * sqrt(70)) / 900, (322 + 13 * sqrt(70)) / 900, *rationals((128, 225))),
+    }
+
+
+def exact_lobatto_weights() -> Mapping[int, Expressions]:
+    """Return the Lobatto weights up to the middle, by number of points (Davis & Rabinowitz, section 2.7)."""
+    from sympy import sqrt
+
+    return {
+        2: rationals((1, 1)),
+        3: rationals((1, 3), (4, 3)),
+        4: rationals((1, 6), (5, 6)),
+        5: rationals((1, 10), (49, 90), (32, 45)),
+        6: (*rationals((1, 15)), (14 - sqrt(7)) / 30, (14 + sqrt(7)) / 30),
+    }
+
+
+def exact_radau_weights() -> tuple[Expressions, ...]:
+    """Return the weights of the left Radau rules with 1, 2 and 3 points."""
+    from sympy import sqrt
+
+    return (
+        rationals((2, 1)),
+        rationals((1, 2), (3, 2)),
+        (*rationals((2, 9)), (16 + sqrt(6)) / 18, (16 - sqrt(6)) / 18),
+    )

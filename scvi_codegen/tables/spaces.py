@@ -1,0 +1,363 @@
+"""Spaces of trial curves (paper, 4.2.3): polynomials, trigonometric polynomials, splines with a continuous slope.
+
+A space of degree s is given by the velocities of its curves, on [0, 1]: s functions with cardinal combinations l_b on s
+points, l_b(point_a) = 1 if a = b else 0. A curve is q(c) = q0 + h sum_b V_b int_0^c l_b, its velocity sum_b V_b l_b(c).
+A method needs tables of the l_b, of their integrals, and for quadratures with derivatives of their slopes; no more.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, differentiation_matrix, matrix_product
+from scvi_codegen.tables.nodes import to_number
+from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre
+
+__all__ = ["CurveSpace", "Polynomials", "Splines", "Trigonometric", "space_by_name"]
+
+MOST_POINTS = 64
+BETTER = 4
+"""By how many points the rule is better that tells whether one is good enough."""
+GUARD_DIGITS = 200
+"""Trigonometric functions of a small frequency are nearly polynomials: their cardinal combinations cancel."""
+
+
+class CurveSpace(ABC):
+    """A family of spaces, one for each degree."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What :func:`space_by_name` reads back."""
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether a curve run backward is one of the space."""
+        return True
+
+    @abstractmethod
+    def dimension(self, degree: int) -> int:
+        """The number s of velocities that give a curve."""
+
+    @abstractmethod
+    def points(self, degree: int, rule: Quadrature) -> Vector:
+        """(s,) where the velocities are those of the curve."""
+
+    def default_rule(self, degree: int) -> Quadrature:
+        """The rule to take where none is given: as many Gauss points as the degree."""
+        return gauss_legendre(degree)
+
+    def along(self, rule: Quadrature) -> Quadrature:
+        """The rule along the step: the one given, unless the step has pieces."""
+        return rule
+
+    @abstractmethod
+    def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
+        """(len(at), s) values of the l_b, or of a derivative by c."""
+
+    @abstractmethod
+    def positions(self, points: Vector, at: Vector) -> Matrix:
+        """(len(at), s) integrals of the l_b from 0."""
+
+    @abstractmethod
+    def order(self, degree: int) -> int | None:
+        """Order of an SVI with a good enough quadrature, or ``None`` where none is claimed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Polynomials(CurveSpace):
+    """Polynomials of the degree: the paper's spectral variational integrators."""
+
+    @property
+    def name(self) -> str:
+        """``polynomials``."""
+        return "polynomials"
+
+    def dimension(self, degree: int) -> int:
+        """The degree."""
+        return degree
+
+    def points(self, degree: int, rule: Quadrature) -> Vector:
+        """The quadrature points if there are as many, else Gauss's."""
+        plain = len(rule) == degree and not rule.derivative_weights
+        return rule.abscissae if plain else gauss_legendre(degree).abscissae
+
+    def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
+        """See :meth:`CurveSpace.velocities`."""
+        values = cardinal_values(points, at)
+        for _ in range(derivative):
+            values = matrix_product(values, differentiation_matrix(points))
+        return values
+
+    def positions(self, points: Vector, at: Vector) -> Matrix:
+        """See :meth:`CurveSpace.positions`."""
+        return cardinal_integrals(points, at, 0)
+
+    def order(self, degree: int) -> int | None:
+        """Twice the degree."""
+        return 2 * degree
+
+
+@dataclass(frozen=True, slots=True)
+class Trigonometric(CurveSpace):
+    """1, cos(k f c), sin(k f c) for k = 1 .. K, and powers of c for what is left of the degree: s = 2 K + powers.
+
+    An even degree with all its harmonics leaves no power: straight lines are then not among the curves, and for a fixed
+    f the method does not converge as h goes to 0. Let f shrink with the step, or take an odd degree or fewer harmonics.
+
+    With the frequency f of an oscillator times the step the method is exact on the oscillator, whatever the step, as
+    soon as the quadrature is: by default it has enough Gauss points. Vanden Berghe et al., J. Comput. Appl. Math. 125
+    (2000) 107, survey such methods.
+
+    Args:
+        frequency: f > 0, in radians a step.
+        harmonics: K; by default as many as fit the degree.
+    """
+
+    frequency: float
+    harmonics: int | None = None
+
+    def __post_init__(self) -> None:
+        frequency = float(to_number(self.frequency))
+        if not frequency > 0.0:
+            raise MethodError(f"the frequency of trigonometric curves is positive, in radians a step, not {frequency}")
+        if self.harmonics is not None and (isinstance(self.harmonics, bool) or self.harmonics < 1):
+            raise MethodError(f"trigonometric curves have at least one harmonic, not {self.harmonics}")
+        object.__setattr__(self, "frequency", frequency)
+
+    @property
+    def name(self) -> str:
+        """``trigonometric:<frequency>[:<harmonics>]``."""
+        tail = "" if self.harmonics is None else f":{self.harmonics}"
+        return f"trigonometric:{self.frequency!r}{tail}"
+
+    def dimension(self, degree: int) -> int:
+        """The degree."""
+        return degree
+
+    def points(self, degree: int, rule: Quadrature) -> Vector:
+        """Gauss points."""
+        self._count(degree)
+        return gauss_legendre(degree).abscissae
+
+    def default_rule(self, degree: int) -> Quadrature:
+        """So many Gauss points that products of two curves are integrated to round-off."""
+        count = self._count(degree)
+        powers = 2 * (degree - 2 * count)
+
+        def product(x: Number) -> Number:
+            """The steepest of the products; the point 1 makes it uneven."""
+            return (1 + x) ** powers * mp.cos(count * mp.mpf(self.frequency) * (1 + x))
+
+        sums: list[Number] = []
+        enough = count * self.frequency < MOST_POINTS
+        for n in range(degree + 1, MOST_POINTS + 1) if enough else ():
+            rule = gauss_legendre(n)
+            sums.append(mp.fdot(rule.weights, map(product, rule.points)))
+            if len(sums) > BETTER and abs(sums[-1 - BETTER] - sums[-1]) < mp.ldexp(1, powers - 56):
+                return gauss_legendre(n - BETTER)
+        raise MethodError(f"{self.name} turns too often in a step for {MOST_POINTS} points: take a smaller step")
+
+    def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
+        """See :meth:`CurveSpace.velocities`."""
+        return self._cardinal(points, at, derivative)
+
+    def positions(self, points: Vector, at: Vector) -> Matrix:
+        """See :meth:`CurveSpace.positions`."""
+        start = self._cardinal(points, (mp.zero,), -1)[0]
+        return tuple(tuple(x - y for x, y in zip(line, start, strict=True)) for line in self._cardinal(points, at, -1))
+
+    def order(self, degree: int) -> int | None:
+        """None is claimed for a fixed frequency a step; 2 degree where it shrinks with the step."""
+        return None
+
+    def _count(self, degree: int) -> int:
+        harmonics = degree // 2 if self.harmonics is None else self.harmonics
+        if not 2 <= 2 * harmonics <= degree:
+            raise MethodError(
+                f"trigonometric curves of degree {degree} have {degree // 2} harmonics at most, not {harmonics}; "
+                "one harmonic takes degree 2"
+            )
+        return harmonics
+
+    def _cardinal(self, points: Vector, at: Vector, derivative: int) -> Matrix:
+        """Combinations that are cardinal on the points: functions there times their inverse at the points."""
+        degree = len(points)
+        with mp.workdps(DIGITS + GUARD_DIGITS):
+            own = mp.matrix([self._functions(degree, c, 0) for c in points])
+            try:
+                solved = mp.matrix([self._functions(degree, c, derivative) for c in at]) * mp.inverse(own)
+            except ZeroDivisionError:
+                raise MethodError(
+                    f"{self.name} of degree {degree} is not determined by {degree} velocities: the curves turn too "
+                    "often in a step; take a smaller step"
+                ) from None
+        return tuple(tuple(+solved[i, j] for j in range(degree)) for i in range(len(at)))
+
+    def _functions(self, degree: int, c: Number, derivative: int) -> list[Number]:
+        """The s velocity functions, centred; ``derivative`` -1 for an integral of each."""
+        count, x = self._count(degree), c - mp.mpf(1) / 2
+        values = [_power_derivative(x, j, derivative) for j in range(degree - 2 * count)]
+        for k in range(1, count + 1):
+            f, turn = k * mp.mpf(self.frequency), derivative * mp.pi / 2
+            values += [f**derivative * mp.cos(f * x + turn), f**derivative * mp.sin(f * x + turn)]
+        return values
+
+
+def _power_derivative(x: Number, j: int, derivative: int) -> Number:
+    """The derivative of x^j, or its integral for -1."""
+    if derivative == -1:
+        return x ** (j + 1) / (j + 1)
+    return mp.ff(j, derivative) * x ** (j - derivative) if derivative <= j else mp.zero
+
+
+@dataclass(frozen=True, slots=True)
+class Splines(CurveSpace):
+    """Polynomials of the degree on pieces of the step, with continuous velocity; one quadrature on every piece.
+
+    With the breakpoints where a force has a kink the order is that of smooth forces.
+
+    Args:
+        pieces: how many pieces of equal length, 2 by default.
+        breakpoints: in (0, 1), ascending, in place of equal pieces.
+    """
+
+    pieces: int = 2
+    breakpoints: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.pieces, bool) or self.pieces < 1:
+            raise MethodError(f"splines have at least one piece, not {self.pieces}")
+        if self.pieces > MOST_POINTS:
+            raise MethodError(f"splines have at most {MOST_POINTS} pieces: take fewer, and more steps")
+        inner = tuple(float(to_number(x)) for x in self.breakpoints)
+        if any(not a < b for a, b in pairwise((0.0, *inner, 1.0))):
+            raise MethodError(f"breakpoints must ascend between 0 and 1, not {', '.join(map(str, inner))}")
+        object.__setattr__(self, "breakpoints", inner)
+        object.__setattr__(self, "pieces", len(inner) + 1 if inner else self.pieces)
+
+    @property
+    def name(self) -> str:
+        """``splines:<pieces>``, or ``splines:<breakpoint>,..``."""
+        return f"splines:{','.join(map(repr, self.breakpoints)) or self.pieces}"
+
+    @property
+    def symmetric(self) -> bool:
+        """For symmetric breakpoints."""
+        return all(a + b == 1.0 for a, b in zip(self.breakpoints, reversed(self.breakpoints), strict=True))
+
+    @property
+    def ends(self) -> list[tuple[Number, Number]]:
+        """Start and end of each piece."""
+        inner = self.breakpoints or tuple(mp.mpf(k) / self.pieces for k in range(1, self.pieces))
+        return list(pairwise((mp.zero, *map(mp.mpf, inner), mp.one)))
+
+    def dimension(self, degree: int) -> int:
+        """Of the velocities: continuous, of one degree less."""
+        if degree < 2:
+            raise MethodError("splines with a continuous slope have degree 2 at least")
+        velocities = self.pieces * (degree - 1) + 1
+        if velocities > MOST_POINTS:
+            raise MethodError(
+                f"{self.name} of degree {degree} has {velocities} velocities, of at most {MOST_POINTS}: take fewer "
+                "pieces, and more steps"
+            )
+        return velocities
+
+    def points(self, degree: int, rule: Quadrature) -> Vector:
+        """Equispaced on each piece, its ends included."""
+        self.dimension(degree)
+        inner = [a + (b - a) * k / (degree - 1) for a, b in self.ends for k in range(degree - 1)]
+        return (*inner, mp.one)
+
+    def along(self, rule: Quadrature) -> Quadrature:
+        """The rule on every piece."""
+        if rule.derivative_weights:
+            raise MethodError(f"{rule.name} uses derivatives along the curve: at breakpoints of {self.name} they jump")
+        return _composite(rule, tuple(self.ends))
+
+    def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
+        """See :meth:`CurveSpace.velocities`; derivatives, which jump, are not given."""
+        assert derivative == 0  # :meth:`along` sees to it
+        per_piece = (len(points) - 1) // self.pieces
+        lines = []
+        for c in at:
+            first = self._piece(c) * per_piece
+            own = cardinal_values(points[first : first + per_piece + 1], (c,))[0]
+            lines.append(_placed(own, first, len(points)))
+        return tuple(lines)
+
+    def positions(self, points: Vector, at: Vector) -> Matrix:
+        """See :meth:`CurveSpace.positions`."""
+        per_piece = (len(points) - 1) // self.pieces
+
+        def over(piece: int, end: Number) -> Vector:
+            first, start = piece * per_piece, self.ends[piece][0]
+            own = cardinal_integrals(points[first : first + per_piece + 1], (end,), start)[0]
+            return _placed(own, first, len(points))
+
+        whole = [over(k, end) for k, (_, end) in enumerate(self.ends)]
+        lines = []
+        for c in at:
+            k = self._piece(c)
+            lines.append(tuple(map(mp.fsum, zip(*whole[:k], over(k, c), strict=True))))
+        return tuple(lines)
+
+    def order(self, degree: int) -> int | None:
+        """Twice the degree."""
+        return 2 * degree
+
+    def _piece(self, c: Number) -> int:
+        return sum(c >= a for a, _ in self.ends[1:])
+
+
+def _placed(own: Vector, first: int, size: int) -> Vector:
+    """Entries of one piece among zeros."""
+    return (*(mp.zero,) * first, *own, *(mp.zero,) * (size - first - len(own)))
+
+
+@lru_cache(maxsize=64)
+def _composite(rule: Quadrature, ends: tuple[tuple[Number, Number], ...]) -> Quadrature:
+    """The rule on every piece, as one rule on [-1, 1]."""
+    points = [2 * (a + (b - a) * c) - 1 for a, b in ends for c in rule.abscissae]
+    weights = [2 * (b - a) * w for a, b in ends for w in rule.unit_weights]
+    merged: dict[Number, Number] = {}
+    for x, w in zip(points, weights, strict=True):
+        near = next((y for y in merged if abs(x - y) < mp.mpf("1e-30")), x)
+        merged[near] = merged.get(near, mp.zero) + w
+    name = f"{rule.name} on {len(ends)} pieces"
+    return Quadrature(name=name, points=tuple(merged), weights=tuple(merged.values()), order=rule.order)
+
+
+def space_by_name(name: str) -> CurveSpace:
+    """The space of ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"``, ``"splines:2"`` or
+    ``"splines:0.25,0.5"``.
+
+    Raises:
+        MethodError: for any other text.
+    """  # noqa: D205  (a list of examples does not fit a line)
+    family, _, rest = name.partition(":")
+    words = rest.split(":") if family == "trigonometric" else rest.split(",")
+    try:
+        if family == "polynomials" and not rest:
+            return Polynomials()
+        if family == "trigonometric" and len(words) <= 2:
+            return Trigonometric(float(words[0]), *map(int, words[1:]))
+        if family == "splines":
+            whole = rest.isascii() and rest.isdigit()
+            return Splines(int(rest)) if whole else Splines(breakpoints=tuple(map(float, words)))
+    except MethodError:
+        raise
+    except ValueError:
+        pass
+    raise MethodError(
+        f"there are no curves called {name!r}: write polynomials, trigonometric:FREQUENCY[:HARMONICS] with radians a "
+        "step, or splines:PIECES or splines:BREAKPOINT,.."
+    )

@@ -1,0 +1,399 @@
+"""The benchmark's own arithmetic: references against closed forms, equal error, ratios. No peer is needed."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+from mpmath import mp
+
+from scvi_codegen import benchmark as bench
+from scvi_codegen.benchmark import (
+    cases,
+    compositions,
+    hand_written,
+    measuring,
+    paper_tables,
+    report,
+    start_up,
+)
+from scvi_codegen.benchmark.contenders import ours, peers
+from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.contenders.ours import our_ensembles
+from scvi_codegen.benchmark.contenders.tracing import rates_text
+from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
+from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
+from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
+from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.errors import StateError, SystemDefinitionError
+from scvi_codegen.methods import SVI, Composition, StoermerVerlet
+from scvi_codegen.native import building
+
+EXTENDED = np.finfo(np.longdouble).eps < 1e-18
+needs_extended = pytest.mark.skipif(not EXTENDED, reason="long double is no wider than double here")
+
+
+def points(*pairs):
+    return [Point(seconds=seconds, error=error) for seconds, error in pairs]
+
+
+def short(name, span):
+    return replace(cases.case(name), span=span)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(folder, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(folder))
+
+
+class TestCases:
+    @pytest.mark.parametrize("name", [name for name in cases.CASES if name not in ("fput-chain:64", "fput-chain:256")])
+    def test_hand_solved_accelerations_obey_the_lagrangian(self, name):
+        chosen = cases.case(name)
+        system, m = chosen.system, chosen.dimension
+        x = [sympy.Rational(int(value), 1000) for value in np.random.default_rng(3).integers(100, 600, 2 * m)]
+        values = dict(zip(system.parameters, map(sympy.Float, system.defaults), strict=True))
+        lagrangian = system.lagrangian.xreplace(values)
+        rates = chosen.formulations[0].rates(x, chosen.parameters, sympy)
+        place = dict(zip((*system.coordinates, *system.velocities), x, strict=True))
+        for q, v in zip(system.coordinates, system.velocities, strict=True):
+            momentum = lagrangian.diff(v)
+            residual = -lagrangian.diff(q)
+            for other, its_velocity, n in zip(system.coordinates, system.velocities, range(m), strict=True):
+                residual += momentum.diff(other) * x[m + n] + momentum.diff(its_velocity) * rates[m + n]
+            assert abs(float(residual.subs(place))) < 1e-12
+
+    def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
+        chosen = cases.case("relativistic-particle")
+        plain, momenta = chosen.formulations
+        q, v = 0.3, 0.6
+        p = v / math.sqrt(1 - v * v)
+        q_rate, p_rate = momenta.rates([q, p], chosen.parameters, math)
+        acceleration = plain.rates([q, v], chosen.parameters, math)[1]
+        assert q_rate == pytest.approx(v, rel=1e-15)
+        assert p_rate == pytest.approx(acceleration * (1 - v * v) ** -1.5, rel=1e-14)
+        assert not chosen.velocity.any()
+
+    def test_every_case_has_eight_different_states(self):
+        for name in cases.CASES:
+            chosen = cases.case(name)
+            assert chosen.q.shape == chosen.velocity.shape == (cases.STATES, chosen.dimension)
+            assert len(np.unique(chosen.q, axis=0)) == cases.STATES
+
+    def test_unknown_names(self):
+        with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
+            cases.case("dufing")
+        with pytest.raises(StateError, match=r"nothing called 'drif' to measure; did you mean 'drift'\?"):
+            bench.benchmark(["drif"])
+        with pytest.raises(StateError, match="no peer 'heyoca'"):
+            bench.Plan(peers=("heyoca",))
+
+    def test_traced_text_computes_the_same(self):
+        chosen = cases.case("outer-solar-system")
+        text = rates_text(chosen.formulations[0].rates, chosen.parameters, 36)
+        names = {"sqrt": math.sqrt}
+        exec(text, names)
+        x = [*chosen.q[0], *chosen.velocity[0]]
+        out = np.empty(36)
+        names["rates"](out, 0.0, x, 0)
+        np.testing.assert_allclose(out, chosen.formulations[0].rates(x, chosen.parameters, math), rtol=1e-13)
+
+    def test_the_loops_of_a_chain_compute_the_same(self):
+        chosen = cases.case("fput-chain:8")
+        names = {}
+        exec(chosen.loops, names)
+        x, out = np.random.default_rng(5).standard_normal(16), np.empty(16)
+        names["rates"](out, 0.0, x, 0)
+        np.testing.assert_allclose(out, chosen.formulations[0].rates(list(x), chosen.parameters, math), rtol=1e-13)
+
+
+def kepler_position(q, v, t):
+    """The orbit through double q and v about a unit mass, by Kepler's equation with 40 digits."""
+    with mp.workdps(40):
+        q, v = ([mp.mpf(float(x)) for x in part] for part in (q, v))
+        r, speed = mp.hypot(*q), mp.hypot(*v)
+        a = 1 / (2 / r - speed**2)
+        rate = a ** mp.mpf("-1.5")
+        sine, cosine = (q[0] * v[0] + q[1] * v[1]) / mp.sqrt(a), 1 - r / a
+        ahead = mp.findroot(lambda x: x - cosine * mp.sin(x) + sine * (1 - mp.cos(x)) - rate * t, rate * t)
+        f = 1 - a / r * (1 - mp.cos(ahead))
+        g = t - (ahead - mp.sin(ahead)) / rate
+        return [f * x + g * y for x, y in zip(q, v, strict=True)]
+
+
+@needs_extended
+class TestReference:
+    def test_tables_integrate_polynomials(self):
+        a, b, guess = (high + low for high, low in gauss_tables(16))
+        c = a.sum(axis=1)
+        assert abs(b.sum() - 1) < 1e-18
+        assert np.abs(a @ c**5 - c**6 / 6).max() < 1e-18
+        assert np.abs(guess @ c**3 - (1 + c) ** 3).max() < 1e-8
+
+    def test_kepler_against_its_closed_form(self):
+        chosen = short("kepler:0.5", 40.0)
+        found = reference(chosen)
+        exact = [kepler_position(q, v, 40) for q, v in zip(chosen.q, chosen.velocity, strict=True)]
+        error = max(
+            abs(mp.mpf(h) + mp.mpf(low) - x)
+            for highs, lows, row in zip(found.high.tolist(), found.low.tolist(), exact, strict=True)
+            for h, low, x in zip(highs, lows, row, strict=True)
+        )
+        assert error < 2e-16
+        assert found.accuracy < 2e-16
+
+    def test_oscillator_with_a_span_that_is_no_multiple_of_the_step(self):
+        start = np.array([[1.0, 0.0]], dtype=np.longdouble)
+        end = final_states(lambda x: np.stack([x[..., 1], -x[..., 0]], axis=-1), start, 10.1, 0.75)
+        t = np.longdouble(10.1)
+        assert np.abs(end[0] - [np.cos(t), -np.sin(t)]).max() < 2e-18
+
+    def test_is_kept_and_found_again(self, monkeypatch):
+        chosen = short("planar-pendulum", 5.0)
+        first = reference(chosen)
+        monkeypatch.setattr("scvi_codegen.benchmark.references._compute", lambda *arguments: pytest.fail("again"))
+        assert np.array_equal(reference(chosen).low, first.low)
+        with pytest.raises(BaseException, match="again"):
+            reference(short("planar-pendulum", 6.0))
+
+    def test_momenta_that_were_rounded_have_a_reference_of_their_own(self):
+        chosen = short("outer-solar-system", 1024.0)
+        momenta = chosen.velocity * np.array(chosen.masses)
+        moved = reference(chosen, momenta)
+        assert 0 < np.abs((moved.high - reference(chosen).high) + (moved.low - reference(chosen).low)).max() < 1e-14
+
+    def test_our_ensemble_arrives_there(self, monkeypatch):
+        monkeypatch.setattr(ours, "advised_counts", lambda *_, quick: {100: 1e-12})
+        chosen = short("kepler:0.2", 50.0)
+        (ensemble,) = our_ensembles(chosen)
+        assert ensemble.trajectories == len(chosen.q)
+        assert rms_error(ensemble.prepare(0)(), reference(chosen)) < 1e-12
+
+
+class TestCurves:
+    def test_interpolates_log_time_against_log_error(self):
+        curve = points((1e-3, 1e-4), (4e-3, 1e-8), (16e-3, 1e-12))
+        assert time_at(curve, 1e-6) == pytest.approx(2e-3)
+        assert time_at(curve, 1e-10) == pytest.approx(8e-3)
+        assert time_at(curve, 1e-8) == pytest.approx(4e-3)
+
+    def test_extrapolates_nothing(self):
+        curve = points((1.0, 1e-4), (2.0, 1e-6))
+        assert time_at(curve, 1e-2) == 1.0
+        assert time_at(curve, 1e-7) is None
+        assert time_at([], 1e-7) is None
+
+    def test_errors_below_the_floor_are_equal(self):
+        curve = points((1.0, 1e-11), (4.0, 1e-15), (5.0, 1e-16))
+        assert [point.seconds for point in frontier(curve)] == [1.0, 4.0]
+        assert time_at(curve, 1e-15) == time_at(curve, FLOOR) == pytest.approx(2.0)
+        assert time_at(points((1.0, 1e-11), (4.0, 0.0)), FLOOR) < 4.0
+
+    def test_a_slower_setting_that_is_less_accurate_does_not_matter(self):
+        curve = points((1.0, 1e-6), (2.0, 1e-10))
+        assert time_at([*curve, *points((3.0, 1e-7), (1.5, 1e-5), (1.0, math.nan))], 1e-8) == time_at(curve, 1e-8)
+
+    def test_the_common_error_is_one_that_both_reach(self):
+        one, other = points((1.0, 1e-11)), points((1.0, 1e-9), (2.0, 1e-16))
+        assert common_error(one, other) == pytest.approx(2e-11)
+        assert common_error(other, other) == FLOOR
+        assert common_error(one, []) is None
+
+
+def measurement(method, seconds, error, **changes):
+    entries = {"setting": "h=1", "options": "", "compile_seconds": 0.1, "fastest": seconds, "repeats": 3} | changes
+    return measuring.Measurement(method=method, seconds=seconds, error=error, **entries)
+
+
+def result_of(*found, **skipped):
+    return report.CaseResult(name="x", span=1.0, dimension=1, accuracy=1e-18, measurements=found, skipped=skipped)
+
+
+class TestReport:
+    result = result_of(
+        measurement("scvi-codegen svi", 1e-3, 1e-12),
+        measurement("heyoka", 5e-3, 1e-13, setting="tol=default"),
+        measurement("heyoka", 4e-3, 1e-12),
+        measurement("heyoka fast_math", 3e-3, 1e-12),
+        measurement("broken", math.nan, math.nan, failure="ArithmeticError: no"),
+        jitcode="not installed",
+    )
+
+    def test_ratios_are_against_heyoka_by_default_and_at_best_and_against_the_best_peer(self):
+        other = measurement("CyRK DOP853", 2e-3, 1e-12)
+        ours, _, fast, _ = report.rows(replace(self.result, measurements=(*self.result.measurements, other)))
+        assert (ours.default, ours.best, ours.peer) == tuple(pytest.approx(x) for x in (5.0, 3.0, 2.0))
+        assert fast.best == 1.0
+
+    def test_without_heyoka_there_are_no_ratios(self):
+        result = result_of(measurement("scvi-codegen svi", 1e-3, 1e-12))
+        (row,) = report.rows(result)
+        assert row.default is row.best is row.peer is None
+        assert "-" in result.text()
+
+    def test_table_names_failures_and_skipped_peers(self):
+        text = self.result.text()
+        assert "skipped jitcode: not installed" in text
+        assert "broken h=1: ArithmeticError: no" in text
+
+    def test_json_schema(self):
+        table = Table(name="t", title="", columns={"a": ".1f", "b": ""}, rows=({"a": math.nan}, {"a": 1.0, "b": "x"}))
+        whole = bench.Report(machine=bench.machine(), results=(self.result, table))
+        data = json.loads(json.dumps(whole.data(), allow_nan=False))
+        assert set(data) == {"schema", "machine", "cases", "tables", "interrupted"}
+        assert {"processor", "compiler", "flags", "versions"} <= set(data["machine"])
+        (found,) = data["cases"]
+        assert set(found) == {"name", "span", "dimension", "reference_accuracy", "skipped", "measurements", "rows"}
+        fields = {
+            "method",
+            "setting",
+            "options",
+            "compile_seconds",
+            "seconds",
+            "fastest",
+            "error",
+            "repeats",
+            "failure",
+        }
+        assert all(set(entry) == fields for entry in found["measurements"])
+        assert found["measurements"][4]["seconds"] is None
+        assert data["tables"][0]["rows"] == [{"a": None}, {"a": 1.0, "b": "x"}]
+        assert "  a    b\n  -    -\n  1.0  x" in table.text()
+
+
+class TestMeasuring:
+    def test_rounds_alternate_and_failures_are_kept(self):
+        order = []
+
+        def contender(name):
+            def prepare(index):
+                def integrate():
+                    order.append(name)
+                    if name == "bad":
+                        raise ArithmeticError("no")
+                    return np.array([float(index)])
+
+                return integrate
+
+            return Contender(method=name, setting="", options="", compile_seconds=0.0, prepare=prepare)
+
+        high = np.arange(8.0)[:, None]
+        exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
+        good, bad, last = measuring.measure(
+            [contender("one"), contender("bad"), contender("two")], lambda _: exact, repeats=2
+        )
+        assert order == [*["one"] * 8, "bad", *["two"] * 8, *(["one"] * 8 + ["two"] * 8) * 2]
+        assert (good.error, good.repeats, last.repeats) == (0.0, 2, 2)
+        assert bad.failure == "ArithmeticError: no"
+
+    def test_an_ensemble_is_one_run_whose_time_is_shared(self):
+        high = np.arange(8.0)[:, None]
+        final = np.tile(high, (2, 1))
+        ensemble = Contender(
+            method="all", setting="", options="", compile_seconds=0.0, prepare=lambda n: lambda: final, trajectories=16
+        )
+        exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
+        (found,) = measuring.measure([ensemble], lambda _: exact, repeats=2)
+        assert found.error == 0.0
+        assert found.seconds < 1e-3
+
+
+@needs_extended
+class TestCommand:
+    def test_without_peers(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
+        path = tmp_path / "out.json"
+        said = []
+        plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),))
+        names = ["planar-pendulum", "drift"]
+        text = bench.benchmark(names, plan, json_path=str(path), say=said.append).text()
+        assert "skipped heyoka: heyoka is not installed (pip install 'scvi-codegen[bench]')" in text
+        assert "skipped cyrk: CyRK is not installed" in text
+        data = json.loads(path.read_text())
+        assert [found["name"] for found in data["cases"]] == names[:1]
+        assert data["cases"][0]["rows"][0]["best"] is None
+        assert max(found["error"] for found in data["cases"][0]["measurements"]) < 1e-6
+        assert len(data["tables"][0]["rows"]) == 6
+        assert "planar-pendulum: reference" in said
+
+    def test_ctrl_c_keeps_what_was_measured(self, tmp_path, monkeypatch):
+        def interrupt(plan, say):
+            raise KeyboardInterrupt
+
+        def fail(plan, say):
+            raise StateError("no")
+
+        done = Table(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
+        sections = {"one": lambda plan, say: done, "bad": fail, "two": interrupt, "three": interrupt}
+        monkeypatch.setattr(bench, "SECTIONS", sections)
+        path = tmp_path / "out.json"
+        found = bench.benchmark(json_path=str(path))
+        assert (found.results[0], found.interrupted) == (done, "two")
+        assert "bad: failed: no" in found.text()
+        assert json.loads(path.read_text())["interrupted"] == "two"
+        assert "done: kept" in found.text()
+
+    def test_picture(self, tmp_path):
+        pytest.importorskip("matplotlib")
+        from scvi_codegen.benchmark.picture import plot_curves
+
+        plot_curves([TestReport.result, TestReport.result], tmp_path / "curves.svg")
+        text = (tmp_path / "curves.svg").read_text()
+        assert "time of a trajectory, ms" in text
+        assert text.count("heyoka fast_math") == 1
+
+
+class TestDrift:
+    def test_the_slope_of_a_line(self):
+        slope, error = fitted_slope(np.linspace(0.0, 3e-12, 2001))
+        assert slope == pytest.approx(3e-12)
+        assert error < 1e-20
+
+    def test_a_random_walk_has_a_slope_within_its_error(self):
+        random = np.random.default_rng(5)
+        walks = [fitted_slope(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
+        scores = np.array([slope / error for slope, error in walks])
+        assert 0.85 < scores.std() < 1.2
+
+    def test_a_short_run_keeps_its_energy(self):
+        (row,) = drift_rows(cases.case("kepler:0.2"), 0.2, 20_000, with_heyoka=False)
+        assert row["largest"] < 1e-12
+
+
+class TestTables:
+    def test_the_method_written_by_hand_agrees_with_the_generated_one(self):
+        found = hand_written.run_hand_written(bench.Plan(quick=True, repeats=1), lambda text: None)
+        assert [row["case"] for row in found.rows] == list(hand_written.HAND_WRITTEN)
+        assert all(row["apart"] < 1e-12 for row in found.rows)
+
+    @needs_extended
+    def test_a_table_of_the_paper(self, monkeypatch):
+        monkeypatch.setattr(paper_tables, "TABLES", paper_tables.TABLES[:1])
+        found = paper_tables.run_paper_tables(bench.Plan(quick=True, repeats=1), lambda text: None)
+        errors = {(row["table"], row["scheme"]): row["position_error"] for row in found.rows}
+        assert len(errors) == 3
+        assert errors[6, "SVI"] < 0.01 * errors[6, "SRK"]
+        assert "more accurate by" in found.text()
+
+    @needs_extended
+    @pytest.mark.full
+    def test_compositions_on_one_case(self, monkeypatch):
+        monkeypatch.setattr(compositions, "COMPARED", ("henon-heiles",))
+        monkeypatch.setattr(compositions, "METHODS", (SVI(8), StoermerVerlet(), Composition(8)))
+        found = compositions.run_compositions(bench.Plan(quick=True), lambda text: None)
+        assert [row["error"] for row in found.rows] == [1e-4, 1e-8, 1e-12]
+        assert all("stoermer-verlet" in row for row in found.rows)
+        assert found.rows[-1]["fastest"] != "stoermer-verlet"
+
+    def test_start_up(self):
+        cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows
+        assert (cold["cache"], cached["cache"]) == ("cold", "cached")
+        assert cold["sympy_by_import"] == "False"
+        assert cached["first_step_ms"] < cold["first_step_ms"]

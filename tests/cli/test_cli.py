@@ -1,0 +1,377 @@
+"""The command line: what it prints, what it writes, what it says when something is wrong."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from scvi_codegen.cli import main
+from scvi_codegen.cli.choices import Choices, read_model
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
+from scvi_codegen.models.model_file import Model, load_model, parse_model, save_model
+from scvi_codegen.models.problems import PROBLEMS, problem
+
+COMMAND = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))
+NOTHING = Choices(
+    **dict.fromkeys(Choices.__dataclass_fields__) | {"parameter": ()}  # type: ignore[arg-type]
+)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    return
+
+
+def invoke(*words: str) -> Result:
+    return CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
+
+
+def output_of(*words: str) -> str:
+    result = invoke(*words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def error_of(*words: str, status: int = 2) -> str:
+    """The message on stderr of a command that fails without a traceback."""
+    result = invoke(*words)
+    assert result.exit_code == status, result.output
+    assert isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
+    return result.stderr
+
+
+def arrays(path: str) -> dict[str, np.ndarray]:
+    with np.load(path) as file:
+        return dict(file)
+
+
+def chosen(name: str = "kepler", **choices: object) -> Model:
+    return read_model(name, replace(NOTHING, **choices))
+
+
+class TestHelp:
+    def test_overview_teaches_by_examples(self):
+        text = output_of("--help")
+        assert "scvi-codegen run kepler" in text
+        for command in ("generate", "derive", "run", "systems", "methods"):
+            assert command in text
+            assert "Example" in output_of(command, "-h") or command == "methods"
+
+    def test_every_example_of_the_help_is_accepted(self):
+        texts = [output_of("--help"), *(output_of(command, "--help") for command in main.commands)]
+        Path("mine.toml").write_text(output_of("systems", "kepler"))
+        found = [match[1] for text in texts for match in re.finditer(r"^ +scvi-codegen (\w.*)$", text, re.MULTILINE)]
+        lines = dict.fromkeys(found)  # in order: some go on with what others wrote
+        assert len(lines) >= 9
+        for line in lines:
+            words = re.split(r" {2,}| > ", line)[0].split()
+            if "--steps" not in words and words[0] == "run":
+                words += ["--span", "10"] if "--span" not in words else []
+            words += ["--list"] if words[0] == "reproduce" else []  # running it takes minutes
+            output_of(*words)
+
+    def test_version(self):
+        from scvi_codegen import __version__
+
+        assert output_of("--version") == f"scvi-codegen, version {__version__}\n"
+
+    def test_help_does_not_wait_for_sympy_or_numpy(self):
+        script = (
+            "import sys; sys.modules['sympy'] = sys.modules['numpy'] = sys.modules['mpmath'] = None\n"
+            "from scvi_codegen.cli import main; main(['--help'])"
+        )
+        result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        assert "Usage" in result.stdout
+
+    def test_a_mistyped_command_is_a_usage_error(self):
+        assert "No such command" in error_of("rum", "kepler")
+
+
+class TestChoices:
+    def test_nothing_chosen_is_the_catalogue(self):
+        assert chosen() == Model.from_problem(problem("kepler"))
+        assert chosen("fput-chain:5").system.dimension == 5
+
+    def test_a_file_is_read_by_suffix_folder_or_existence(self, tmp_path):
+        model = Model.from_problem(problem("kepler"))
+        for name in ("a.toml", "plain"):
+            save_model(model, name)
+            assert chosen(name) == model
+            assert chosen(str(tmp_path / name)) == model
+
+    @pytest.mark.parametrize(
+        ("choices", "method"),
+        [
+            ({"degree": 5}, SVI(5)),
+            ({"quadrature": "gauss-lobatto:9"}, SVI(8, "gauss-lobatto:9")),
+            ({"nodes": "equispaced"}, SVI(8, nodes="equispaced")),
+            ({"method": "scvi"}, SCVI(8)),
+            ({"method": "scvi", "degree": 3, "variational": False}, SCVI(3, variational=False)),
+            ({"method": "sc", "form": "phase-space"}, SpectralCollocation(8, form="phase-space")),
+            ({"method": "gauss", "stages": 3}, Gauss(3)),
+            ({"method": "gauss", "stages": 3, "form": "position"}, Gauss(3, form="position")),
+            ({"method": "collocation", "abscissae": (0.25, 1.0)}, CollocationRK((0.25, 1.0))),
+            ({"method": "stoermer-verlet"}, StoermerVerlet()),
+            ({"method": "scvi", "degree": 3, "abscissae": "gauss"}, SCVI(3, abscissae="gauss")),
+            ({"degree": 4, "space": "splines:2"}, SVI(4, space="splines:2")),
+            ({"degree": 3, "quadrature": "hermite:3"}, SVI(3, "hermite:3")),
+        ],
+    )
+    def test_methods(self, choices, method):
+        assert chosen(**choices).method == method
+
+    def test_a_chosen_quadrature_survives_another_degree(self):
+        save_model(replace(chosen(), method=SVI(3, "clenshaw-curtis:7")), "a.toml")
+        assert chosen("a.toml", degree=4).method == SVI(4, "clenshaw-curtis:7")
+
+    def test_states_and_lengths(self):
+        model = chosen(q=(1.0, 0.0), p=(0.0, 1.0), time=2.0, step=-0.5, steps=7, every=2, parameter=(("mu", 3.0),))
+        assert (model.q, model.p, model.velocity, model.t) == ((1.0, 0.0), (0.0, 1.0), None, 2.0)
+        assert (model.h, model.steps, model.span, model.every) == (-0.5, 7, None, 2)
+        assert model.system.defaults == (3.0,)
+        assert chosen(step=0.5).step_count == 400
+
+    def test_on_the_command_line(self):
+        words = "--q -1,0 --velocity 0,-1.1 --parameter mu=1.5 --step 0.1 --steps 10 --method gauss --stages 2"
+        text = output_of("run", "kepler", *words.split())
+        assert "10 steps of 0.1 from t = 0 to t = 1; 11 states kept" in text
+        assert "gauss:2" in text
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            ("keplr", "did you mean 'kepler'?"),
+            ("keplr", "There is no model file 'keplr', either."),
+            ("fput-chain:0", "a chain has 1 to 1024 masses, not 0\n"),
+            ("nowhere.toml", "nowhere.toml cannot be read: No such file or directory"),
+            ("kepler --p 0,1 --velocity 0,1", "--p and --velocity exclude each other"),
+            ("kepler --span 1 --steps 1", "--span and --steps exclude each other"),
+            ("kepler --method gaus", "did you mean 'gauss'?"),
+            ("kepler --method gauss", "gauss needs 'stages'"),
+            ("kepler --stages 3", "svi takes no 'stages'; it takes degree, quadrature, nodes"),
+            ("kepler --quadrature gauss-legendre", "lacks its number of points"),
+            ("kepler --degree x", "'x' is not a valid integer"),
+            ("kepler --q 1,a", "could not convert string to float: 'a'"),
+            ("kepler --q 1", "q must have 2 numbers for (q1, q2), not 1"),
+            ("kepler --q nan,0", "q[0] (q1) is nan"),
+            ("kepler --parameter mu", "'mu' is not of the form NAME=VALUE"),
+            ("kepler --parameter mu=nan", "'mu=nan' is not of the form NAME=VALUE"),
+            ("kepler --parameter nu=1", "has no parameter 'nu'"),
+            ("kepler --step 0", "the step is 0"),
+            ("kepler --steps -1", "steps must be at least 0"),
+            ("kepler --every 0", "every must be at least 1"),
+            ("kepler --tolerance 0", "the tolerance must be positive"),
+            ("kepler -o orbit.txt", "as .npz, .csv, .h5, .hdf5, .zarr or into a folder .run, not as 'orbit.txt'"),
+            ("kepler -o no/orbit.npz", "there is no folder 'no'"),
+            ("kepler --plot orbit.gif", "saved as .png or .svg"),
+            ("relativistic-particle --velocity 2", "q = "),
+        ],
+    )
+    def test_mistakes_are_usage_errors(self, words, message):
+        assert message in error_of("run", *words.split())
+
+    def test_a_faulty_formula_is_pointed_at(self):
+        Path("a.toml").write_text(output_of("systems", "planar-pendulum").replace("cos(q)", "cos(angle)"))
+        message = error_of("run", "a.toml")
+        assert message.startswith("Error: a.toml: [system]: unknown name 'angle'")
+        assert "^ column" in message
+
+    def test_warnings_are_one_line_each(self):
+        result = invoke("run", "harmonic-oscillator", "--degree", "3", "--quadrature", "gauss-legendre:2")
+        assert result.stderr.count("Warning: 2 quadrature points do not determine a curve of degree 3") == 1
+        assert "MethodWarning" not in result.output
+
+
+class TestRun:
+    def test_sums_up_what_was_conserved(self):
+        text = output_of("run", "kepler")
+        assert "order 16, symplectic, symmetric" in text
+        assert re.search(r"a step, \d\.\d\d iterations a step; prepared in \d", text)
+        error, drift = re.search(r"relative energy error: (\S+) at most, drift (\S+) over", text).groups()
+        assert abs(float(drift)) <= 2 * float(error) < 1e-12
+        assert float(re.search(r"angular momentum: (\S+) at most", text)[1]) < 1e-14
+        assert "final state\n  q1 = " in text
+
+    def test_the_solver_can_be_chosen(self):
+        for solver in ("newton", "fixed-point"):
+            assert "a step" in output_of("run", "kepler", "--span", "5", "--solver", solver)
+        output_of("generate", "kepler", "-o", "kepler_newton", "--solver", "newton")
+        assert "lanes" not in Path("kepler_newton/kepler_newton.c").read_text()
+        assert "'newton', 'explicit'" in error_of("run", "kepler", "--solver", "guess")
+        assert "not explicit for this system" in error_of("run", "kepler", "--solver", "explicit")
+
+    def test_a_drift_is_seen(self):
+        text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")
+        assert float(re.search(r"drift (\S+) over", text)[1]) > 1e-3
+        change, note = re.search(r"relative error of angular momentum: (\S+) at most(.*)", text).groups()
+        assert float(change) > 1e-4
+        assert note == " (not guaranteed by this method)"
+
+    def test_long_states_are_cut_short(self):
+        text = output_of("run", "fput-chain:9", "--steps", "3")
+        assert "and 3 coordinates more" in text
+        assert "q7" not in text
+
+    def test_energy_of_driven_systems_is_not_called_an_error(self):
+        assert "L depends on time" in output_of("run", "duffing", "--parameter", "gamma=0.3")
+
+    @pytest.mark.parametrize("every", [1, 7])
+    def test_writes_the_trajectory_that_integrate_gives(self, every):
+        for name in ("orbit.npz", "orbit.csv"):
+            output_of("run", "kepler", "--steps", "500", "--every", str(every), "-o", name)
+        model = chosen(steps=500)
+        expected = model.start(compile_stepper(model.system, model.method)).record(500, every=every)
+        written, table = arrays("orbit.npz"), np.loadtxt("orbit.csv", delimiter=",", skiprows=1)
+        for key in ("t", "q", "p", "iterations"):
+            assert np.array_equal(written[key], getattr(expected, key))
+        assert np.array_equal(table, np.column_stack([expected.t, expected.q, expected.p, expected.iterations]))
+
+    def test_steps_fewer_than_every_and_none_at_all(self):
+        assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state kept" in output_of(
+            "run", "kepler", "--steps", "3", "--every", "5", "-o", "a.npz"
+        )
+        assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
+        assert len(arrays("a.npz")["t"]) == 1
+
+    def test_draws_a_picture(self):
+        assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")
+        assert Path("orbit.svg").read_text().startswith("<?xml")
+
+    def test_a_failing_step_keeps_what_was_computed(self):
+        # Falls into the centre of attraction along a line that a step of Newton's method cannot pass.
+        words = "--method gauss --stages 1 --velocity 0,0 --step 0.01 --max-iterations 3 -o fall.npz"
+        result = invoke("run", "kepler", *words.split())
+        assert result.exit_code == 1
+        step = int(re.search(r"Error: step (\d+) at t = \S+ with h = 0.01 failed: not converged", result.stderr)[1])
+        assert step > 5
+        assert f"the {step + 1} states up to there were kept: fall.npz" in result.stderr
+        assert f"{step} steps of 0.01" in result.stdout
+        written = arrays("fall.npz")
+        assert np.array_equal(written["t"], 0.01 * np.arange(step + 1))
+        assert np.isfinite(written["q"]).all()
+
+    def test_a_first_step_that_fails_is_told_in_short(self):
+        result = invoke("run", "double-pendulum", "--step", "5")
+        assert result.exit_code == 1
+        assert "Error: step 0 at t = 0 with h = 5 failed" in result.stderr
+        assert "the initial state was not written to a file (-o, --plot)" in result.stderr
+        assert "energy" not in result.stdout
+
+    def test_a_state_without_energy_is_no_traceback(self):
+        assert "failed" in error_of("run", "kepler", "--q", "0,0", "-o", "a.csv", status=1)
+
+    def test_a_missing_compiler_is_a_failure_of_the_machine(self, monkeypatch):
+        monkeypatch.setenv("CC", "no-such-compiler")
+        assert "CC ('no-such-compiler') was not found" in error_of("run", "kepler", status=1)
+
+    def test_unwritable_folders_are_found_before_the_run(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(os, "access", lambda path, mode: False)
+        assert "cannot be written" in error_of("run", "kepler", "-o", str(tmp_path / "a.npz"))
+
+    def test_missing_matplotlib_is_found_before_the_run(self, monkeypatch):
+        monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+        assert "pip install 'scvi-codegen[plot]'" in error_of("run", "kepler", "--plot", "a.png")
+
+
+@pytest.mark.skipif(COMMAND is None, reason="the command is not installed beside this Python")
+class TestInstalledCommand:
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    def test_an_interrupted_run_keeps_what_was_computed(self, number):
+        output_of("run", "kepler", "--steps", "1")  # compiled and in the cache
+        words = [COMMAND, "run", "kepler", "--steps", "1000000000", "--every", "100", "-o", "orbit.npz"]
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(3.0)
+        process.send_signal(number)
+        stdout, stderr = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert "Error: interrupted at t = " in stderr
+        t = arrays("orbit.npz")["t"]
+        assert f"the {len(t)} states up to there were kept: orbit.npz" in stderr
+        assert len(t) > 2
+        assert np.allclose(np.diff(t), 25.0)
+        assert "relative energy error" in stdout
+
+    def test_statuses_reach_the_shell_and_messages_stderr(self):
+        for words, status in ((["run", "kepler", "--steps", "5"], 0), (["run", "keplr"], 2), (["--help"], 0)):
+            result = subprocess.run([COMMAND, *words], capture_output=True, text=True, check=False)
+            assert result.returncode == status
+            assert bool(result.stderr) == bool(status)
+
+    def test_a_reader_that_stops_early_is_no_error(self):
+        result = subprocess.run(f"{COMMAND} systems | head -1", shell=True, capture_output=True, text=True, check=False)
+        assert result.stderr == ""
+
+
+class TestGenerate:
+    def test_writes_a_folder_and_says_how_to_use_it(self):
+        text = output_of("generate", "planar-pendulum", "-o", "out/pendulum_svi", "--degree", "2")
+        assert "make -C out/pendulum_svi run" in text
+        assert "import pendulum_svi" in text
+        assert load_model("out/pendulum_svi/model.toml").method == SVI(2)
+
+    def test_edited_files_need_force(self):
+        output_of("generate", "planar-pendulum", "-o", "pendulum_svi")
+        Path("pendulum_svi/main.c").write_text("int main(void) { return 0; }\n")
+        assert "--force" in error_of("generate", "planar-pendulum", "-o", "pendulum_svi")
+        output_of("generate", "planar-pendulum", "-o", "pendulum_svi", "--force")
+
+    def test_folder_names_are_checked(self):
+        assert "call it 'pendulum_svi'" in error_of("generate", "planar-pendulum", "-o", "Pendulum-SVI")
+
+
+class TestDerive:
+    words = ("derive", "planar-pendulum", "--degree", "2")
+
+    def test_text(self):
+        text = output_of(*self.words)
+        assert "(27a)" in text
+        assert "sqrt" in output_of(*self.words, "--radicals")
+
+    def test_latex_into_a_file(self):
+        result = invoke(*self.words, "--latex", "-o", "step.tex")
+        assert (result.exit_code, result.stdout) == (0, "")
+        assert r"\tag{27a}" in Path("step.tex").read_text()
+
+    def test_a_folder_that_is_not_there(self):
+        assert "there is no folder 'no'" in error_of(*self.words, "-o", "no/step.tex")
+
+
+class TestListings:
+    def test_systems_lists_the_catalogue(self):
+        text = output_of("systems")
+        for name in PROBLEMS:
+            assert re.search(rf"^{name} ", text, re.MULTILINE)
+        assert "mu=1" in text
+
+    def test_systems_prints_a_model_file(self):
+        assert parse_model(output_of("systems", "kepler")) == chosen("kepler")
+        assert "did you mean 'kepler'" in error_of("systems", "keplr")
+
+    def test_methods_lists_names_arguments_and_properties(self):
+        text = output_of("methods")
+        for name in METHODS:
+            assert re.search(rf"^{name} ", text, re.MULTILINE)
+        assert re.search(r"^svi +degree, quadrature, nodes, space +\S+ +8 +yes +yes$", text, re.MULTILINE)
+        assert re.search(r"^ +scvi-printed-\S+ +none claimed +no +no$", text, re.MULTILINE)
+
+    def test_tableaux_in_radicals_and_in_decimals(self):
+        assert "1/2 - sqrt(3)/6 |" in output_of("methods", "--tableau", "gauss:2")
+        text = output_of("methods", "--tableau", "gauss:5")
+        assert "order 10, symplectic, symmetric, A-stable" in text
+        assert len(text.splitlines()) == 8
+        assert "gauss" in error_of("methods", "--tableau", "gaus:3")

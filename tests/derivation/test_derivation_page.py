@@ -1,0 +1,279 @@
+"""The derivation page: its equations are those that are compiled, its counts are counted, and browsers set it."""
+
+from __future__ import annotations
+
+import random
+import re
+import warnings
+from functools import cache
+from typing import Any
+
+import pytest
+import sympy
+from browsing import (
+    FORMULAS,
+    FRACTIONS,
+    UNREADABLE,
+    VIEWS,
+    assert_it_asks_for_nothing,
+    assert_nothing_sticks_out,
+    opened,
+)
+from click.testing import CliRunner
+from html_page import Page
+from samples import driven_duffing
+from summed_equations import Evaluation
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.compiler import program_of
+from scvi_codegen.derivation import derivation_html
+from scvi_codegen.derivation.equations import derive, table_entries
+from scvi_codegen.derivation.page.elision import MOST_LINES, formulas, operations
+from scvi_codegen.derivation.page.kernels import kernels_of
+from scvi_codegen.derivation.page.sparsity import jacobian_pattern
+from scvi_codegen.display.page.blocks import Formula, Paragraph
+from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.rendering.outline import functions_of, reached
+from scvi_codegen.rendering.text import render
+
+TILTED = """m*(1 + q**2/3)*q_dot**2/2 + a*q*q_dot*sin(t) - k*q**4/4 + q_dot**4/40"""
+METHODS = [
+    sc.SVI(3),
+    sc.SVI(2, "gauss-lobatto:3"),
+    sc.SVI(2, "hermite:2"),
+    sc.SVI(2, space="splines:2"),
+    sc.SCVI(3),
+    sc.SCVI(1),
+    sc.SCVI(2, variational=False),
+    sc.SCVI(2, abscissae="gauss"),
+    sc.SpectralCollocation(3),
+    sc.SpectralCollocation(2, form="phase-space"),
+    sc.Gauss(3),
+    sc.LobattoIIIA(3),
+    sc.RadauIIA(2, form="position"),
+    sc.ExplicitEuler(),
+    sc.StoermerVerlet(),
+]
+
+
+def tilted() -> sc.LagrangianSystem:
+    """Everything a Lagrangian of one coordinate can have: a mass that varies, a magnetic term, time, a quartic term."""
+    return sc.LagrangianSystem.from_text(
+        name="tilted", coordinates=["q"], lagrangian=TILTED, parameters={"m": 1.3, "a": 0.4, "k": 0.7}
+    )
+
+
+def compared(system: Any, method: Any) -> list[tuple[sympy.Expr, sympy.Expr]]:
+    """Every equation in numbers, as the page has it and as ``derive`` writes it out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", sc.MethodWarning)
+        derived = derive(system, method)
+    stages = with_auxiliaries(system, method.paper_form(system))
+    generator = random.Random(5)
+    unknowns = {block.name: sympy.Rational(generator.randint(10, 90), 100) for block in stages.blocks}
+    known = {
+        "q_k": sympy.Rational(2, 5),
+        "p_k": sympy.Rational(3, 7),
+        "h": sympy.Rational(1, 9),
+        "t_k": sympy.Rational(1, 3),
+    }
+    known |= {parameter.name: sympy.Rational(str(value)) for parameter, value in system.constants.items()}
+    evaluation = Evaluation(system, stages, known, unknowns)
+    numbers = dict(zip(derived.unknowns, unknowns.values(), strict=True))
+    names = {derived.state[0][0]: "q_k", derived.state[1][0]: "p_k", derived.step: "h", derived.time: "t_k"}
+    numbers |= {symbol: known[name] for symbol, name in names.items()}
+    numbers |= {parameter: known[parameter.name] for parameter in system.parameters}
+    written = [*derived.equations, *derived.end_position, *derived.end_momentum]
+    expected = [derived.numeric(equation.residual).xreplace(numbers).evalf(30) for equation in written]
+    return list(zip([*evaluation.residuals(), *evaluation.ends()], expected, strict=True))
+
+
+class TestEquations:
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_sums_are_what_is_written_out(self, method):
+        assert all(abs(one - other) < 1e-18 for one, other in compared(tilted(), method))
+
+    def test_of_a_composition_too(self):
+        assert all(abs(one - other) < 1e-18 for one, other in compared(driven_duffing(), sc.Composition(8)))
+
+    @pytest.mark.parametrize(
+        "method", [sc.SVI(2), sc.SVI(2, "gauss-legendre:3"), sc.SCVI(2), sc.Gauss(2)], ids=lambda m: m.name
+    )
+    def test_and_of_a_hamiltonian(self, method):
+        system = sc.HamiltonianSystem.from_text(
+            name="twisted", coordinates=["q"], momenta=["p"], hamiltonian="p**2*(1 + q**2)/2 + q**4*cos(t) + p*q/3"
+        )
+        assert all(abs(one - other) < 1e-18 for one, other in compared(system, method))
+
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_a_name_stands_for_one_number(self, method):
+        stages = method.paper_form(tilted())
+        values: dict[str, Any] = {}
+        for family in stages.families:
+            for part in (*family.gathers, *family.scatters):
+                for names, numbers in zip(part.table.names, part.table.entries, strict=True):
+                    for name, number in zip(names, numbers, strict=True):
+                        assert not name or values.setdefault(name, number) == number
+        shown = {entry.symbol.name: entry.value for entry in table_entries(stages, method)}
+        assert values.keys() - shown.keys() <= {name for name in values if not name or "/" in name}
+
+    @pytest.mark.parametrize(
+        "method", [sc.SVI(2), sc.SCVI(2), sc.SpectralCollocation(3), sc.Gauss(2)], ids=lambda m: m.name
+    )
+    def test_the_pattern_is_that_of_the_jacobian(self, method):
+        system = sc.problem("henon-heiles").system
+        pattern = jacobian_pattern(method.paper_form(system), system.dimension)
+        found = {(r, c) for r, row in enumerate(pattern.rows) for c in row}
+        assert found == set(derive(system, method).jacobian.todok())
+
+
+@cache
+def kepler_page(method: Any) -> str:
+    return derivation_html(sc.problem("kepler").system, method)
+
+
+class TestPage:
+    @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+    def test_every_method_has_one_that_is_well_formed_and_needs_nothing_else(self, method):
+        page = derivation_html(sc.problem("planar-pendulum").system, method)
+        parsed = Page(page)
+        assert len(parsed.all("h1")) == 1
+        assert len(parsed.all("section")) == len(parsed.all("h2")) == 11
+        identifiers = [attributes["id"] for _, attributes in parsed.elements if "id" in attributes]
+        assert len(identifiers) == len(set(identifiers))
+        assert set(re.findall(r'href="#([^"]*)"', page)) <= set(identifiers)
+        assert parsed.all("script") == []
+        assert not re.search(r"https?:|@import|url\(", page)
+
+    def test_every_kernel_and_every_function_of_the_step_is_there(self):
+        system = sc.problem("double-pendulum").system
+        program = program_of(system, sc.SVI(2), prefix="double_pendulum")
+        functions = functions_of(render(program).code)
+        page = derivation_html(system, sc.SVI(2))
+        shown = re.findall(r"<summary>(\w+)\(", page)
+        assert {kernel.name for kernel in kernels_of(program)} <= set(shown)
+        assert {"sweep", "solve", "newton", "evaluate", "add_quadrature", "double_pendulum_advance"} <= set(shown)
+        assert len(shown) == len(set(shown))
+        called = {f.name for f in reached(functions, "double_pendulum_advance") if f.comment and "lanes" not in f.name}
+        assert called <= set(shown)
+
+    def test_operations_are_counted(self):
+        program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
+        functions = functions_of(render(program).code)
+        page = kepler_page(sc.SVI(2))
+        for kernel in kernels_of(program):
+            row = re.search(
+                rf'<td class="word">{kernel.name}</td>(?:<td class="number">(\d+)</td>)'
+                + r'<td class="number">(\d+)</td>' * 3,
+                page,
+            )
+            results, before, after, temporaries = map(int, row.groups())
+            body = functions[kernel.name].body
+            signs = re.findall(r"(?<=[\w\])]) [-+] |\*|/", body)
+            calls = re.findall(r"\b[a-z]\w*\(", body)
+            negatives = re.findall(r"-(?=[\w(])", body)
+            assert after == len(signs) + len(calls) + len(negatives)
+            assert temporaries == body.count("const")
+            assert results == len(re.findall(r"^  (?:value|slope)\[", body, re.MULTILINE))
+            assert before == sum(sympy.count_ops(formula) for formula in kernel.formulas)
+
+    def test_tables_have_radicals_where_they_are_short(self):
+        page = kepler_page(sc.SVI(2))
+        assert "<msqrt><mn>3</mn></msqrt>" in page
+        assert "\N{MINUS SIGN}0.57735026918962576" in page
+
+    def test_numbers_of_the_paper_stand_beside_the_equations(self):
+        page = kepler_page(sc.SCVI(2))
+        numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
+        assert {"2", "33", "34a, i = 1, 2", "34c", "34d", "34e", "dG/dQ", "dG/dv0"} <= numbers
+
+    def test_a_hamiltonian_has_hamiltons_equations(self):
+        page = derivation_html(sc.hamiltonian_of(sc.problem("henon-heiles").system), sc.SVI(1))
+        assert "Hamilton&#39;s equations</h2>" in page
+        assert page.count("(19a)") == page.count("(19b)") == 2
+
+    def test_names_are_escaped(self):
+        system = sc.LagrangianSystem.from_text(name="<b> & */ q", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+        page = derivation_html(system, sc.SVI(1))
+        assert "<h1>&lt;b&gt; &amp; */ q</h1>" in page
+        Page(page)
+
+    def test_a_large_system_is_cut_short_and_says_so(self):
+        system = sc.problem("outer-solar-system").system
+        page = derivation_html(system, sc.SVI(8))
+        assert len(page.encode()) < 1_000_000
+        Page(page)
+        assert re.search(r"The first \d of 18 equations\.", page)
+        assert "144 rows and columns" in page
+        assert "they are left out here" in page
+        function = functions_of(sc.generate_source(system, sc.SVI(8))[0].code)["quadrature_slope"]
+        assert f"/* .. {len(function.text.splitlines()) - MOST_LINES} more lines */" in page
+
+    def test_equal_derivations_give_equal_pages(self):
+        assert derivation_html(sc.problem("kepler").system, sc.SVI(2)) == kepler_page(sc.SVI(2))
+
+
+@pytest.mark.parametrize(("size", "scheme"), VIEWS)
+def test_in_a_browser(browser, tmp_path, size, scheme):
+    with opened(browser, kepler_page(sc.SCVI(2)), tmp_path / "kepler.html", size, scheme) as view:
+        assert_it_asks_for_nothing(view)
+        assert_nothing_sticks_out(view)
+        view.evaluate("document.querySelectorAll('details').forEach(pair => pair.open = true)")
+        assert_nothing_sticks_out(view)
+        boxes = view.evaluate(FORMULAS)
+        assert len(boxes) > 200
+        assert all(width > 4.0 and height > 8.0 for width, height in boxes)
+        fractions = view.evaluate(FRACTIONS)
+        assert len(fractions) > 50
+        assert all(height > 12.0 and above <= below + 0.5 for height, above, below in fractions)
+        assert view.evaluate(UNREADABLE) == []
+        sides = view.evaluate(
+            "[...document.querySelectorAll('.sides')].map(sides => [...sides.children].map(side => {"
+            " const box = side.getBoundingClientRect(); return [box.left, box.top, box.bottom]; }))"
+        )
+        assert len(sides) > 20
+        for left, right in sides:
+            beside = left[1] == right[1] and left[0] < right[0]
+            below = left[2] <= right[1] and left[0] == right[0]
+            assert beside if size == "desk" else below
+        assert view.evaluate("[...document.querySelectorAll('svg')].every(e => e.getBoundingClientRect().width > 200)")
+
+
+class TestCommand:
+    def test_a_page_is_written(self, tmp_path):
+        path = tmp_path / "page.html"
+        done = CliRunner().invoke(main, ["derive", "kepler", "--method", "svi", "--degree", "2", "--html", str(path)])
+        assert done.exit_code == 0, done.output
+        assert done.stderr == f"wrote {path}\n"
+        assert done.stdout == ""
+        assert path.read_text(encoding="utf-8").rstrip("\n") == kepler_page(sc.SVI(2)).rstrip("\n")
+        assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
+
+    @pytest.mark.parametrize("more", [["--latex"], ["--radicals"], ["-o", "text"]])
+    def test_it_is_not_mixed_with_text(self, more, tmp_path):
+        done = CliRunner().invoke(main, ["derive", "kepler", "--html", str(tmp_path / "page.html"), *more])
+        assert done.exit_code == 2
+        assert "leave out --latex, --radicals and -o" in done.stderr
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_folder_that_is_not_there_is_named(self):
+        done = CliRunner().invoke(main, ["derive", "kepler", "--html", "no/page.html"])
+        assert done.exit_code == 2
+        assert "there is no folder 'no'" in done.stderr
+
+
+def test_operations_are_those_of_sympy():
+    x = sympy.Symbol("x")
+    assert operations(sympy.sin(x) ** 2 / 3 + x) == sympy.count_ops(sympy.sin(x) ** 2 / 3 + x) == 4
+
+
+def test_what_is_left_out_is_counted():
+    x = sympy.symbols("x:300")
+    short, long = Formula(x[0] + x[1]), Formula(sympy.Add(*(s**2 for s in x)))
+    left = [block.text if isinstance(block, Paragraph) else block for block in formulas([short, long, short], "row")]
+    assert left == [short, short, "1 row of more than 400 operations left out, the longest of 599."]
+    assert list(formulas([short] * 20, "row"))[-1] == Paragraph("The first 12 of 20 rows.")
+    wide = Formula(sympy.Add(*x))
+    assert list(formulas([wide] * 4, "row")) == [wide, wide, Paragraph("The first 2 of 4 rows.")]
+    assert list(formulas([wide] * 4, "row", together=2000)) == [wide] * 4

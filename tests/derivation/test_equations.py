@@ -1,0 +1,206 @@
+"""The closed form: the paper's own example, and agreement with the compiled steps, which solve other unknowns."""
+
+import re
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from sympy import cos, sin, sqrt
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.models.problems import double_pendulum, duffing, kepler, planar_pendulum
+
+UNIT = {"m": 1, "l": 1, "g": 1}
+
+
+def unit_pendulum(expression):
+    return expression.subs({sympy.Symbol(name, real=True): value for name, value in UNIT.items()})
+
+
+def test_the_two_point_pendulum_is_the_papers_36_and_37():
+    derived = derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True)
+    q1, v, q, p, h = sympy.symbols("Q_1 v_0 q_k p_k h", real=True)
+    first, second = (3 + sqrt(3)) / 6, (3 - sqrt(3)) / 6
+    equation_36 = q1 / h**2 + sin(q1) - v / h - q / h**2
+    G = -(3 + sqrt(3)) * h / 12 * sin(first * q + second * q1) - (3 - sqrt(3)) * h / 12 * sin(second * q + first * q1)
+    equation_37 = -q1 / h + q / h + G + p
+    stage, momentum = (unit_pendulum(e.residual) for e in derived.equations)
+    assert [e.number for e in derived.equations] == ["34a", "34d"]
+    assert sympy.simplify(stage - equation_36) == 0
+    assert sympy.simplify(momentum - equation_37) == 0
+    assert derived.entries == ()
+
+
+def test_28_to_30_for_the_two_point_svi():
+    """The Galerkin form (28): A~ Q~ = -G - (p_k, 0, ..)^T with (29) for the free particle's part."""
+    derived = derive(planar_pendulum(), SVI(1, "gauss-legendre:2"), radicals=True)
+    q1, q, h = sympy.symbols("Q_1 q_k h", real=True)
+    (row,) = derived.equations
+    kinetic = unit_pendulum(row.residual).subs(sympy.Symbol("p_k", real=True), 0)
+    kinetic = kinetic.xreplace(dict.fromkeys(kinetic.atoms(sin), sympy.S.Zero))
+    assert sympy.simplify(kinetic - (q - q1) / h) == 0
+    assert row.number == "27a"
+    assert derived.end_momentum[0].number == "27c"
+
+
+SYSTEMS = [planar_pendulum(), kepler(), double_pendulum(), duffing().with_parameters(gamma=0.3, omega=1.3)]
+METHODS = [
+    SVI(1),
+    SVI(2, "gauss-lobatto:3", "legendre-lobatto"),
+    SVI(3, "gauss-legendre:4", "equispaced"),
+    SCVI(1, "gauss-legendre:2"),
+    SCVI(2),
+    SCVI(3, "gauss-legendre:4"),
+    SCVI(2, variational=False),
+    SpectralCollocation(2),
+    SpectralCollocation(3, form="phase-space"),
+    Gauss(2),
+    RadauIIA(2),
+    RadauIA(2, form="position"),
+    LobattoIIIA(3),
+    StoermerVerlet(),
+    ExplicitEuler(),
+]
+STATES = {1: ([0.7], [0.4], 0.2), 2: ([0.7, -0.3], [0.3, 0.9], 0.15)}
+
+
+def solved(derived, stepper):
+    """End state by Newton's iteration in 30 digits on the closed form, from its own first guess."""
+    q, p, h = STATES[derived.system.dimension]
+    t = 0.3
+    known = dict(zip(derived.state[0], q, strict=True)) | dict(zip(derived.state[1], p, strict=True))
+    known |= {derived.time: t, derived.step: h}
+    known |= dict(zip(derived.system.parameters, stepper.defaults, strict=True))
+    velocity = stepper.velocity(q, p, t)
+    names = [f"{x.name}_dot_k" for x in derived.system.coordinates]
+    velocities = {sympy.Symbol(n, real=True): v for n, v in zip(names, velocity, strict=True)}
+
+    def number(expression):
+        return derived.numeric(expression).subs(known)
+
+    with mpmath.workdps(30):
+        residuals = [number(e.residual) for e in derived.equations]
+        jacobian = derived.jacobian.applyfunc(number)
+        function = sympy.lambdify(derived.unknowns, residuals, "mpmath")
+        slope = sympy.lambdify(derived.unknowns, sympy.Matrix(jacobian), "mpmath")
+        x = mpmath.matrix(
+            [mpmath.mpf(str(derived.initial_guess[u].subs(known | velocities))) for u in derived.unknowns]
+        )
+        for _ in range(12):
+            x -= mpmath.lu_solve(slope(*x), mpmath.matrix(function(*x)))
+        assert max(abs(r) for r in function(*x)) < mpmath.mpf("1e-25")
+        ends = (*derived.end_position, *derived.end_momentum)
+        values = sympy.lambdify(derived.unknowns, [number(e.residual) for e in ends], "mpmath")(*x)
+    m = derived.system.dimension
+    return (q, p, h, t), np.array(values[:m], float), np.array(values[m:], float)
+
+
+@pytest.mark.parametrize("system", SYSTEMS, ids=lambda s: s.name)
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_closed_form_and_compiled_step_agree(system, method):
+    stepper = compile_stepper(system, method)
+    (q, p, h, t), q1, p1 = solved(derive(system, method), stepper)
+    compiled = stepper.step(q, p, h, t)
+    np.testing.assert_allclose(compiled[0], q1, rtol=1e-14, atol=4e-15)
+    np.testing.assert_allclose(compiled[1], p1, rtol=1e-14, atol=4e-15)
+
+
+@pytest.mark.parametrize("system", SYSTEMS[:3], ids=lambda s: s.name)
+@pytest.mark.parametrize("form", ["position", "phase-space"])
+@pytest.mark.parametrize("degree", [1, 3])
+def test_matrix_form_vanishes_where_the_scalar_form_does(system, form, degree):
+    """(18), (21) with Kronecker products against the written-out equations, off the solution too for (18)."""
+    derived = derive(system, SpectralCollocation(degree, form=form))
+    generator = np.random.default_rng(degree)
+    symbols = [*derived.unknowns, *derived.state[0], *derived.state[1], *system.parameters]
+    values = {
+        s: sympy.Float(str(x), 40) for s, x in zip(symbols, generator.uniform(0.4, 0.9, len(symbols)), strict=True)
+    }
+    values |= {derived.time: sympy.Float("0.3", 40), derived.step: sympy.Float("0.2", 40)}
+    scalar = [derived.numeric(e.residual).subs(values) for e in derived.equations]
+    matrix = [e.subs(values) for e in derived.matrix_form().residual]
+    m = system.dimension
+    if form == "position":
+        assert len(matrix) == degree * m
+        assert max(abs(a - b) for a, b in zip(scalar, matrix, strict=False)) < 1e-30
+        return
+    # (21) is A times the Runge-Kutta rows: the first half (15) holds by construction, the second is -A (scalar rows)
+    A = sympy.Matrix(derived.matrix_form().A).subs(values)
+    rows = sympy.Matrix(degree, m, scalar)
+    expected = [*[0] * (degree * m), *(-A * rows)]
+    assert max(abs(a - b) for a, b in zip(expected, matrix, strict=True)) < 1e-30
+
+
+def test_matrix_form_is_one_of_spectral_collocation():
+    with pytest.raises(MethodError, match="spectral collocation"):
+        derive(planar_pendulum(), SVI(2)).matrix_form()
+
+
+@pytest.mark.parametrize("method", [SVI(3, "gauss-legendre:3"), SCVI(2), SpectralCollocation(4), Gauss(3), SVI(4)])
+def test_radicals_are_the_values(method):
+    derived = derive(planar_pendulum(), method)
+    for entry in derived.entries:
+        if entry.exact is not None:
+            assert abs(sympy.N(entry.exact, 60) - sympy.Float(str(entry.value), 60)) < sympy.Float("1e-50")
+
+
+def test_radicals_are_found_where_they_are_short():
+    for method in (SVI(2), SVI(3), SCVI(2, "gauss-legendre:3"), SpectralCollocation(3), Gauss(3), RadauIIA(2)):
+        assert derive(planar_pendulum(), method, radicals=True).entries == ()
+    assert derive(planar_pendulum(), SVI(9), radicals=True).entries != ()
+
+
+def test_names_of_the_derivation_yield_to_names_of_the_system():
+    system = LagrangianSystem.from_text(
+        name="clash", coordinates=["q"], lagrangian="h*q_dot**2/2 - w_1*q**2", parameters={"h": 1.0, "w_1": 2.0}
+    )
+    derived = derive(system, SVI(1, "gauss-legendre:2"))
+    assert derived.step.name == "_h"
+    stepper = compile_stepper(system, SVI(1, "gauss-legendre:2"))
+    (q, p, h, t), q1, p1 = solved(derived, stepper)
+    np.testing.assert_allclose(stepper.step(q, p, h, t), (q1, p1), rtol=1e-14)
+
+
+def test_displays():
+    derived = derive(kepler(), SCVI(2))
+    assert "lambda_1_q1" in derived.to_text()
+    assert r"\tag{34d}" in derived._repr_latex_()
+    assert derived._repr_latex_().count(r"\begin{align*}") == 3  # equations, tables, momentum maps
+    kinds = {e.kind for e in derived.stage_equations}
+    assert kinds == {"stage", "multiplier"}
+    assert [e.number for e in derived.idel_equations] == ["34d", "34d", "34e", "34e"]
+    assert derived.jacobian.shape == (10, 10)
+
+
+def test_explicit_time_appears_with_the_points():
+    derived = derive(duffing(), SVI(1, "gauss-legendre:2"))
+    assert cos(sympy.Symbol("omega", real=True) * (derived.time + sympy.Symbol("d_1", real=True) * derived.step)) in (
+        derived.equations[0].residual.atoms(cos)
+    )
+
+
+@pytest.mark.parametrize("method", [SVI(2), SVI(2, "hermite:2"), SCVI(2)], ids=lambda method: method.name)
+def test_latex_has_one_index_and_one_exponent_at_a_letter_and_names_the_new_state(method):
+    text = derive(kepler(), method).to_latex()
+    assert not re.search(r"_\{[^{}]*\}_|\^\{[^{}]*\}\^", text)
+    assert text.count("p_{q_{2},k+1} &=") == text.count("q_{1,k+1} &=") == 1
+
+
+def test_a_weight_that_is_zero_is_shown_as_such():
+    derived = derive(planar_pendulum(), SpectralCollocation(2, form="phase-space"))
+    assert {entry.symbol.name: entry.exact for entry in derived.entries}["b_2"] == 0

@@ -1,0 +1,177 @@
+"""What notebooks show of systems, methods, equations, steppers and trajectories."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from browsing import UNREADABLE, VIEWS, assert_it_asks_for_nothing, opened
+from html_page import Page
+from samples import compile_quickly
+
+import scvi_codegen as sc
+from scvi_codegen.display.cards import card, listed, plain, sparkline
+
+METHODS = [
+    sc.SVI(3),
+    sc.SVI(2, "hermite:2"),
+    sc.SVI(2, space="splines:2"),
+    sc.SCVI(3),
+    sc.SCVI(2, abscissae="gauss"),
+    sc.SpectralCollocation(8),
+    sc.SpectralCollocation(2, form="phase-space"),
+    sc.Gauss(2),
+    sc.RadauIIA(5),
+    sc.StoermerVerlet(),
+    sc.Composition(10),
+    sc.ExplicitEuler(),
+]
+
+
+@cache
+def trajectory() -> sc.Trajectory:
+    kepler = sc.problem("kepler")
+    stepper = compile_quickly(kepler.system, sc.SVI(2))
+    return stepper.integrate(kepler.q, stepper.momentum(kepler.q, kepler.velocity), h=0.1, steps=1000)
+
+
+DISPLAYED: dict[str, Callable[[], Any]] = {
+    "lagrangian": lambda: sc.problem("double-pendulum").system,
+    "hamiltonian": lambda: sc.problem("point-vortices").system,
+    "large system": lambda: sc.problem("outer-solar-system").system,
+    "equations": lambda: sc.derive(sc.problem("planar-pendulum").system, sc.SVI(2)),
+    "radicals": lambda: sc.derive(sc.problem("kepler").system, sc.SCVI(2), radicals=True),
+    "stepper": lambda: trajectory().stepper,
+    "trajectory": trajectory,
+} | {method.name: lambda method=method: method for method in METHODS}
+
+
+@pytest.mark.parametrize("name", DISPLAYED)
+def test_every_display_is_well_formed_and_short(name):
+    shown = DISPLAYED[name]()._repr_html_()
+    parsed = Page(shown)
+    assert parsed.elements[0] == ("div", {"class": "scvi-codegen", "style": "overflow-x:auto"})
+    assert parsed.all("script") == parsed.all("style") == []
+    assert len(shown) < 60_000
+
+
+class TestMethod:
+    def test_it_says_what_it_promises(self):
+        shown = sc.SVI(3)._repr_html_()
+        assert re.search(r">order</th><td[^>]*>6</td>", shown)
+        assert re.search(r">symplectic</th><td[^>]*>yes</td>", shown)
+        assert re.search(r">symplectic</th><td[^>]*>no</td>", sc.SpectralCollocation(3)._repr_html_())
+
+    def test_its_numbers_are_there_exactly_where_they_are_short(self):
+        shown = sc.SVI(3)._repr_html_()
+        assert "<msqrt><mn>15</mn></msqrt>" in shown
+        assert "0.77459666924148338" in shown
+        assert "msqrt" not in sc.SVI(9, "gauss-legendre:9", nodes="legendre-lobatto")._repr_html_()
+
+    def test_a_long_table_is_cut_and_says_so(self):
+        shown = sc.SVI(20)._repr_html_()
+        assert "the first 12 of 20 rows" in shown
+        assert "the first 12 of 21 rows" in shown
+
+
+class TestSystem:
+    def test_its_function_is_typeset(self):
+        shown = sc.problem("planar-pendulum").system.with_parameters(g=9.81)._repr_html_()
+        assert "<math" in shown
+        assert "<mi>L</mi>" in shown
+        assert "g = 9.81" in shown
+        assert "<mi>H</mi>" in sc.hamiltonian_of(sc.problem("planar-pendulum").system)._repr_html_()
+
+    def test_a_long_one_is_counted(self):
+        large = sc.LagrangianSystem.from_text(
+            name="chain",
+            coordinates=[f"q{k}" for k in range(40)],
+            lagrangian=" + ".join(f"q{k}_dot**2/2 - (q{k} - q{(k + 1) % 40})**4/4" for k in range(40)),
+        )._repr_html_()
+        assert re.search(r"L: \d{3} operations", large)
+        assert ".. (40)" in large
+
+    def test_names_are_escaped(self):
+        system = sc.LagrangianSystem.from_text(name="<b>&", coordinates=["q"], lagrangian="q_dot**2/2")
+        assert "&lt;b&gt;&amp;" in system._repr_html_()
+
+
+class TestEquations:
+    def test_they_are_typeset_with_their_numbers(self):
+        shown = DISPLAYED["equations"]()._repr_html_()
+        assert shown.count("(27a)") == shown.count("(27b)") == 1
+        assert "<math" in shown
+
+    def test_large_ones_are_counted_in_every_form(self):
+        derived = sc.derive(sc.problem("double-pendulum").system, sc.SVI(6))
+        assert repr(derived) == "<12 equations of double pendulum by svi-6-gauss-legendre-6>"
+        assert derived._repr_latex_() is None
+        shown = derived._repr_html_()
+        assert re.search(r"\(27a\) \d+ operations", shown)
+        small = DISPLAYED["equations"]()
+        assert small._repr_latex_() == small.to_latex()
+
+
+class TestTrajectory:
+    def test_facts_curves_and_the_range_of_the_energy(self):
+        shown = trajectory()._repr_html_()
+        assert "0 to 100, h = 0.1" in shown
+        assert "1001; q and p of shape (1001, 2)" in shown
+        energies = trajectory().energy()[::3]
+        assert f"{energies.min():.10g} to {energies.max():.10g}" in shown
+        pictures = Page(shown).all("svg")
+        assert [picture["aria-label"] for picture in pictures] == ["q1", "q2", "energy"]
+
+    def test_curves_are_thinned(self):
+        points = re.findall(r'points="([^"]*)"', trajectory()._repr_html_())
+        assert all(300 < len(line.split()) <= 400 for line in points)
+
+    def test_states_without_an_energy_are_shown_without(self):
+        run = trajectory()
+        broken = sc.Trajectory(
+            t=run.t,
+            q=np.zeros_like(run.q),
+            p=run.p,
+            iterations=run.iterations,
+            h=run.h,
+            parameters=run.parameters,
+            stepper=run.stepper,
+        )
+        assert 'aria-label="energy"' not in broken._repr_html_()
+
+
+def test_a_sparkline_goes_from_bottom_to_top_and_leaves_out_what_is_not_finite():
+    points = [
+        tuple(map(float, pair.split(",")))
+        for pair in re.findall(r"[\d.]+,[\d.]+", sparkline([0.0, float("nan"), 2.0], ""))
+    ]
+    assert len(points) == 2
+    assert points[0][0] < points[1][0]
+    assert points[0][1] > points[1][1]
+    assert Page(sparkline([], "<none>"))
+    assert Page(sparkline([1.0, 1.0], "flat"))
+
+
+def test_cards_escape_text():
+    assert "&lt;i&gt;" in card("<i>", [("<i>", plain("<i>"))])
+    assert "<i>" not in card("<i>", [("<i>", plain("<i>"))])
+    assert listed([]) == "none"
+
+
+@pytest.mark.parametrize(("size", "scheme"), VIEWS)
+def test_in_a_browser(browser, tmp_path, size, scheme):
+    displays = "\n".join(display()._repr_html_() for display in DISPLAYED.values())
+    colors = ":root{color-scheme:light dark} body{color:CanvasText;background:Canvas}"
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'
+    page = f"<!DOCTYPE html><html><head>{head}<style>{colors}</style></head><body>{displays}</body></html>"
+    with opened(browser, page, tmp_path / "notebook.html", size, scheme) as view:
+        assert_it_asks_for_nothing(view)
+        assert view.evaluate("document.documentElement.scrollWidth") <= view.width
+        assert view.evaluate(UNREADABLE) == []
+        boxes = view.evaluate("[...document.querySelectorAll('polyline')].map(e => e.getBoundingClientRect().width)")
+        assert len(boxes) == 3
+        assert min(boxes) > 100.0

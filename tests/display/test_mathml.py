@@ -1,0 +1,303 @@
+"""MathML: what stands there is the expression, symbol by symbol, and browsers can read it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import sympy
+from sympy import Float, Function, Matrix, Mul, Pow, Rational, Symbol, cos, exp, pi, sin, sqrt, symbols
+
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.display.mathml import mathml, mathml_terms
+from scvi_codegen.display.mathml.names import latex_name
+from scvi_codegen.display.mathml.printer import ONE_LINE
+from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
+from scvi_codegen.models.problems import problem
+
+x, y, h = symbols("x y h")
+LEAVES = {
+    "sin": "math.sin",
+    "cos": "math.cos",
+    "log": "math.log",
+    "e": "math.e",
+    "π": "math.pi",
+    "\N{MINUS SIGN}": "-",
+    "\u2062": "*",
+    "·": "*",
+    "×": "*",
+}
+FUNCTIONS = ("math.sin", "math.cos", "math.log", "(lambda")
+
+
+def inner(expression: sympy.Basic) -> str:
+    """The MathML of an expression within ``<math>``."""
+    return mathml(expression).removeprefix("<math>").removesuffix("</math>")
+
+
+class Reader:
+    """Evaluates presentation MathML as a mathematician would read it, given the values of symbols."""
+
+    def __init__(self, values: dict[Symbol, float]) -> None:
+        self.values = {inner(symbol): value for symbol, value in values.items()}
+
+    def value(self, *elements: str) -> float:
+        tokens = [token for text in elements for child in ElementTree.fromstring(text) for token in self.tokens(child)]
+        return float(eval(self.joined(tokens)))
+
+    def joined(self, tokens: list[str]) -> str:
+        """Operands side by side are factors."""
+        text = ""
+        for before, token in zip(["(", *tokens], tokens, strict=False):
+            operands = before[-1].isalnum() or before[-1] in ").", token[0].isalnum() or token[0] == "("
+            text += "*" if all(operands) and not before.startswith(FUNCTIONS) else ""
+            text += token
+        return text
+
+    def tokens(self, element: ElementTree.Element) -> Iterator[str]:
+        known = self.values.get(ElementTree.tostring(element, encoding="unicode"))
+        if known is not None:
+            yield f"({known!r})"
+            return
+        children = list(element)
+        match element.tag:
+            case "mrow":
+                yield from (token for child in children for token in self.tokens(child))
+            case "mi" | "mn" | "mo":
+                yield LEAVES.get(element.text or "", element.text or "")
+            case "mfrac":
+                yield f"(({self.expression(children[0])})/({self.expression(children[1])}))"
+            case "msqrt":
+                yield f"(({self.joined([t for c in children for t in self.tokens(c)])})**0.5)"
+            case "mroot":
+                yield f"(({self.expression(children[0])})**(1/({self.expression(children[1])})))"
+            case "msup":
+                yield from self.power(children[0], children[1])
+            case "msubsup":
+                base = ElementTree.Element("msub")
+                base.extend(children[:2])
+                yield from self.power(base, children[2])
+            case _:
+                raise AssertionError(f"what is {element.tag}?")
+
+    def expression(self, element: ElementTree.Element) -> str:
+        return self.joined(list(self.tokens(element)))
+
+    def power(self, base: ElementTree.Element, exponent: ElementTree.Element) -> Iterator[str]:
+        """A power; that of a function's name is the power of its value, that of a closing bracket ends the bracket."""
+        if base.tag == "mi" and base.text in ("sin", "cos"):
+            yield f"(lambda z: {LEAVES[base.text]}(z)**({self.expression(exponent)}))"
+        elif base.tag == "mo":
+            yield f")**({self.expression(exponent)})"
+        else:
+            yield f"(({self.expression(base)})**({self.expression(exponent)}))"
+
+
+EXPRESSIONS = [
+    -(x + y) / 2,
+    Mul(-1, x + y, evaluate=False),
+    x - Mul(1, x + y, evaluate=False),
+    Mul(2, Mul(3, x, evaluate=False), evaluate=False),
+    2 * 3**x,
+    Rational(2, 3) * 5**y * x,
+    (x - y) / h,
+    -(x - y) / h**2,
+    1 / x,
+    -1 / x,
+    x**-y,
+    x**y / h,
+    (-2) ** Symbol("n"),
+    Rational(1, 3) ** x,
+    Rational(-1, 3) ** Symbol("n"),
+    sqrt(3) / 6 - Rational(1, 2),
+    1 / sqrt(x + y),
+    (x + y) ** Rational(3, 2) + (x**2 + y**2) ** Rational(-3, 2),
+    (x + y) ** Rational(-1, 3) * h,
+    sin(x) ** 2 * cos(x + y) ** 3 - sin(x) ** -2,
+    sin(-x) * cos(x / 2 - y),
+    exp(-x * y) / (1 + exp(x)),
+    pi * x / 4,
+    x * y**2 * (x + y) ** 2 * (x - 2 * y),
+    Symbol("Q_1") ** 2 + Symbol("Q__2_x") ** -2 + Symbol("theta1") ** 2 * Symbol("q_dot") ** 2,
+    Mul(Rational(-1, 2), x + y, x - y, evaluate=False),
+    Float("1.5e-7") * x - Float("2.25") * y + Float("-4e12"),
+    Pow(x**2, y, evaluate=False),
+    Pow(-x, 2, evaluate=False),
+    h * (x + y + 3) * (x + 2 * y + 5) * sin(x + y + h) / 7,
+    (x + y) * (x - y) / (h * (x + 3) * (y + 4)),
+]
+
+DERIVED = [
+    ("planar-pendulum", SVI(2), True),
+    ("planar-pendulum", SCVI(2), False),
+    ("double-pendulum", SVI(1), True),
+    ("double-pendulum", SVI(2), False),
+    ("kepler", SCVI(2), True),
+    ("duffing", SpectralCollocation(3), True),
+    ("henon-heiles", Gauss(2), False),
+]
+
+
+def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
+    """One element, and all pieces, read as the expression."""
+    draws = np.random.default_rng(seed).uniform(0.5, 1.5, len(expression.free_symbols))
+    values = dict(zip(sorted(expression.free_symbols, key=str), map(float, draws), strict=True))
+    if Symbol("n") in values:
+        values[Symbol("n")] = 3.0
+    reader = Reader(values)
+    expected = float(expression.xreplace({symbol: Float(value) for symbol, value in values.items()}).evalf())
+    assert reader.value(mathml(expression)) == pytest.approx(expected, rel=1e-10, abs=1e-12)
+    pieces = [piece for term in mathml_terms(expression) for piece in term]
+    assert reader.value(*pieces) == pytest.approx(expected, rel=1e-10, abs=1e-12)
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+def test_it_reads_as_the_expression(expression):
+    check_read_back(expression)
+
+
+@pytest.mark.parametrize(("name", "method", "radicals"), DERIVED, ids=lambda value: getattr(value, "name", str(value)))
+def test_derived_equations_read_as_they_are(name, method, radicals):
+    derived = derive(problem(name).system, method, radicals=radicals)
+    for equation in (*derived.equations, *derived.end_momentum):
+        check_read_back(equation.residual)
+
+
+TAU_1 = "<msub><mi>τ</mi><mn>1</mn></msub>"
+DOT = "<mo>˙</mo></mover>"
+NAMED = {
+    "theta_1": "<msub><mi>θ</mi><mn>1</mn></msub>",
+    "theta1": "<msub><mi>θ</mi><mn>1</mn></msub>",
+    "Q__2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
+    "Q_2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
+    "Q_1": "<msup><mi>Q</mi><mn>1</mn></msup>",
+    "\\dot{q}": f'<mover accent="true"><mi>q</mi>{DOT}',
+    "\\hat{D}_1": '<msub><mover accent="true"><mi>D</mi><mo>^</mo></mover><mn>1</mn></msub>',
+    "w__'_1": "<msubsup><mi>w</mi><mn>1</mn><mo>′</mo></msubsup>",
+    "q_dot": f'<mover accent="true"><mi>q</mi>{DOT}',
+    "q1_dot_k": f'<msub><mover accent="true"><mi>q</mi>{DOT}<mrow><mn>1</mn><mo>,</mo><mi>k</mi></mrow></msub>',
+    "p_k": "<msub><mi>p</mi><mi>k</mi></msub>",
+    "q_{k+1}": "<msub><mi>q</mi><mrow><mi>k</mi><mo>+</mo><mn>1</mn></mrow></msub>",
+    "lambda_1_q1": "<msub><mi>λ</mi><mrow><mn>1</mn><mo>,</mo><msub><mi>q</mi><mn>1</mn></msub></mrow></msub>",
+    "l_1_0": f'<mrow><msub><mi>l</mi><mn>0</mn></msub><mrow><mo stretchy="false">(</mo>{TAU_1}'
+    '<mo stretchy="false">)</mo></mrow></mrow>',
+    "_h": "<mi>h</mi>",
+    "a<b&c": "<mi>a&lt;b&amp;c</mi>",
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_names(name):
+    assert inner(Symbol(name)) == NAMED[name]
+
+
+def test_names_of_tables():
+    assert "<mi>l</mi><mo>˙</mo>" in inner(Symbol("dl_2_1"))
+    assert "<mi>D</mi><mo>^</mo>" in inner(Symbol("DD_1_0"))
+    assert "<msup><mi>A</mi><mn>2</mn></msup>" in inner(Symbol("aa_1_2"))
+    assert "<mi>b</mi><mi>A</mi>" in inner(Symbol("bA_2"))
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [("0.1", "0.1"), ("3.0", "3"), ("0.33333333333333333", "0.333333"), ("1e-12", "1×10\N{MINUS SIGN}12")],
+)
+def test_numbers_have_sensible_digits(number, text):
+    assert "".join(ElementTree.fromstring(mathml(Float(number, 50))).itertext()) == text
+
+
+def test_a_power_of_a_symbol_with_an_upper_index_is_in_brackets():
+    assert inner(Symbol("Q_1") ** 2).startswith('<msup><mrow><mo stretchy="false">(')
+    assert inner(Symbol("x_1") ** 2) == "<msubsup><mi>x</mi><mn>1</mn><mn>2</mn></msubsup>"
+
+
+def test_brackets_grow_with_fractions_only():
+    assert 'stretchy="false"' in inner(sin(x + y))
+    assert 'stretchy="false"' not in inner(sin(x / 2))
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        Matrix([[1, -x], [sqrt(2) / 2, x**2 / 3]]),
+        sympy.Eq(Symbol("q_dot"), Function("L_d")(Symbol("q_0"), Symbol("q_1"))),
+        sympy.Derivative(Function("L")(x, y), x),
+        sympy.Integral(exp(-(x**2)), (x, 0, 1)),
+        sympy.Sum(Symbol("w_n"), (Symbol("n"), 1, Symbol("g"))),
+        sympy.Piecewise((x, x > 0), (y, True)),
+        sympy.kronecker_product(sympy.MatrixSymbol("A", 2, 2), sympy.MatrixSymbol("E", 2, 2)),
+        sympy.MatrixSymbol("A", 2, 2) * sympy.MatrixSymbol("Q", 2, 1) + sympy.MatrixSymbol("B", 2, 1),
+        sympy.I * x + sympy.oo,
+        sympy.Tuple(x, y),
+    ],
+    ids=lambda expression: type(expression).__name__,
+)
+def test_all_kinds_are_well_formed_and_without_html_entities(expression):
+    for text in (mathml(expression, display=True), *(piece for term in mathml_terms(expression) for piece in term)):
+        ElementTree.fromstring(text)
+        assert set(re.findall(r"&\w+;", text)) <= {"&lt;", "&gt;", "&amp;"}
+
+
+def test_functions_keep_their_names():
+    assert inner(Function("L_d")(x)).startswith("<mrow><msub><mi>L</mi><mi>d</mi></msub>")
+
+
+class TestTerms:
+    def test_a_short_equation_is_one_piece(self):
+        assert len(mathml_terms(x + y, h)) == len(mathml_terms(x + y, h)[0]) == 1
+        assert mathml_terms(sympy.Eq(h, x + y)) == mathml_terms(x + y, h)
+
+    def test_a_long_sum_is_broken_before_its_signs(self):
+        total = sympy.Add(*(Symbol(f"x_{n}") * Symbol(f"y_{n}") for n in range(12)))
+        assert len(str(total)) > ONE_LINE
+        first, *others = mathml_terms(total - h, h)
+        assert ["<mo>=</mo>" in piece for piece in first] == [True, False]
+        assert len(others) == 12
+        assert all('<mo form="infix">' in term[0] and len(term) == 1 for term in others)
+
+    def test_a_long_left_side_is_broken_like_a_right_one(self):
+        total = sympy.Add(*(Symbol(f"x_{n}") * Symbol(f"y_{n}") for n in range(12)))
+        terms = mathml_terms(sympy.S.Zero, total)
+        assert len(terms) == 13
+        assert '<mo form="infix">=</mo><mn>0</mn>' in terms[-1][0]
+
+    def test_a_long_product_is_broken_before_its_wide_factors(self):
+        product = x * (x + y + 111111) * (x - y + 222222) * sin(x + 333333 * y) * cos(y + 444444 * x)
+        (term,) = mathml_terms(product)
+        assert len(term) == 5
+
+    def test_a_wide_denominator_becomes_a_power_that_can_be_broken(self):
+        square = sum((Symbol(f"aaaaaa_{n}") + Symbol(f"bbbbbb_{n}")) ** 2 for n in range(4))
+        (term,) = mathml_terms(x * square ** Rational(-3, 2))
+        assert len(term) == 5
+        assert "<mfrac>" not in "".join(term)
+        check_read_back(x * square ** Rational(-3, 2))
+
+
+def test_reading_back_finds_a_wrong_sign():
+    reader = Reader({x: 2.0, y: 3.0})
+    assert reader.value(mathml(x - y)) == -1.0
+    assert reader.value(mathml(x - y).replace("\N{MINUS SIGN}", "+")) == 5.0
+    assert math.isclose(reader.value(mathml(sin(x) ** 2)), math.sin(2.0) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "latex"),
+    [
+        ("theta_1_dot", r"\dot{\theta}_{1}"),
+        ("q1_dot_k", r"\dot{q}_{1,k}"),
+        ("Q_2_x", "Q_{x}^{2}"),
+        ("p_q1_k+1", "p_{q_{1},k+1}"),
+        ("l_1_0", r"l_{0}(\tau_{1})"),
+        ("dl_3_2", r"\dot{l}_{2}(\tau_{3})"),
+        ("DD_1_0", r"(\hat{D}\tilde{D})_{1,0}"),
+        ("aa_n_j", "(A^{2})_{n,j}"),
+        ("bA_2", "(bA)_{2}"),
+    ],
+)
+def test_names_are_read_the_same_way_in_latex(name, latex):
+    assert latex_name(name) == latex

@@ -1,0 +1,133 @@
+"""What a fault may be: a changed function, an edit of the C text, a wrong table; and changes to make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import sympy
+from sabotage import Case, Make, Sabotage, changed_result
+
+from scvi_codegen.ir.program import Operation
+from scvi_codegen.lowering.solvers import choice
+from scvi_codegen.methods import SVI, RungeKutta, shooting
+from scvi_codegen.tables.precision import mp
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """A fault, what it is tried on, and how it is made."""
+
+    name: str
+    case: Case
+    apply: Callable[[Sabotage], None]
+    edits_text: bool = False
+
+
+def function(name: str, where: Case, home: Any, attribute: str, make: Make) -> Mutation:
+    return Mutation(name, where, lambda sabotage: sabotage.replace(home, attribute, make))
+
+
+def here(name: str, where: Case, home: Any, attribute: str, make: Make) -> Mutation:
+    return Mutation(name, where, lambda sabotage: sabotage.replace_here(home, attribute, make))
+
+
+def text(name: str, where: Case, pattern: str, replacement: str, *, within: str = "") -> Mutation:
+    """An edit of the C text, the first place after the head of the function ``within``."""
+    if within:
+        pattern, replacement = rf"(\b{within}\([^;{{]*\)\n\{{\n(?:.*\n)*?.*?){pattern}", rf"\g<1>{replacement}"
+    return Mutation(name, where, lambda sabotage: sabotage.edit(pattern, replacement), edits_text=True)
+
+
+def wrong_tableau(name: str, where: Case, **changes: Make) -> Mutation:
+    """A tableau that is wrong from the beginning: both sides use it."""
+    made = where.method()
+    assert isinstance(made, RungeKutta)
+    other = replace(made.tableau, **{key: change(getattr(made.tableau, key)) for key, change in changes.items()})
+    return Mutation(name, replace(where, method=lambda: RungeKutta(other, made.form)), lambda sabotage: None)
+
+
+def wrong_rule(name: str, where: Case, change: Make) -> Mutation:
+    """A quadrature that is wrong from the beginning."""
+    made = where.method()
+    assert isinstance(made, SVI)
+    other = change(made.quadrature)
+    return Mutation(name, replace(where, method=lambda: SVI(made.degree, other)), lambda sabotage: None)
+
+
+def eight_digits(x: Any) -> Any:
+    return type(x)(mp.nstr(mp.mpf(x), 8))
+
+
+def eight_digits_text(x: float) -> str:
+    return f"{x:.7e}"
+
+
+def scaled_first(factor: Any) -> Make:
+    return lambda values: (values[0] * factor, *values[1:])
+
+
+def reversed_rows(rows: Any) -> Any:
+    return tuple(rows[::-1])
+
+
+def transposed(rows: Any) -> Any:
+    return tuple(zip(*rows, strict=True))
+
+
+def without_negation(original: Any) -> Any:
+    def printed(expression: Any, context: int) -> Any:
+        negated = isinstance(expression, Operation) and expression.operator == "neg"
+        return original(expression.operands[0] if negated else expression, context)
+
+    return printed
+
+
+def without_rates_of(*names: str) -> Make:
+    """The chain rule without the terms of some variables."""
+
+    def make(original: Any) -> Any:
+        def rate(expressions: Any, variables: Any, rates: Any) -> Any:
+            kept = [pair for pair in zip(variables, rates, strict=False) if pair[0].name not in names]
+            return original(expressions, *(tuple(part) for part in zip(*kept, strict=True)))
+
+        return rate
+
+    return make
+
+
+def slopes(change: Callable[[int, sympy.Expr], sympy.Expr]) -> Make:
+    """Derivatives of the kernel in Newton's matrix, not its values."""
+    return changed_result(lambda found: (tuple(change(k, slope) for k, slope in enumerate(found[0])), found[1]))
+
+
+def last_column_negated(stages: Any) -> Any:
+    """The scatter tables of the last gather, with p1 changed by the other sign."""
+    family = stages.families[-1]
+    own = family.scatters[0]
+    entries = tuple((*line[:-1], -line[-1]) for line in own.table.entries)
+    scatter = replace(own, table=replace(own.table, entries=entries))
+    return replace(stages, families=(*stages.families[:-1], replace(family, scatters=(scatter, *family.scatters[1:]))))
+
+
+def of_another_system(original: Any) -> Any:
+    """L + 1e-6 q in place of L: consistent, symplectic, symmetric."""
+    return lambda self: original(replace(self, scalar=self.scalar + self.gathers[0].arguments[0] / 10**6))
+
+
+def as_printed(sabotage: Sabotage) -> None:
+    """The chain-rule term of the discrete Lagrangian lost everywhere, as in the paper."""
+    sabotage.replace(shooting, "_shooting_nodal", lambda _: shooting._printed_nodal)
+    sabotage.replace(shooting, "_shooting_increments", lambda _: shooting._printed_increments)
+    sabotage.replace_here(choice, "shooting_sweep", lambda _: choice.printed_sweep)
+
+
+def power_rule_halved(original: Any) -> Any:
+    """Of squares: d(x^2) = x dx."""
+
+    def partial(node: Any, position: int) -> Any:
+        found = original(node, position)
+        return found / 2 if node.is_Pow and node.exp == 2 and position == 0 else found
+
+    return partial

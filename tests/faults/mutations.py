@@ -1,0 +1,354 @@
+"""Faults for the generator: a certificate that does not catch each of them is worth nothing.
+
+Each is named for what is wrong and has a case in which it makes a difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import sympy
+from certified_cases import case
+from faults import (
+    Mutation,
+    as_printed,
+    eight_digits,
+    eight_digits_text,
+    function,
+    here,
+    last_column_negated,
+    of_another_system,
+    power_rule_halved,
+    reversed_rows,
+    scaled_first,
+    slopes,
+    text,
+    transposed,
+    without_negation,
+    without_rates_of,
+    wrong_rule,
+    wrong_tableau,
+)
+from sabotage import changed_result, of_entries
+
+from scvi_codegen.formulas import derivatives
+from scvi_codegen.lowering import program as lowering
+from scvi_codegen.lowering.solvers import collocation as collocation_sweep
+from scvi_codegen.lowering.solvers import coupled, separable
+from scvi_codegen.mechanics import forms as mechanics
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.methods import (
+    collocation,
+    composition,
+    shooting,
+    stage_system,
+)
+from scvi_codegen.methods import method as method_room
+from scvi_codegen.rendering import printer as c_printer
+from scvi_codegen.tables import quadrature, tableau
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.spaces import Splines, Trigonometric
+
+__all__ = ["MUTATIONS"]
+
+MUTATIONS = (
+    # The printer and the lowering.
+    function(
+        "numbers printed with 8 digits", case("pendulum/svi"), c_printer, "print_number", lambda _: eight_digits_text
+    ),
+    function("minus signs lost", case("double/svi"), c_printer, "_print", without_negation),
+    function("tables rounded to 8 digits", case("double/svi"), lowering, "lower_matrix", of_entries(eight_digits)),
+    function(
+        "weights rounded to 8 digits",
+        case("cart/svi"),
+        lowering,
+        "lower_vector",
+        changed_result(lambda found: tuple(map(eight_digits, found))),
+    ),
+    function(
+        "parameters exchanged",
+        case("double/svi"),
+        lowering,
+        "lower_kernel",
+        lambda original: lambda name, *, parameters, **named: original(name, parameters=parameters[::-1], **named),
+    ),
+    function(
+        "powers from the third on one too low",
+        case("driven/svi"),
+        lowering._Graph,
+        "_whole",
+        lambda original: lambda self, x, n: original(self, x, n - 1 if n > 2 else n),
+    ),
+    function(
+        "r^-5 for r^-3",
+        case("kepler/svi-3"),
+        lowering,
+        "INVERSE_ROOTS",
+        lambda own: {**own, sympy.Integer(-3): "inverse_root_5"},
+    ),
+    function(
+        "a power of h too much in a gather",
+        case("double/svi"),
+        lowering,
+        "_gather_loop",
+        changed_result(lambda loop: replace(loop, power=loop.power + 1) if loop.name.endswith("_1") else loop),
+    ),
+    function(
+        "a power of h missing in a scatter",
+        case("double/svi"),
+        lowering,
+        "_scatter_loop",
+        changed_result(lambda loop: replace(loop, power=loop.power - 1) if loop.name.endswith("_0") else loop),
+    ),
+    function(
+        "a slope five per cent off",
+        case("double/svi"),
+        lowering,
+        "_slope_blocks",
+        slopes(lambda k, slope: slope * sympy.Rational(21, 20) if k == 0 else slope),
+    ),
+    function(
+        "a slope lost",
+        case("double/sc"),
+        lowering,
+        "_slope_blocks",
+        slopes(lambda k, slope: sympy.S.Zero if k == 1 else slope),
+    ),
+    function(
+        "the slope of H_p off",
+        case("vortices/svi"),
+        lowering,
+        "_slope_blocks",
+        slopes(lambda k, slope: slope * sympy.Rational(11, 10) if k == 1 else slope),
+    ),
+    # The C text.
+    text("the force of the sweeps negated", case("driven/svi"), r"value\[0\] = ", "value[0] = -", within="force_lanes"),
+    text("a term of the force dropped", case("driven/svi"), r" - parameters\[0\]\*u\[0\]", "", within="force_lanes"),
+    text(
+        "a term of Newton's residual dropped",
+        case("driven/svi"),
+        r" - parameters\[0\]\*u\[0\]",
+        "",
+        within="quadrature_slope",
+    ),
+    text("a factor in a slope", case("driven/svi"), r"3\.0\*", "2.0*", within="quadrature_slope"),
+    text("h for h^2", case("driven/svi"), r"data->square = h \* h;", "data->square = h;"),
+    text(
+        "a run one step ahead in time",
+        case("driven/svi"),
+        r"step\.t = run->t0 \+ \(double\)run->step",
+        "step.t = run->t0 + (double)(run->step + 1)",
+    ),
+    text("L added in the energy", case("driven/svi"), r"sum = -value\[0\];", "sum = value[0];"),
+    text(
+        "Newton's iteration accepts too early",
+        case("double/svi"),
+        r"moved->relative <= options->tolerance",
+        "moved->relative <= 1e-5",
+    ),
+    text("sweeps accept too early", case("kepler/svi-3"), r"<= tolerance \* tolerance", "<= 1e-12"),
+    text(
+        "Newton's residual wrong with kept factors",
+        case("pendulum/svi"),
+        r"value\[0\] = ",
+        "value[0] = 1.001*",
+        within="quadrature_value",
+    ),
+    text("half of the discrete action", case("pendulum/svi"), r"sum \+= ", "sum += 0.5 * ", within="quadrature_sum"),
+    text(
+        "momenta of a run advanced by dq",
+        case("kepler/svi-3"),
+        r"add_compensated\(now\.p, now\.carry_p, dp\)",
+        "add_compensated(now.p, now.carry_p, dq)",
+    ),
+    text(
+        "a kick of the wrong size", case("kepler/composition"), r"dp\[i\] \+= step->h", "dp[i] += 1.0000001 * step->h"
+    ),
+    # Solvers.
+    here(
+        "the product of two tables for another",
+        case("kepler/gauss"),
+        separable,
+        "matrix_product",
+        lambda original: lambda a, b: original(transposed(a), b) if len(a) > 1 else original(a, b),
+    ),
+    here(
+        "the mass of the sweeps doubled",
+        case("double/svi"),
+        coupled,
+        "jacobian",
+        changed_result(lambda entries: {place: 2 * entry for place, entry in entries.items()}),
+    ),
+    here(
+        "the mass at the nodes doubled",
+        case("double/gauss-position"),
+        collocation_sweep,
+        "mass_entries",
+        changed_result(lambda entries: {place: 2 * entry for place, entry in entries.items()}),
+    ),
+    function(
+        "L_q and L_v exchanged at both ends",
+        case("kepler/printed"),
+        collocation_sweep,
+        "_printed_ends",
+        changed_result(lambda ends: replace(ends, start_force=ends.end_force, end_force=ends.start_force)),
+    ),
+    # Tables of the methods.
+    function(
+        "p1 changed by the other sign",
+        case("double/svi"),
+        stage_system,
+        "stationary_increments",
+        changed_result(last_column_negated),
+    ),
+    function(
+        "tables rounded to 2^-24, together",
+        case("double/svi"),
+        stage_system,
+        "dyadic",
+        of_entries(lambda x: mp.nint(x * 2**24) / 2**24),
+    ),
+    function(
+        "two weights exchanged",
+        case("double/lobatto-svi"),
+        method_room,
+        "unit_sum",
+        changed_result(lambda w: (w[1], w[0], *w[2:])),
+    ),
+    wrong_rule(
+        "Gauss weights with 9 digits",
+        case("pendulum/svi-3"),
+        lambda rule: replace(
+            rule,
+            weights=(
+                rule.weights[0] + mp.mpf("1e-9"),
+                rule.weights[1] - mp.mpf("2e-9"),
+                *scaled_first(1 + mp.mpf("1e-9") / rule.weights[2])(rule.weights[2:]),
+            ),
+        ),
+    ),
+    wrong_tableau(
+        "Gauss tableau with 8 digits",
+        case("double/gauss"),
+        A=lambda A: tuple(tuple(map(eight_digits, row)) for row in A),
+    ),
+    wrong_tableau(
+        "another symplectic tableau",
+        case("double/gauss"),
+        A=lambda A: ((mp.mpf(1) / 4, mp.zero), (mp.mpf(1) / 2, mp.mpf(1) / 4)),
+        c=lambda c: (mp.mpf(1) / 4, mp.mpf(3) / 4),
+    ),
+    wrong_tableau("rows of a tableau exchanged", case("kepler/radau-iia"), A=reversed_rows),
+    wrong_tableau("weights of a tableau exchanged", case("kepler/radau-iia"), b=reversed_rows),
+    wrong_tableau("a tableau transposed", case("double/radau-ia"), A=transposed),
+    wrong_tableau("Lobatto IIIB for IIIA", case("kepler/lobatto"), A=lambda _: tableau.lobatto_iiib(3).A),
+    wrong_tableau("an abscissa off by 1e-7", case("driven/chebyshev"), c=lambda c: (c[0] + mp.mpf("1e-7"), *c[1:])),
+    wrong_tableau("the abscissa of Euler at the end", case("driven/euler"), c=lambda _: (mp.one,)),
+    wrong_tableau(
+        "explicit Euler made implicit", case("driven/euler"), A=lambda _: ((mp.one,),), c=lambda _: (mp.one,)
+    ),
+    here(
+        "momentum by A for A^T",
+        case("kepler/sc-phase-space"),
+        collocation,
+        "_transposed",
+        changed_result(lambda table: replace(table, entries=transposed(table.entries), names=transposed(table.names))),
+    ),
+    here(
+        "A for A^2",
+        case("double/gauss-position"),
+        collocation,
+        "matrix_product",
+        lambda original: lambda a, b: original(a, b) if len(a) == 1 else a,
+    ),
+    here(
+        "A for A^2 in the multipliers",
+        case("double/scvi"),
+        shooting,
+        "cardinal_integrals",
+        of_entries(lambda x: x * (1 + mp.mpf("1e-8"))),
+    ),
+    function(
+        "a digit of a composition wrong",
+        case("kepler/composition"),
+        composition,
+        "FIRST_HALVES",
+        lambda own: {**own, 8: (own[8][0].replace("248", "249"), *own[8][1:])},
+    ),
+    function(
+        "one kick in place of two halves",
+        case("pendulum/verlet"),
+        composition,
+        "kicks_and_drifts",
+        changed_result(lambda parts: ((mp.one, mp.zero), parts[1])),
+    ),
+    function(
+        "one point in place of two",
+        case("double/verlet"),
+        tableau,
+        "lobatto_iiia",
+        changed_result(lambda own: replace(own, b=(mp.mpf("0.6"), mp.mpf("0.4")))),
+    ),
+    function(
+        "derivative weights negated",
+        case("pendulum/hermite"),
+        quadrature.Quadrature,
+        "unit_derivative_weights",
+        lambda own: property(lambda self: tuple(tuple(-x for x in line) for line in own.fget(self))),
+    ),
+    function(
+        "positions of splines off by 1e-9",
+        case("pendulum/splines"),
+        Splines,
+        "positions",
+        of_entries(lambda x: x * (1 + mp.mpf("1e-9"))),
+    ),
+    function(
+        "positions of trigonometric curves off",
+        case("pendulum/trigonometric"),
+        Trigonometric,
+        "positions",
+        of_entries(lambda x: x * (1 + mp.mpf("1e-9"))),
+    ),
+    # The derivation, which compiled code and digits share.
+    function(
+        "a force 1e-6 off",
+        case("double/gauss-position"),
+        mechanics,
+        "force",
+        changed_result(scaled_first(1 + sympy.Rational(1, 10**6))),
+    ),
+    function(
+        "another potential, consistently", case("double/svi"), stage_system.ScalarFamily, "slopes", of_another_system
+    ),
+    function("L_vq v lost", case("double/sc"), mechanics, "_rate", without_rates_of("theta1", "theta2")),
+    function("L_vt lost", case("cart/sc"), mechanics, "_rate", without_rates_of("t")),
+    function(
+        "L_vq v lost, as printed", case("double/printed"), mechanics, "_rate", without_rates_of("theta1", "theta2")
+    ),
+    function(
+        "L_vq v lost, on Gauss points",
+        case("double/scvi-gauss"),
+        mechanics,
+        "_rate",
+        without_rates_of("theta1", "theta2"),
+    ),
+    function("the power rule halved", case("kepler/svi-3"), derivatives, "_partial", power_rule_halved),
+    function(
+        "the derivative of the cosine positive",
+        case("pendulum/verlet"),
+        sympy.cos,
+        "fdiff",
+        lambda _: lambda self, position=1: sympy.sin(self.args[0]),
+    ),
+    function(
+        "H with the other sign",
+        case("vortices/svi"),
+        HamiltonianSystem,
+        "lagrangian",
+        lambda _: property(
+            lambda self: self.hamiltonian + sum(p * v for p, v in zip(self.momenta, self.velocities, strict=True))
+        ),
+    ),
+    Mutation("the chain rule of L_d lost", case("kepler/scvi"), as_printed),
+)

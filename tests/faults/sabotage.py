@@ -1,0 +1,118 @@
+"""How a fault is put into the generator, and taken out again.
+
+It is in force while the integrator is built *and* while it is verified, as a real fault would be: what the verification
+shares with the generator is faulty, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+from samples import QUICK_FLAGS
+
+from scvi_codegen import compiler
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import Method
+from scvi_codegen.verification import Certificate, verify
+
+__all__ = ["Case", "Make", "Sabotage", "certified", "changed_result", "of_entries"]
+
+Make = Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system at a state, and how to make a method."""
+
+    system: MechanicalSystem
+    method: Callable[[], Method]
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    h: float
+
+
+class Sabotage:
+    """What a fault may do."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.patch, self.edits = patch, 0
+
+    def replace(self, home: Any, name: str, make: Make) -> None:
+        """Put ``make(original)`` in the place of a function, a table or a method, wherever it has been imported."""
+        original = getattr(home, name)
+        mutated = make(original)
+        self.patch.setattr(home, name, mutated)
+        for module in [module for key, module in sys.modules.items() if key.startswith("scvi_codegen")]:
+            for key, value in list(vars(module).items()):
+                if value is original:
+                    self.patch.setattr(module, key, mutated)
+
+    def replace_here(self, home: Any, name: str, make: Make) -> None:
+        """The same in one module only."""
+        self.patch.setattr(home, name, make(getattr(home, name)))
+
+    def edit(self, pattern: str, replacement: str) -> None:
+        """Edit the first place of the C text, of the artefact and of Newton's solver, that has the pattern."""
+
+        def make(render: Callable[[Any], Any]) -> Callable[[Any], Any]:
+            def rendered(program: Any) -> Any:
+                source = render(program)
+                code, edits = re.subn(pattern, replacement, source.code, count=1)
+                self.edits += edits
+                return replace(source, code=code)
+
+            return rendered
+
+        self.replace(compiler, "render", make)
+
+
+def changed_result(change: Make) -> Make:
+    """Of a function one whose result is changed."""
+
+    def make(original: Any) -> Any:
+        return lambda *arguments, **named: change(original(*arguments, **named))
+
+    return make
+
+
+def of_entries(change: Make) -> Make:
+    """The same for each entry of a matrix."""
+    return changed_result(lambda rows: tuple(tuple(map(change, row)) for row in rows))
+
+
+def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, edits_text: bool = False) -> Certificate:
+    """The certificate of a case with a fault in force, or without one."""
+    with _sabotaged(apply) as sabotage:
+        certificate = verify(case.system, case.method(), case.q, case.p, h=case.h, flags=QUICK_FLAGS)
+        assert not edits_text or sabotage.edits, "the text to be edited was not found"
+    return certificate
+
+
+@contextlib.contextmanager
+def _sabotaged(apply: Callable[[Sabotage], None] | None) -> Iterator[Sabotage]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "remembered_texts", lambda *arguments: arguments[-1]())
+        sabotage = Sabotage(patch)
+        if apply is not None:
+            apply(sabotage)
+            _empty_caches()
+        try:
+            yield sabotage
+        finally:
+            patch.undo()
+            if apply is not None:
+                _empty_caches()
+
+
+def _empty_caches() -> None:
+    """Of all functions of the package: nothing computed with a fault survives it, nor the other way round."""
+    for module in [module for key, module in sys.modules.items() if key.startswith("scvi_codegen")]:
+        for value in list(vars(module).values()):
+            if hasattr(value, "cache_clear"):
+                value.cache_clear()

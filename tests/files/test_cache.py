@@ -1,0 +1,226 @@
+"""The cache folder: what is in it, what leaves it, what is not believed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import scvi_codegen as sc
+from scvi_codegen import compiler
+from scvi_codegen.cli import main
+from scvi_codegen.errors import BuildError, CacheWarning
+from scvi_codegen.files import cache
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+
+FAST = ("-O0",)
+
+
+def source(number: int) -> Source:
+    declaration = f"double answer_{number}(void);\n"
+    code = f'#include "small.h"\ndouble answer_{number}(void)\n{{\n  return {number}.0;\n}}\n'
+    return Source(prefix="small", header=declaration, code=code, declarations=declaration)
+
+
+def answer(number: int) -> float:
+    building._loaded.clear()  # as a new process would
+    return getattr(building.load(source(number), flags=FAST).lib, f"answer_{number}")()
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty cache on disk, and nothing remembered in memory."""
+    path = tmp_path / "cache"
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(path))
+    monkeypatch.delenv(cache.SIZE_VARIABLE, raising=False)
+    monkeypatch.setattr(building, "_loaded", {})
+    return path
+
+
+def entry(folder: Path, number: int) -> Path:
+    return folder / f"_scvi_{building.fingerprint(source(number), flags=FAST)}"
+
+
+def held(folder: Path) -> set[int]:
+    return {number for number in range(10) if entry(folder, number).exists()}
+
+
+def spring() -> sc.Stepper:
+    building._loaded.clear()
+    text = sc.LagrangianSystem.from_text(name="spring", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+    return sc.compile_stepper(text, sc.StoermerVerlet(), flags=FAST)
+
+
+class TestSize:
+    def test_entries_used_least_recently_leave_when_it_is_too_large(self, folder, monkeypatch):
+        for number in range(3):
+            answer(number)
+            os.utime(entry(folder, number), (number, number))
+        monkeypatch.setenv(cache.SIZE_VARIABLE, str(3 * cache._size(entry(folder, 0)) + 500))
+        answer(0)  # used again, from the cache
+        answer(3)
+        assert held(folder) == {0, 2, 3}
+        answer(4)
+        assert held(folder) == {0, 3, 4}
+
+    def test_what_was_just_built_stays_however_small_the_limit(self, folder, monkeypatch):
+        monkeypatch.setenv(cache.SIZE_VARIABLE, "1")
+        for number in range(3):
+            assert answer(number) == number
+            assert held(folder) == {number}
+
+    def test_texts_and_reference_solutions_count(self, folder, monkeypatch):
+        spring()
+        (folder / "references").mkdir()
+        (folder / "references" / "kepler.npz").write_bytes(bytes(1000))
+        info = sc.cache_info()
+        assert (info.integrators, info.texts, info.references) == (1, 1, 1)
+        assert info.size == sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        monkeypatch.setenv(cache.SIZE_VARIABLE, "1K")
+        answer(0)
+        assert (held(folder), sc.cache_info().texts, sc.cache_info().references) == ({0}, 0, 0)
+
+    @pytest.mark.parametrize(
+        ("given", "size"), [("", 2**30), ("0", 0), ("1234", 1234), ("500M", 500 * 2**20), ("1.5 GiB", 3 * 2**29)]
+    )
+    def test_sizes_are_read(self, given, size, monkeypatch):
+        monkeypatch.setenv(cache.SIZE_VARIABLE, given)
+        assert cache.size_limit() == size
+
+    @pytest.mark.parametrize("given", ["huge", "-1", "1X", "1e9"])
+    def test_what_is_no_size_is_named(self, given, monkeypatch):
+        monkeypatch.setenv(cache.SIZE_VARIABLE, given)
+        with pytest.raises(BuildError, match=f"SCVI_CODEGEN_CACHE_SIZE is '{given}': it must be a size"):
+            answer(0)
+
+    def test_0_is_no_limit(self, folder, monkeypatch):
+        monkeypatch.setenv(cache.SIZE_VARIABLE, "0")
+        for number in range(3):
+            answer(number)
+        assert held(folder) == {0, 1, 2}
+        assert "without a limit" in str(sc.cache_info())
+
+
+class TestTrust:
+    def test_a_folder_that_everyone_may_write_is_not_used(self, folder):
+        folder.mkdir()
+        folder.chmod(0o777)
+        with pytest.warns(CacheWarning, match=r"every user of this machine may write into it.*chmod o-w"):
+            assert answer(1) == 1.0
+        assert list(folder.iterdir()) == []
+        with pytest.warns(CacheWarning):
+            spring()
+        assert list(folder.iterdir()) == []
+
+    def test_an_entry_that_everyone_may_write_is_built_anew(self, folder, monkeypatch):
+        for exposed in (entry(folder, 1), building._library(entry(folder, 1))):
+            answer(1)
+            forge(folder)
+            exposed.chmod(0o777)
+            assert answer(1) == 1.0
+            assert not cache.exposed(exposed)
+
+    def test_a_text_that_everyone_may_write_is_made_anew(self, folder, monkeypatch):
+        spring()
+        (path,) = (folder / "texts").glob("*.json")
+        before = path.stat().st_ino
+        path.chmod(0o666)
+        spring()
+        assert path.stat().st_ino != before
+        assert not cache.exposed(path)
+
+    def test_with_a_careless_umask_nobody_else_may_write(self, folder):
+        with umask(0):
+            spring()
+        paths = [folder, *folder.rglob("*")]
+        assert len(paths) == 8
+        assert [path for path in paths if path.stat().st_mode & 0o022] == []
+
+    def test_a_text_that_was_tampered_with_is_made_anew(self, folder, monkeypatch):
+        first = spring()
+        (path,) = (folder / "texts").glob("*.json")
+        record = json.loads(path.read_text())
+        changed = record["entry"].replace("return", "return  ", 1)
+        path.write_text(json.dumps(record | {"entry": changed}))
+        made = []
+        derive = compiler.program_of
+        monkeypatch.setattr(compiler, "program_of", lambda *args, **more: made.append(1) or derive(*args, **more))
+        assert spring().source == first.source
+        assert made == [1]
+
+    def test_a_library_whose_checksum_is_wrong_is_built_anew_without_a_word(self, folder, recwarn, capfd):
+        answer(1)
+        library = building._library(entry(folder, 1))
+        data = library.read_bytes()
+        library.unlink()
+        library.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        assert answer(1) == 1.0
+        assert building._is_intact(entry(folder, 1))
+        assert capfd.readouterr() == ("", "")
+        assert list(recwarn) == []
+
+
+def forge(folder: Path) -> None:
+    """Put another library, with a checksum that fits it, in the place of number 1."""
+    answer(2)
+    place = entry(folder, 1)
+    library = building._library(place)
+    library.unlink()
+    library.write_bytes(building._library(entry(folder, 2)).read_bytes())
+    checksum = hashlib.sha256(library.read_bytes()).hexdigest()
+    (place / "manifest.json").write_text(json.dumps({"sha256": checksum}))
+
+
+@contextmanager
+def umask(mask: int) -> Iterator[None]:
+    before = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+class TestClearing:
+    def test_clearing_leaves_what_is_not_ours_and_counts_bytes(self, folder):
+        answer(1)
+        spring()
+        (folder / "thesis.tex").write_text("not ours")
+        size = sc.cache_info().size
+        assert sc.clear_cache() == size > 0
+        assert [path.name for path in folder.rglob("*") if path.is_file()] == ["thesis.tex"]
+        assert answer(1) == 1.0
+
+    def test_a_cache_that_is_not_there_is_empty(self, folder):
+        assert sc.cache_info().size == sc.clear_cache() == 0
+        assert not folder.exists()
+
+    def test_what_killed_processes_left_is_removed_after_an_hour(self, folder):
+        answer(1)
+        for name, age in ((".building-old", 7200), (".building-new", 60), (".removed-old", 7200)):
+            (folder / name / "inside").mkdir(parents=True)
+            os.utime(folder / name, (time.time() - age,) * 2)
+        answer(2)
+        assert {path.name for path in folder.glob(".*")} == {".building-new"}
+
+    def test_on_the_command_line(self, folder):
+        answer(1)
+
+        def said(*words: str) -> str:
+            result = CliRunner().invoke(main, ["cache", *words])
+            assert result.exit_code == 0, result.output
+            return result.output
+
+        assert said("path") == f"{folder}\n"
+        assert said() == said("info")
+        assert "1 compiled integrators, 0 generated texts, 0 reference solutions" in said("info")
+        assert f"of 1 GiB ({cache.SIZE_VARIABLE})" in said("info")
+        assert said("clear").startswith("removed ")
+        assert held(folder) == set()

@@ -1,0 +1,76 @@
+"""Sparse derivatives against SymPy's own, entry by entry."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+
+import pytest
+import sympy
+from sympy import Rational, Symbol, atan2, cos, exp, log, sin, sqrt
+
+from scvi_codegen.formulas.derivatives import gradient, hessian, jacobian
+
+X, Y, Z = sympy.symbols("x y z", real=True)
+M = Symbol("m", real=True)
+EXPRESSIONS = [
+    M * (X**2 + Y**2) / 2 - cos(X - Y),
+    -sqrt(1 - X**2 - Y**2),
+    atan2(Y, X) * exp(-M * Z) + log(2 + X**2) ** Rational(3, 2),
+    X**Y + 2 ** (X * Z) + (X + Y) ** (M * Z),
+    X * Y * Z * sin(X * Y * Z) / (1 + X**2),
+    sympy.asin(X / 4) * sympy.acos(Y / 4) + sympy.atan(Z) - sympy.tan(X) / sympy.tanh(Y),
+    sympy.sinh(X) * sympy.cosh(Y) + sympy.asinh(Z) + sympy.acosh(3 + X**2) + sympy.atanh(Y / 4),
+]
+POINT = {X: Rational(3, 7), Y: Rational(5, 11), Z: Rational(-2, 3), M: Rational(9, 8)}
+
+
+def same(mine: sympy.Expr, theirs: sympy.Expr) -> bool:
+    return abs(sympy.N((mine - theirs).subs(POINT), 40)) < 1e-30
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+def test_first_and_second_derivatives_are_sympys(expression: sympy.Expr) -> None:
+    variables = [X, Y, Z]
+    slopes, curvatures = gradient(expression, variables), hessian(expression, variables)
+    assert list(slopes) == sorted(slopes)
+    assert list(curvatures) == sorted(curvatures)
+    for row, first in enumerate(variables):
+        assert same(slopes.get(row, sympy.S.Zero), expression.diff(first))
+        for column, second in enumerate(variables):
+            assert same(curvatures.get((row, column), sympy.S.Zero), expression.diff(first, second))
+            assert curvatures.get((row, column)) is curvatures.get((column, row))
+
+
+def test_fourth_derivatives_by_repetition() -> None:
+    expression = exp(X * Y) * cos(Z)
+    level = {0: expression}
+    for variable in (X, Y, Z, X):
+        level = gradient(level[0], [variable])
+    assert same(level[0], expression.diff(X, Y, Z, X))
+
+
+def test_zeros_and_foreign_symbols_are_left_out() -> None:
+    assert gradient(M**2 + 1, [X, Y]) == {}
+    assert gradient(X - X + Y, [X, Y]) == {1: 1}
+    assert hessian(X * Y + M * Z, [X, Y, Z]) == {(0, 1): 1, (1, 0): 1}
+    assert gradient(Y, [X, Y]) == {1: 1}
+
+
+def test_jacobian_takes_rows_as_sequence_or_by_index() -> None:
+    assert jacobian([X * M, Y**2], [X, Y]) == {(0, 0): M, (1, 1): 2 * Y}
+    assert jacobian({5: Y**2, 2: X}, [X, Y]) == {(2, 0): 1, (5, 1): 2 * Y}
+
+
+def test_an_unknown_node_is_refused_not_guessed() -> None:
+    with pytest.raises(TypeError, match="cannot differentiate"):
+        gradient(sympy.Piecewise((X, X > 0), (0, True)), [X])
+
+
+def test_a_long_lattice_is_quick_and_sparse() -> None:
+    q = [Symbol(f"q{index}", real=True) for index in range(257)]
+    energy = sympy.Add(*((b - a) ** 2 / 2 + (b - a) ** 4 / 4 for a, b in pairwise(q)))
+    start = time.perf_counter()
+    entries = hessian(energy, q)
+    assert time.perf_counter() - start < 5
+    assert len(entries) == 257 + 2 * 256

@@ -1,0 +1,100 @@
+"""Collocation in position form by its fixed-point iteration: where it exists, and that it finds what Newton finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    CollocationRK,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+)
+
+POSITION = (
+    SpectralCollocation(1),
+    SpectralCollocation(8),
+    Gauss(4, form="position"),
+    RadauIIA(2, form="position"),
+    RadauIA(3, form="position"),
+    LobattoIIIA(3, form="position"),
+    CollocationRK([0.0, 0.5], form="position"),
+    ExplicitEuler(form="position"),
+)
+PRINTED = (SCVI(2, variational=False), SCVI(8, variational=False), SCVI(3, "gauss-lobatto:6", variational=False))
+COUPLED = ("double-pendulum", "pumped-cart-pole", "charged-particle", "relativistic-particle", "spherical-pendulum")
+named = {"ids": lambda value: getattr(value, "name", value)}
+
+
+def difference(left, right):
+    """The largest of two runs, relative to the state."""
+    return max(np.abs(a - b).max() / np.abs(b).max() for a, b in ((left.q, right.q), (left.p, right.p)))
+
+
+@pytest.mark.parametrize("method", [*POSITION, *PRINTED], **named)
+def test_every_coupled_system_has_an_iteration_on_accelerations(sample, method):
+    kinds = {sweep_of(sample(name).system, method).kind for name in COUPLED}
+    assert kinds == {"collocation"}
+
+
+def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample):
+    system = sample("kepler").system
+    assert {sweep_of(system, method).kind for method in POSITION} == {"separable"}
+    assert {sweep_of(system, method).kind for method in PRINTED} == {"collocation"}
+    assert sweep_of(system, SCVI(1, variational=False)).kind == "separable"
+
+
+def test_more_points_than_lanes_are_left_to_newton(sample):
+    system = sample("double-pendulum").system
+    assert sweep_of(system, SpectralCollocation(32)) is not None
+    assert sweep_of(system, SpectralCollocation(33)) is None
+    assert sweep_of(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
+
+
+@pytest.mark.parametrize("name", ["pumped-cart-pole", "relativistic-particle"])
+@pytest.mark.parametrize("method", [SpectralCollocation(8), RadauIA(3, form="position"), PRINTED[1]], **named)
+def test_a_run_is_newtons(sample, compiled, name, method):
+    runs = [
+        compiled(name, method, solver=solver).integrate(*sample(name).state, h=0.05, steps=50, t=0.3)
+        for solver in ("fixed-point", "newton")
+    ]
+    assert difference(*runs) < 2e-13
+
+
+@pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(3), PRINTED[0]], **named)
+def test_motion_from_rest_needs_no_newton(sample, compiled, method):
+    """Velocities that vanish are no measure of what is small."""
+    q, p = sample("double-pendulum").state
+    steps = [
+        compiled("double-pendulum", method, solver=solver).step(q, 0 * p, 0.01) for solver in ("fixed-point", "newton")
+    ]
+    assert np.abs(np.subtract(*steps)).max() < 1e-14
+
+
+@pytest.mark.parametrize("method", [SpectralCollocation(3), PRINTED[0]], **named)
+def test_the_velocity_kept_from_the_last_step_yields_to_other_parameters(sample, compiled, method):
+    stepper = compiled("pumped-cart-pole", method, solver="fixed-point")
+    run = stepper.start(*sample("pumped-cart-pole").state, h=0.05)
+    run.record(5)
+    heavier = {"m": 1.5, "M": 1.2}
+    state, t = (run.q.copy(), run.p.copy()), run.t
+    continued = stepper.restore(run.save(), parameters=heavier).record(1)
+    q, p = stepper.step(*state, 0.05, t, heavier)
+    assert np.abs([continued.q[-1] - q, continued.p[-1] - p]).max() < 1e-14
+
+
+@pytest.mark.parametrize("method", [SpectralCollocation(3), PRINTED[0]], **named)
+def test_steps_too_long_for_the_iteration_are_newtons(sample, compiled, method):
+    q, p = sample("spherical-pendulum").state
+    swept, newton = (compiled("spherical-pendulum", method, solver=solver) for solver in ("auto", "newton"))
+    run, expected = (stepper.integrate(q, p, h=0.11, steps=8) for stepper in (swept, newton))
+    assert difference(run, expected) < 2e-12
+    with pytest.raises(Exception, match="not converged"):
+        compiled("spherical-pendulum", method, solver="fixed-point").integrate(q, p, h=0.11, steps=8)

@@ -1,0 +1,324 @@
+"""Kernels read back are the SymPy originals; sharing and size are what they should be; printed C means the same."""
+
+import ctypes
+import math
+import operator
+import random
+import subprocess
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import gradient, jacobian
+from scvi_codegen.ir.program import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.lowering.program import DEEPEST_EXPRESSION, lower, lower_kernel
+from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
+from scvi_codegen.models.problems import PROBLEMS, double_pendulum, duffing, fput_chain, kepler, problem
+from scvi_codegen.native.building import find_compiler
+from scvi_codegen.rendering.printer import print_expression, print_number
+
+mp = mpmath.mp.clone()
+mp.dps = 120
+
+x, y, t, a = sympy.symbols("x y t a", real=True)
+
+
+def kernel_of(*values: sympy.Expr) -> Kernel:
+    """A kernel over x, y (arguments), t and a (parameter)."""
+    return lower_kernel("kernel", arguments=(x, y), time=t, parameters=(a,), values=values)
+
+
+# Reading back: the meaning of the intermediate representation, for any kind of number.
+
+CALLED = """
+    sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log sqrt pow
+""".split()  # noqa: SIM905  (a line of words reads better than quoted ones)
+FLOATS: dict[str, Callable[..., Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "neg": operator.neg,
+    **{name: getattr(math, name) for name in CALLED},
+    **{f"inverse_root_{k}": lambda x, k=k: 1.0 / (x ** (k // 2) * math.sqrt(x)) for k in (1, 3, 5, 7)},
+}
+DIGITS = (
+    FLOATS
+    | {f"inverse_root_{k}": lambda x, k=k: mp.power(x, mp.mpf(-k) / 2) for k in (1, 3, 5, 7)}
+    | {name: getattr(mp, name) for name in CALLED if name != "pow"}
+    | {"pow": mp.power}
+)
+
+
+def interpret(
+    kernel: Kernel, u: Sequence[Any], t: Any, parameters: Sequence[Any], convert: Any, functions: Any
+) -> list:
+    """Results of a kernel in the arithmetic of ``convert`` and ``functions``."""
+    w: list[Any] = []
+    sources = {"u": u, "parameters": parameters, "w": w}
+
+    def value(expression: Expression) -> Any:
+        if isinstance(expression, Constant):
+            return convert(expression.value)
+        if isinstance(expression, Load):
+            return t if expression.source == "t" else sources[expression.source][expression.index]
+        return functions[expression.operator](*(value(operand) for operand in expression.operands))
+
+    for temporary in kernel.temporaries:
+        w.append(value(temporary))  # noqa: PERF401  (each may use those before it)
+    return [value(result) for result in kernel.results]
+
+
+def depth(expression: Expression) -> int:
+    return 1 + max(map(depth, expression.operands)) if isinstance(expression, Operation) else 0
+
+
+def exact(expression: sympy.Expr, point: dict[sympy.Symbol, Any]) -> Any:
+    """SymPy's own value, to 60 digits."""
+    return mp.mpf(sympy.N(expression.subs(point), 60, maxn=2000))
+
+
+# Random expressions. Constants are multiples of 1/8, exact in binary64, so that nothing but arithmetic is compared.
+
+EIGHTHS = st.integers(-24, 24).map(lambda n: sympy.Rational(n, 8))
+EXPONENTS = st.sampled_from([sympy.Rational(n, 2) for n in range(-7, 8)] + [sympy.Rational(n, 8) for n in (-11, -3, 5)])
+POSITIVE_FUNCTIONS = (sympy.log, sympy.sqrt, sympy.asinh, lambda e: e ** sympy.Rational(-5, 2), lambda e: e ** (x / 2))
+FUNCTIONS = (sympy.sin, sympy.cos, sympy.tanh, sympy.atan, lambda e: sympy.exp(sympy.sin(e)), lambda e: -e)
+
+
+def square(e: sympy.Expr) -> sympy.Expr:
+    """Positive, and not a constant, which SymPy would fold into one that is not exact in binary64."""
+    return (e if e.free_symbols else e + x) ** 2 + 1
+
+
+def is_exact(e: sympy.Expr) -> bool:
+    """Whether all constants in it are small multiples of a power of 1/2."""
+    if not e.free_symbols:
+        return bool(e.is_Rational and e.q & (e.q - 1) == 0 and abs(e.p) < 2**53)
+    return all(map(is_exact, e.args))
+
+
+def compound(parts: st.SearchStrategy[sympy.Expr]) -> st.SearchStrategy[sympy.Expr]:
+    return st.one_of(
+        st.lists(parts, min_size=2, max_size=4).map(lambda terms: sympy.Add(*terms)),
+        st.tuples(parts, parts).map(lambda pair: pair[0] - pair[1]),
+        st.tuples(parts, parts).map(lambda pair: -2 * (pair[0] - 3 * pair[1])),
+        st.lists(parts, min_size=2, max_size=3).map(lambda factors: sympy.Mul(*factors)),
+        st.tuples(parts, EXPONENTS).map(lambda pair: square(pair[0]) ** pair[1]),
+        st.tuples(st.sampled_from([x, y, a]), EXPONENTS).map(lambda pair: pair[0] ** pair[1]),
+        st.tuples(parts, st.sampled_from(FUNCTIONS)).map(lambda pair: pair[1](pair[0] + x)),
+        st.tuples(parts, st.sampled_from(POSITIVE_FUNCTIONS)).map(lambda pair: pair[1](square(pair[0]))),
+    )
+
+
+EXPRESSIONS = st.recursive(st.one_of(st.sampled_from([x, y, t, a]), EIGHTHS), compound, max_leaves=8)
+POINTS = st.fixed_dictionaries({s: st.integers(1, 40).map(lambda n: sympy.Rational(n, 16)) for s in (x, y, t, a)})
+
+
+@settings(max_examples=600, deadline=None)
+@given(values=st.lists(EXPRESSIONS, min_size=1, max_size=3), point=POINTS)
+def test_reading_back_gives_the_original_to_fifty_digits(values, point):
+    assume(all(map(is_exact, values)))
+    kernel = kernel_of(*values)
+    at = {s: mp.mpf(int(n.p)) / int(n.q) for s, n in point.items()}
+    results = interpret(kernel, (at[x], at[y]), at[t], (at[a],), mp.mpf, DIGITS)
+    for result, original in zip(results, values, strict=True):
+        expected = exact(original, point)
+        assert abs(result - expected) <= mp.mpf(10) ** -50 * (1 + abs(expected)), kernel
+
+
+CATALOGUE = ["planar-pendulum", "duffing", "kepler", "double-pendulum", "spherical-pendulum", "relativistic-particle"]
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(2), Gauss(2)], ids=lambda m: m.name)
+def test_kernels_of_systems_have_the_values_and_slopes_of_their_formulas(name, method):
+    system = problem(name).system
+    program = lower(system, method, prefix="p")
+    points = random.Random(name)
+    for family, lowered in zip(method.stage_system(system).families, program.families, strict=True):
+        symbols = (*family.arguments, system.time, *system.parameters)
+        point = {symbol: sympy.Rational(points.randint(1, 30), 64) for symbol in symbols}
+        point |= {symbol: 1 + value for symbol, value in point.items() if symbol in system.parameters}
+        numbers = [float(point[symbol]) for symbol in symbols]
+        m = len(family.arguments)
+        expected = [float(exact(e, point)) for e in (*family.results, *slopes_in_order(family))]
+        found = interpret(lowered.slope, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+        values = interpret(lowered.value, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
+        np.testing.assert_allclose(values, expected[: len(values)], rtol=1e-12, atol=1e-14)
+
+
+def slopes_in_order(family: Any) -> list[sympy.Expr]:
+    return [
+        slope
+        for scatter in family.scatters
+        for gather in family.gathers
+        for slope in jacobian(scatter.results, gather.arguments).values()
+    ]
+
+
+# Sharing and size.
+
+
+def test_a_difference_and_its_negative_are_one_subtraction():
+    counts = kernel_of(sympy.sin(x - y), sympy.cos(y - x), sympy.exp(2 * x - 2 * y) * t).operation_counts()
+    assert counts["-"] == 1
+
+
+def test_negative_odd_half_powers_are_functions_of_their_own():
+    r2 = x**2 + y**2
+    half = sympy.Rational(1, 2)
+    counts = kernel_of(*(r2 ** (-n * half) for n in (1, 3, 5, 7)), r2 ** (-9 * half), a / r2).operation_counts()
+    assert [counts[f"inverse_root_{k}"] for k in (1, 3, 5, 7)] == [1, 1, 1, 1]
+    assert counts["/"] == counts["sqrt"] == 1
+    assert "pow" not in counts
+
+
+def test_the_slopes_of_kepler_cost_no_division():
+    system = kepler()
+    forces = gradient(system.lagrangian, system.coordinates)
+    slopes = jacobian(tuple(forces.values()), system.coordinates)
+    kernel = lower_kernel(
+        "kepler",
+        arguments=system.coordinates,
+        time=system.time,
+        parameters=system.parameters,
+        values=tuple(forces.values()),
+        slopes=tuple(slopes.values()),
+    )
+    counts = kernel.operation_counts()
+    assert (counts["inverse_root_3"], counts["inverse_root_5"]) == (1, 1)
+    assert "/" not in counts
+    assert sum(counts.values()) < 40
+
+
+def test_whole_powers_are_products_and_other_powers_are_calls():
+    assert set(kernel_of(x**7 + y**-4).operation_counts()) == {"*", "/", "+"}
+    assert kernel_of(x ** sympy.Rational(1, 3)).operation_counts() == {"pow": 1}
+    assert kernel_of(x**y).operation_counts() == {"pow": 1}
+
+
+@pytest.mark.parametrize("family", [SVI, SCVI, SpectralCollocation, Gauss], ids=lambda family: family.__name__)
+@pytest.mark.parametrize("system", [double_pendulum(), duffing()], ids=lambda system: system.name)
+def test_symbolic_cost_does_not_grow_with_the_degree(family, system):
+    small, large = (lower(system, family(degree), prefix="p") for degree in (2, 12))
+    assert large.kernels == small.kernels
+    assert large.blocks > small.blocks
+
+
+def test_a_chain_of_256_masses_lowers_without_recursion():
+    system = fput_chain(256)
+    state = (*system.coordinates, *system.velocities)
+    kernel = lower_kernel(
+        "chain", arguments=state, time=system.time, parameters=system.parameters, values=(system.lagrangian,)
+    )
+    assert max(map(depth, (*kernel.temporaries, *kernel.results))) <= DEEPEST_EXPRESSION + 1
+    assert str(kernel).count("\n") == len(kernel.temporaries) + 1
+    assert sum(kernel.operation_counts().values()) < 256 * 16
+
+
+def test_a_long_sum_is_cut_into_temporaries_and_keeps_its_value():
+    values = [sympy.Rational(k, 8) for k in range(1, 1500)]
+    kernel = kernel_of(sympy.Add(*(c * x ** (k % 30) for k, c in enumerate(values)), *(y**k for k in range(2, 40))))
+    assert max(map(depth, kernel.temporaries)) <= DEEPEST_EXPRESSION + 1
+    (result,) = interpret(kernel, (0.5, -0.25), 0.0, (0.0,), float, FLOATS)
+    expected = sum(float(c) * 0.5 ** (k % 30) for k, c in enumerate(values)) + sum((-0.25) ** k for k in range(2, 40))
+    assert result == pytest.approx(expected, rel=1e-13)
+
+
+@pytest.mark.parametrize("constant", [10**400, sympy.Rational(-(10**400), 3), sympy.exp(1000), sympy.exp(10**30)])
+def test_constants_beyond_a_double_are_refused(constant):
+    with pytest.raises(SystemDefinitionError, match="constant"):
+        kernel_of(constant * x + y)
+
+
+def test_functions_without_a_c_counterpart_are_refused():
+    with pytest.raises(SystemDefinitionError, match="no C counterpart"):
+        kernel_of(sympy.gamma(x))
+
+
+def test_lowering_is_reproducible():
+    first, second = (lower(double_pendulum(), SCVI(3), prefix="p") for _ in range(2))
+    assert first == second
+    assert str(first) == str(second)
+
+
+# The printer. Every expression of two levels over these leaves is compiled and compared bit for bit.
+
+LEAVES = (Load("u", 0), Load("w", 0), Constant(-2.5))
+POINT = (0.75, -3.0)
+
+
+def level(below: Sequence[Expression]) -> list[Expression]:
+    pairs = [Operation(sign, pair) for sign in "+-*/" for pair in product(below, repeat=2)]
+    return [*below, *pairs, *(Operation("neg", (operand,)) for operand in below)]
+
+
+def compiled_values(expressions: Sequence[Expression], tmp_path: Any) -> np.ndarray:
+    """The values of expressions over u[0] and w0, by the C compiler."""
+    lines = [f"  value[{k}] = {print_expression(e)};" for k, e in enumerate(expressions)]
+    text = "\n".join(["#include <math.h>", "void f(const double *u, double w0, double *value)", "{", *lines, "}"])
+    (tmp_path / "f.c").write_text(text)
+    strict = ["-std=c99", "-O0", "-ffp-contract=off", "-fPIC", "-shared", "-w"]
+    subprocess.run([*find_compiler(), *strict, "f.c", "-lm", "-o", "f.so"], cwd=tmp_path, check=True)
+    values = np.empty(len(expressions))
+    double = ctypes.POINTER(ctypes.c_double)
+    u = (ctypes.c_double * 1)(POINT[0])
+    ctypes.CDLL(str(tmp_path / "f.so")).f(u, ctypes.c_double(POINT[1]), values.ctypes.data_as(double))
+    return values
+
+
+def test_printed_c_means_what_the_expression_means(tmp_path):
+    expressions = level(level(LEAVES))
+    sources = {"u": np.float64(POINT[0]), "w": np.float64(POINT[1])}
+
+    def value(expression: Expression) -> Any:
+        if isinstance(expression, Constant):
+            return np.float64(expression.value)
+        if isinstance(expression, Load):
+            return sources[expression.source]
+        return FLOATS[expression.operator](*map(value, expression.operands))
+
+    with np.errstate(all="ignore"):
+        expected = np.array([value(expression) for expression in expressions])
+    found = compiled_values(expressions, tmp_path)
+    np.testing.assert_array_equal(found, expected)
+    assert len(expressions) > 5000
+
+
+def test_compiled_kernels_have_the_values_of_their_formulas(tmp_path):
+    values = (a := Load("u", 0), h := Load("w", 0))
+    inverse_square = Operation("/", (Constant(1.0), Operation("*", (h, h))))
+    expressions = [
+        Operation("*", (a, inverse_square)),
+        Operation("/", (a, Operation("/", (h, a)))),
+        Operation("-", (a, Operation("-", (h, a)))),
+        Operation("-", (a, Operation("neg", (h,)))),
+        Operation("pow", (Operation("neg", (h,)), Constant(-1.5))),
+        Operation("neg", (Operation("neg", (Operation("+", values),)),)),
+    ]
+    a_, h_ = POINT
+    expected = [a_ / h_**2, a_ / (h_ / a_), a_ - (h_ - a_), a_ + h_, (-h_) ** -1.5, a_ + h_]
+    np.testing.assert_allclose(compiled_values(expressions, tmp_path), expected, rtol=1e-15)
+
+
+@settings(deadline=None)
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_printed_numbers_read_back_as_the_same_double(number):
+    text = print_number(number)
+    assert float(text) == number
+    assert any(mark in text for mark in ".e")
+
+
+def test_the_whole_catalogue_lowers():
+    for name in PROBLEMS:
+        assert lower(problem(name).system, SVI(2), prefix="p").kernels

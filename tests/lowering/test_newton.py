@@ -1,0 +1,136 @@
+"""Newton's iteration: the band, its order, exchanges of rows within it, and factors kept from step to step."""
+
+import random
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scvi_codegen import (
+    SCVI,
+    SVI,
+    Gauss,
+    LagrangianSystem,
+    SolverOptions,
+    SpectralCollocation,
+    compile_stepper,
+    generate_source,
+)
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.ir.program import WORTH_REMEMBERING
+from scvi_codegen.lowering.program import lower
+from scvi_codegen.models.problems import fput_chain
+from scvi_codegen.rendering.text import workspace_size
+from scvi_codegen.runtime.stepper import Stepper
+
+SIZE = 12
+
+
+@cache
+def ring(seed: int | None = None) -> Stepper:
+    """Masses on a ring of hardening springs, coordinates in order or shuffled."""
+    order = list(range(SIZE)) if seed is None else random.Random(seed).sample(range(SIZE), SIZE)
+    kinetic = " + ".join(f"x{i}_dot**2/2" for i in range(SIZE))
+    springs = "".join(f" - cosh(x{i} - x{(i + 1) % SIZE}) + x{i}*x{(i + 5) % SIZE}_dot/50" for i in range(SIZE))
+    system = LagrangianSystem.from_text(name="ring", coordinates=[f"x{i}" for i in order], lagrangian=kinetic + springs)
+    return compile_stepper(system, SVI(3), solver="newton")
+
+
+def state(size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
+    return np.sin(np.arange(size)), 0.3 * np.cos(2.0 * np.arange(size))
+
+
+@cache
+def chain(method: object) -> Stepper:
+    return compile_stepper(fput_chain(SIZE), method, solver="newton")
+
+
+@pytest.mark.parametrize("method", [SVI(3), SCVI(3), Gauss(3)], ids=lambda method: method.name)
+def test_the_band_gives_what_the_fixed_point_gives(method):
+    q, p = state(6)
+    swept, found = (
+        compile_stepper(fput_chain(6), method, solver=solver).integrate(q, p, h=0.2, steps=40)
+        for solver in ("fixed-point", "newton")
+    )
+    np.testing.assert_allclose(found.q, swept.q, rtol=0, atol=2e-13)
+    np.testing.assert_allclose(found.p, swept.p, rtol=0, atol=2e-13)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_order_of_the_coordinates_does_not_matter(seed):
+    shuffled, ordered = ring(seed), ring()
+    order = [int(name[1:]) for name in shuffled.coordinates]
+    q, p = state()
+    expected = ordered.integrate(q, p, h=0.1, steps=20)
+    found = shuffled.integrate(q[order], p[order], h=0.1, steps=20)
+    np.testing.assert_allclose(found.q, expected.q[:, order], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.p, expected.p[:, order], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.energy(), expected.energy(), rtol=1e-14)
+
+
+@pytest.mark.parametrize("method", [SVI(2), SCVI(2), SpectralCollocation(2)], ids=lambda method: method.name)
+def test_rows_are_exchanged_within_the_band(method):
+    """Masses x_dot y_dot have no diagonal: no pivot stands where it is needed. In u = x + y, w = x - y they have."""
+    pairs = range(8)
+    kinetic = " + ".join(f"x{i}_dot*y{i}_dot" for i in pairs)
+    springs = "".join(f" - x{i}*y{i} - (x{i} - y{i + 1})**2/3" for i in list(pairs)[:-1])
+    names = [f"{letter}{i}" for i in pairs for letter in "xy"]
+    tilted = LagrangianSystem.from_text(name="tilted", coordinates=names, lagrangian=kinetic + springs)
+    change = {f"x{i}": f"(u{i} + w{i})" for i in pairs} | {f"y{i}": f"(u{i} - w{i})" for i in pairs}
+    text = kinetic + springs
+    for name, value in change.items():
+        text = text.replace(f"{name}_dot", value.replace(" ", "_dot ", 1).replace(")", "_dot)")).replace(name, value)
+    names = [f"{letter}{i}" for i in pairs for letter in "uw"]
+    straight = LagrangianSystem.from_text(name="straight", coordinates=names, lagrangian=text)
+    one, other = (compile_stepper(system, method, solver="newton") for system in (tilted, straight))
+    turn = np.kron(np.eye(8), [[1.0, 1.0], [1.0, -1.0]])
+    q, v = state(16)
+    first, second = one.step(turn @ q, one.momentum(turn @ q, turn @ v), 0.3), other.step(q, other.momentum(q, v), 0.3)
+    np.testing.assert_allclose(first[0], turn @ second[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(turn.T @ first[1], second[1], rtol=0, atol=1e-13)
+
+
+def test_memory_grows_with_the_length_of_a_chain_not_with_its_square():
+    sizes = [workspace_size(lower(fput_chain(n), SVI(8), prefix="p")) for n in (32, 64, 128)]
+    assert sizes[2] - sizes[1] == pytest.approx(2 * (sizes[1] - sizes[0]), rel=1e-3)
+    assert sizes[2] < 10**5
+
+
+def test_a_mass_matrix_that_is_all_there_is_to_invert_is_no_larger_than_it_must_be():
+    source, _ = generate_source(fput_chain(16), SVI(2), solver="fixed-point")
+    assert "BAND = 0," in source.code
+
+
+@pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
+class TestKeptFactors:
+    """Runs of a chain with enough unknowns that factors go from step to step."""
+
+    def test_there_are_enough(self, method):
+        assert chain(method).interface.unknowns >= WORTH_REMEMBERING
+
+    def test_a_run_goes_on_bit_for_bit_however_it_is_cut(self, method):
+        q, p = state()
+        expected = chain(method).integrate(q, p, h=0.15, steps=60)
+        run = chain(method).start(q, p, h=0.15)
+        for portion in (1, 1, 2, 7, 20, 29):
+            last = run.record(portion)
+            run = chain(method).restore(run.save())
+        assert np.array_equal(last.q[-1], expected.q[-1])
+        assert np.array_equal(last.p[-1], expected.p[-1])
+        assert last.iterations[-1] == expected.iterations[-1]
+
+    def test_a_step_does_not_know_what_was_before(self, method):
+        q, p = state()
+        first = chain(method).step(q, p, 0.2)
+        chain(method).integrate(-q, p, h=0.4, steps=5)
+        assert np.array_equal(chain(method).step(q, p, 0.2), first)
+
+    def test_a_step_that_fails_leaves_the_run_as_it_was(self, method):
+        q, p = state()
+        run = chain(method).start(q, p, h=0.15)
+        run.record(10)
+        before = run.save()
+        strict = chain(method).restore(before, options=SolverOptions(max_iterations=1))
+        with pytest.raises(StepFailedError):
+            strict.record(1)
+        assert strict.save() == before

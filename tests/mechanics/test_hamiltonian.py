@@ -1,0 +1,323 @@
+"""Systems given by a Hamiltonian: reading them, Legendre's transform both ways, and steps in phase space.
+
+A regular Hamiltonian must give the steps of its Lagrangian (identity 10), which the oracle checks elsewhere; a singular
+one is checked against closed solutions and against a Runge-Kutta step written out here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of, lagrangian_twin
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    Composition,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.models.model_file import Model, dump_model, parse_model
+from scvi_codegen.models.problems import problem
+
+QUICK = ("-O1", "-ffp-contract=off")
+ROUND_OFF = 2e-14
+METHODS = (
+    SVI(3),
+    SVI(2, "gauss-legendre:4"),
+    SVI(3, "clenshaw-curtis:4"),
+    SCVI(1),
+    SCVI(3),
+    SCVI(2, "gauss-lobatto:4"),
+    SCVI(3, variational=False),
+    SCVI(3, abscissae="radau-iia"),
+    SpectralCollocation(3),
+    SpectralCollocation(3, form="phase-space"),
+    Gauss(2),
+    Gauss(2, form="position"),
+    RadauIA(2),
+    RadauIIA(3),
+    LobattoIIIA(3, form="position"),
+    StoermerVerlet(),
+    ExplicitEuler(),
+)
+
+
+def hyperbolic() -> HamiltonianSystem:
+    """H = q p: q' = q, p' = -p, and velocities say nothing of momenta."""
+    return HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
+
+
+# Reading.
+
+
+def test_text_and_sympy_give_the_same_system() -> None:
+    text = HamiltonianSystem.from_text(
+        name="pendulum",
+        coordinates=["q"],
+        momenta=["p"],
+        hamiltonian="p**2/(2*m) - cos(q) + 0.1*t",
+        parameters={"m": 2},
+    )
+    q, p, m, t = sympy.symbols("q p m t")
+    own = HamiltonianSystem.from_sympy(
+        name="pendulum",
+        coordinates=[q],
+        momenta=[p],
+        hamiltonian=p**2 / (2 * m) - sympy.cos(q) + 0.1 * t,
+        parameters={m: 2},
+    )
+    T = sympy.Symbol("T")
+    Q, P = sympy.Function("q")(T), sympy.Function("p")(T)
+    functions = HamiltonianSystem.from_sympy(
+        name="pendulum",
+        coordinates=[Q],
+        momenta=[P],
+        hamiltonian=P**2 / (2 * m) - sympy.cos(Q) + 0.1 * T,
+        parameters={m: 2},
+    )
+    assert text == own == functions
+    assert text.with_parameters(m=3.0).defaults == (3.0,)
+    assert text._repr_latex_().startswith("$")
+
+
+def test_momenta_are_called_after_their_coordinates_by_default() -> None:
+    system = HamiltonianSystem.from_text(name="free", coordinates=["x", "y"], hamiltonian="(p_x**2 + p_y**2)/2")
+    assert [p.name for p in system.momenta] == ["p_x", "p_y"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"coordinates": "q"}, r"write \['q'\]"),
+        ({"momenta": "p"}, r"write \['p'\]"),
+        ({"momenta": ["p", "r"]}, "1 coordinates, but 2 momenta"),
+        ({"momenta": ["q"]}, "name of both coordinate 'q' and momentum 'q'"),
+        ({"momenta": ["double"]}, "keyword of C"),
+        ({"hamiltonian": "p**2/2 + z"}, "'z'"),
+        ({"hamiltonian": "p**2/2 + q_dot"}, "'q_dot'"),
+        ({"parameters": {"p": 1.0}}, "'p' is the name of both"),
+    ],
+)
+def test_refused_systems(changes: dict[str, object], message: str) -> None:
+    given = {"name": "x", "coordinates": ["q"], "momenta": ["p"], "hamiltonian": "p**2/2"} | changes
+    with pytest.raises(SystemDefinitionError, match=message):
+        HamiltonianSystem.from_text(**given)  # type: ignore[arg-type]  # wrong on purpose
+
+
+def test_model_files_hold_a_hamiltonian() -> None:
+    model = Model(system=hyperbolic(), method=SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5)
+    text = dump_model(model)
+    assert 'hamiltonian = "p*q"' in text
+    assert parse_model(text) == model
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("hamiltonian =", "lagrangian =", "momenta beside a lagrangian"),
+        ('hamiltonian = "p*q"', 'hamiltonian = "p*q"\nlagrangian = "q"', "both of lagrangian and hamiltonian"),
+        ('hamiltonian = "p*q"', "", "neither of lagrangian and hamiltonian"),
+        ('"p",', "1,", "momenta must be a list of names"),
+    ],
+)
+def test_refused_model_files(old: str, new: str, message: str) -> None:
+    text = dump_model(Model(system=hyperbolic(), method=SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5))
+    assert old in text
+    with pytest.raises(Exception, match=message):
+        parse_model(text.replace(old, new))
+
+
+# Legendre's transform.
+
+
+@pytest.mark.parametrize(
+    "name", ["kepler", "double-pendulum", "charged-particle", "cart-pole", "relativistic-particle"]
+)
+def test_legendre_there_and_back(name: str) -> None:
+    """At a random point: v = H_p and H = p . v - L; and the Lagrangian of the Hamiltonian is the first one again."""
+    system = problem(name).system
+    assert isinstance(system, LagrangianSystem)
+    hamiltonian = hamiltonian_of(system)
+    assert hamiltonian.is_regular
+    again = lagrangian_of(hamiltonian)
+    generator = np.random.default_rng(5)
+    point = {
+        symbol: sympy.Float(generator.uniform(0.2, 0.7), 40) for symbol in (*system.coordinates, *system.velocities)
+    }
+    point |= {symbol: sympy.Float(value, 40) for symbol, value in system.constants.items()}
+    momenta = [sympy.diff(system.lagrangian, v).evalf(40, subs=point) for v in system.velocities]
+    energy = sum(p * point[v] for p, v in zip(momenta, system.velocities, strict=True)) - system.lagrangian.evalf(
+        40, subs=point
+    )
+    state = point | dict(zip(hamiltonian.momenta, momenta, strict=True))
+    assert abs(hamiltonian.hamiltonian.evalf(40, subs=state) - energy) < 1e-30
+    for p, v in zip(hamiltonian.momenta, system.velocities, strict=True):
+        assert abs(sympy.diff(hamiltonian.hamiltonian, p).evalf(40, subs=state) - point[v]) < 1e-30
+    assert abs(again.lagrangian.evalf(40, subs=point) - system.lagrangian.evalf(40, subs=point)) < 1e-30
+
+
+def test_what_has_no_legendre_transform_is_named() -> None:
+    with pytest.raises(SystemDefinitionError, match="velocities do not determine momenta"):
+        lagrangian_of(hyperbolic())
+    assert lagrangian_twin(hyperbolic()) is None
+    quintic = LagrangianSystem.from_text(name="quintic", coordinates=["q"], lagrangian="q_dot**2/2 + q_dot**6/6 - q**2")
+    with pytest.raises(SystemDefinitionError, match="give the other function yourself"):
+        hamiltonian_of(quintic)
+
+
+# Steps of regular Hamiltonians.
+
+
+@pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle"])
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_a_regular_hamiltonian_gives_the_steps_of_its_lagrangian(sample, name, method) -> None:
+    """Identity 10, for every method: with Newton's iteration on (35), and with the fixed point."""
+    system, h, t = sample(name).system, 0.13, 0.4
+    q, p = sample(name).state
+    expected = np.array(compile_stepper(system, method, solver="newton", flags=QUICK).step(q, p, h, t))
+    hamiltonian = hamiltonian_of(system)
+    for solver in ("newton", "auto"):
+        stepper = compile_stepper(hamiltonian, method, solver=solver, flags=QUICK)
+        assert np.abs(np.array(stepper.step(q, p, h, t)) - expected).max() < ROUND_OFF
+
+
+def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
+    system = sample("double-pendulum").system
+    one, two = (compile_stepper(s, SVI(2), solver="newton", flags=QUICK) for s in (system, hamiltonian_of(system)))
+    q, p = sample("double-pendulum").state
+    v = one.velocity(q, p)
+    assert np.abs(two.velocity(q, p) - v).max() < ROUND_OFF
+    assert np.abs(two.momentum(q, v) - p).max() < ROUND_OFF
+    assert abs(two.energy(q, p) - one.energy(q, p)) < ROUND_OFF
+    q1 = one.step(q, p, 0.1)[0]
+    assert abs(two.discrete_lagrangian(q, q1, 0.1) - one.discrete_lagrangian(q, q1, 0.1)) < ROUND_OFF
+    assert np.abs(two.discrete_legendre_minus(q, q1, 0.1)[1] - p).max() < 1e-12
+
+
+def test_compositions_take_a_separable_hamiltonian(sample) -> None:
+    system = sample("kepler").system
+    q, p = sample("kepler").state
+    one, two = (
+        compile_stepper(s, Composition(8), flags=QUICK).step(q, p, 0.1) for s in (system, hamiltonian_of(system))
+    )
+    assert np.array_equal(one, two)
+
+
+# Singular Hamiltonians.
+
+
+@pytest.mark.parametrize(
+    ("method", "error"),
+    [
+        (SVI(4), 1e-14),
+        (Gauss(3), 1e-10),
+        (RadauIIA(3), 1e-8),
+        (SVI(3, "gauss-lobatto:3"), 1e-4),
+        (SpectralCollocation(5, form="phase-space"), 1e-9),
+        (StoermerVerlet(), 1e-2),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_a_hamiltonian_without_a_lagrangian(method, error) -> None:
+    """q' = q, p' = -p; q p is a quadratic invariant, kept by the symplectic methods to round-off."""
+    stepper = compile_stepper(hyperbolic(), method, flags=QUICK)
+    run = stepper.integrate([1.0], [1.0], h=0.1, steps=10)
+    assert abs(run.q[-1, 0] - np.e) < error
+    assert abs(run.p[-1, 0] - 1 / np.e) < error
+    if method.symplectic:
+        assert np.abs(run.energy() - 1.0).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    "method",
+    [SVI(3, "gauss-legendre:4"), SCVI(2), SpectralCollocation(2), Gauss(2, form="position")],
+    ids=lambda method: method.name,
+)
+def test_methods_that_need_a_lagrangian_say_so(method) -> None:
+    for make in (compile_stepper, derive):
+        with pytest.raises(MethodError, match="as many quadrature points as its degree"):
+            make(hyperbolic(), method)
+
+
+def test_a_singular_hamiltonian_has_no_momenta_of_velocities_and_no_discrete_lagrangian() -> None:
+    stepper = compile_stepper(hyperbolic(), SVI(2), flags=QUICK)
+    assert stepper.velocity([2.0], [5.0]) == 2.0
+    with pytest.raises(StateError, match="Give p"):
+        stepper.momentum([1.0], [1.0])
+    with pytest.raises(MethodError, match="no discrete Lagrangian"):
+        stepper.discrete_lagrangian([1.0], [1.1], 0.1)
+
+
+def test_quadratures_with_derivatives_need_a_lagrangian() -> None:
+    with pytest.raises(MethodError, match="lagrangian_of"):
+        compile_stepper(hamiltonian_of(problem("planar-pendulum").system), SVI(2, "hermite:2"))
+
+
+def vortex_rates(state: np.ndarray, strength: np.ndarray) -> np.ndarray:
+    """Velocities of point vortices, from the law of Biot and Savart."""
+    n = len(strength)
+    x, y = state[:n], state[n:] / strength
+    dx, dy = x[:, None] - x, y[:, None] - y
+    distance = dx**2 + dy**2 + np.eye(n)
+    u = -(dy / distance) @ strength / (2 * np.pi)
+    v = (dx / distance) @ strength / (2 * np.pi)
+    return np.concatenate([u, strength * v])
+
+
+def test_point_vortices_against_gauss_written_out() -> None:
+    entry = problem("point-vortices")
+    strength = np.array(entry.system.defaults)
+    stepper = compile_stepper(entry.system, SVI(2), flags=QUICK)
+    root = np.sqrt(3.0) / 6.0
+    A = np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]])
+    state, h = np.concatenate([entry.q, entry.p]), 0.1
+    slopes = np.zeros((2, len(state)))
+    for _ in range(200):
+        slopes = np.array([vortex_rates(state + h * line @ slopes, strength) for line in A])
+    expected = state + h * slopes.sum(axis=0) / 2
+    assert np.abs(np.concatenate(stepper.step(entry.q, entry.p, h)) - expected).max() < ROUND_OFF
+
+
+@pytest.mark.parametrize("method", [SVI(6), Gauss(3), RadauIIA(3), StoermerVerlet()], ids=lambda method: method.name)
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None:
+    entry = problem("point-vortices")
+    one, two = (
+        compile_stepper(entry.system, method, solver=solver, flags=QUICK) for solver in ("fixed-point", "newton")
+    )
+    steps = [np.array(stepper.step(entry.q, entry.p, h)) for stepper in (one, two)]
+    assert np.abs(steps[0] - steps[1]).max() < ROUND_OFF
+    ends = [stepper.integrate(entry.q, entry.p, h=h, steps=50).q[-1] for stepper in (one, two)]
+    assert np.abs(ends[0] - ends[1]).max() < 1e-12
+
+
+def test_point_vortices_conserve_what_they_must() -> None:
+    """Energy nearly; the centre of vorticity and the angular impulse to round-off (linear and quadratic invariants)."""
+    entry = problem("point-vortices")
+    strength = np.array(entry.system.defaults)
+    run = compile_stepper(entry.system, SVI(6), flags=QUICK).integrate(entry.q, entry.p, h=0.2, steps=500)
+    y = run.p / strength
+    invariants = [run.q @ strength, y @ strength, (run.q**2 + y**2) @ strength]
+    for values in invariants:
+        assert np.abs(values - values[0]).max() < 1e-12
+    assert np.abs(run.energy() / run.energy()[0] - 1).max() < 1e-7
+
+
+def test_the_derivation_shows_the_momenta_at_the_points() -> None:
+    derived = derive(hamiltonian_of(problem("planar-pendulum").system), SCVI(2, "gauss-legendre:2"))
+    numbers = [equation.number for equation in derived.equations]
+    assert numbers.count("35f") == 6
+    assert {"35a", "35d"} <= set(numbers)
+    assert "H = " in derived.to_text()
+    assert {"P_1", "P_2", "N_1", "nu_2"} <= {symbol.name for symbol in derived.unknowns}

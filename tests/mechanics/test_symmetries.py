@@ -1,0 +1,461 @@
+"""Symmetries that are found, those that are refused, and what compiled runs conserve of their momentum maps."""
+
+from __future__ import annotations
+
+import time
+from itertools import combinations
+
+import numpy as np
+import pytest
+import sympy
+from sympy import Symbol
+
+from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.forms import euler_lagrange, force, momentum
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, check_symmetry, symmetries
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    Composition,
+    ExplicitEuler,
+    Gauss,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.methods.exactness import is_exact
+from scvi_codegen.models.problems import PROBLEMS, point_vortices, problem
+
+ROUNDOFF = 3e-14
+
+
+def particle(potential: str = "0", axes: str = "xy", **parameters: float) -> LagrangianSystem:
+    """One mass m, kinetic energy less a potential."""
+    kinetic = " + ".join(f"{axis}_dot**2" for axis in axes)
+    return LagrangianSystem.from_text(
+        name="particle",
+        coordinates=list(axes),
+        lagrangian=f"m*({kinetic})/2 - ({potential})",
+        parameters={"m": 1.3} | parameters,
+    )
+
+
+def bodies(axes: str = "xy", *, gravity: bool = False, names: str = "abc") -> LagrangianSystem:
+    """Three masses that attract each other, softly, perhaps falling."""
+    pairs = combinations(names, 2)
+    terms = [f"m_{b}*({' + '.join(f'{b}_{axis}_dot**2' for axis in axes)})/2" for b in names]
+    terms += [
+        f"G*m_{b}*m_{c}/sqrt(1 + {' + '.join(f'({b}_{axis} - {c}_{axis})**2' for axis in axes)})" for b, c in pairs
+    ]
+    if gravity:
+        terms += [f"-m_{b}*g*{b}_y" for b in names]
+    return LagrangianSystem.from_text(
+        name="bodies",
+        coordinates=[f"{b}_{axis}" for b in names for axis in axes],
+        lagrangian=" + ".join(terms).replace("+ -", "- "),
+        parameters={"G": 1.0, "g": 0.7} | {f"m_{b}": 1.0 + k for k, b in enumerate(names)},
+    )
+
+
+MAGNETIC = "m*(x_dot**2 + y_dot**2 + z_dot**2)/2 + e*B*x*y_dot + e*E*x"
+
+
+def magnetic(e_field: float = 0.3) -> LagrangianSystem:
+    """A charge in crossed constant fields."""
+    return LagrangianSystem.from_text(
+        name="crossed fields",
+        coordinates=["x", "y", "z"],
+        lagrangian=MAGNETIC,
+        parameters={"m": 1.3, "e": 0.7, "B": 1.1, "E": e_field},
+    )
+
+
+def formulas(system: MechanicalSystem) -> dict[str, str]:
+    return {symmetry.name: symmetry.formula for symmetry in symmetries(system)}
+
+
+# What is found.
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("kepler", ["angular momentum"]),
+        ("henon-heiles", []),
+        ("duffing", []),
+        ("harmonic-oscillator", []),
+        ("spherical-pendulum", ["momentum of phi"]),
+        ("cart-pole", ["momentum of x"]),
+        ("double-pendulum", []),
+        ("relativistic-particle", []),
+        ("charged-particle", ["momentum of y", "momentum of z", "boost of z"]),
+        ("outer-solar-system", [f"{k}{a}" for k in ("linear momentum ", "angular momentum ", "boost ") for a in "xyz"]),
+        ("point-vortices", ["momentum of all coordinates", "linear invariant", "quadratic invariant"]),
+        ("fput-chain", []),
+    ],
+)
+def test_symmetries_of_the_catalogue_are_found(name, expected):
+    assert [symmetry.name for symmetry in symmetries(problem(name).system)] == expected
+
+
+def test_a_central_force_in_space():
+    assert formulas(particle("k/sqrt(x**2 + y**2 + z**2)", "xyz", k=1.0)) == {
+        "angular momentum x": "y*p_z - z*p_y",
+        "angular momentum y": "z*p_x - x*p_z",
+        "angular momentum z": "x*p_y - y*p_x",
+    }
+
+
+def test_an_oscillator_has_the_rotations_and_no_more():
+    """Its other symmetries go with cos(t): not among those searched."""
+    assert list(formulas(particle("k*(x**2 + y**2 + z**2)/2", "xyz", k=2.0))) == [
+        f"angular momentum {a}" for a in "xyz"
+    ]
+    assert list(formulas(particle("k*(x**2 + y**2)/2 + k*z**2", "xyz", k=2.0))) == ["angular momentum z"]
+
+
+def test_a_free_particle():
+    assert formulas(particle()) == {
+        "momentum of x": "p_x",
+        "momentum of y": "p_y",
+        "angular momentum": "x*p_y - y*p_x",
+        "boost of x": "m*x - p_x*t",
+        "boost of y": "m*y - p_y*t",
+    }
+
+
+def test_a_uniform_field_has_as_many():
+    assert formulas(particle("m*g*y", g=9.81)) == {
+        "momentum of x": "p_x",
+        "momentum of y": "p_y + g*m*t",
+        "angular momentum": "x*p_y + g*m*x*t - y*p_x - g*p_x*t**2/2",
+        "boost of x": "m*x - p_x*t",
+        "boost of y": "m*y - p_y*t - g*m*t**2/2",
+    }
+
+
+def test_masses_that_differ_between_the_axes():
+    system = LagrangianSystem.from_text(
+        name="anisotropic",
+        coordinates=["u", "w"],
+        lagrangian="m*u_dot**2/2 + M*w_dot**2/2",
+        parameters={"m": 1.0, "M": 4.0},
+    )
+    assert formulas(system)["angular momentum of u, w"] == "m*u*p_w - M*w*p_u"
+
+
+def test_sums_of_parameters_in_coefficients():
+    system = LagrangianSystem.from_text(
+        name="trolley",
+        coordinates=["x", "y"],
+        lagrangian="M*x_dot**2/2 + m*(x_dot + y_dot)**2/2 - k*(y - a - b)**4",
+        parameters={"m": 1.0, "M": 4.0, "k": 1.0, "a": 0.1, "b": 0.2},
+    )
+    assert formulas(system)["boost of x"] == "(M + m)*x + m*y - p_x*t"
+    shifted = particle("((x - a - b)**2 + y**2)**2", a=0.3, b=0.4)
+    (turn,) = symmetries(shifted)
+    assert turn.formula == "x*p_y - y*p_x - (a + b)*p_y"
+
+
+def test_long_numbers_in_a_formula_come_back_to_the_last_digit():
+    system = LagrangianSystem.from_text(
+        name="measured",
+        coordinates=["x"],
+        lagrangian="1.00000597682*x_dot**2/2",
+    )
+    assert symmetries(system)[1].momentum_map.coeff(Symbol("x", real=True)) == sympy.Rational("1.00000597682")
+
+
+def test_other_linear_coordinates():
+    """Kepler's problem in x = 2 u + w, y = u - 3 w: the rotation has no simple form there."""
+    system = LagrangianSystem.from_text(
+        name="skew",
+        coordinates=["u", "w"],
+        lagrangian="((2*u_dot + w_dot)**2 + (u_dot - 3*w_dot)**2)/2 + 1/sqrt((2*u + w)**2 + (u - 3*w)**2)",
+    )
+    assert formulas(system) == {"linear symmetry of u, w": "u*p_u + 5*u*p_w - 10*w*p_u - w*p_w"}
+
+
+def test_a_force_that_is_too_small_for_binary64_breaks_it_all_the_same():
+    assert symmetries(particle("1/sqrt(x**2 + y**2) + 1e-14*x")) == ()
+
+
+def test_magnetic_fields_have_gauges():
+    found = {symmetry.name: symmetry for symmetry in symmetries(magnetic())}
+    assert list(found) == ["momentum of x", "momentum of y", "momentum of z", "angular momentum z", "boost of z"]
+    assert found["momentum of x"].formula == "p_x - B*e*y - E*e*t"
+    assert str(found["momentum of x"].gauge) == "B*e*y + E*e*t"
+    assert found["momentum of x"].direction == (1, 0, 0)
+
+
+@pytest.mark.parametrize("axes", ["xy", "xyz"])
+@pytest.mark.parametrize("gravity", [False, True])
+def test_three_bodies_have_the_whole_galilean_group(axes, gravity):
+    """Translations, rotations and boosts, 5 in the plane, 9 in space; energy would be the tenth."""
+    found = formulas(bodies(axes, gravity=gravity))
+    turns = ["angular momentum"] if axes == "xy" else [f"angular momentum {axis}" for axis in axes]
+    assert list(found) == [*(f"linear momentum {a}" for a in axes), *turns, *(f"boost {a}" for a in axes)]
+    assert found["boost x"] == "m_a*a_x + m_b*b_x + m_c*c_x - p_a_x*t - p_b_x*t - p_c_x*t"
+    if not gravity:
+        assert found["linear momentum y"] == "p_a_y + p_b_y + p_c_y"
+
+
+def test_more_than_twelve_coordinates_are_tried_as_a_whole():
+    chain = " ".join(f"+ cos(q{k} - q{(k + 1) % 14})" for k in range(14))
+    kinetic = " + ".join(f"M*q{k}_dot**2/2" for k in range(14))
+    closed = LagrangianSystem.from_text(
+        name="closed chain",
+        coordinates=[f"q{k}" for k in range(14)],
+        lagrangian=f"{kinetic} {chain}",
+        parameters={"M": 2.0},
+    )
+    assert list(formulas(closed)) == ["momentum of all coordinates", "boost of all coordinates"]
+    assert formulas(closed)["boost of all coordinates"].startswith("M*q0 + M*q1 + M*q2 ")
+    loose = LagrangianSystem.from_text(
+        name="cyclic ones",
+        coordinates=[f"q{k}" for k in range(14)],
+        lagrangian=f"{kinetic} + cos(q1) + q2**2 * q3_dot**2",
+        parameters={"M": 2.0},
+    )
+    assert "momentum of q3" in formulas(loose)
+    assert "momentum of q1" not in formulas(loose)
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_each_rotation_turns_about_the_axis_it_is_named_for(axis):
+    others = [name for name in "xyz" if name != axis]
+    (symmetry,) = symmetries(particle(f"({others[0]}**2 + {others[1]}**2)**2 + {axis}**2/3", "xyz"))
+    assert symmetry.name == f"angular momentum {axis}"
+    assert symmetry.direction["xyz".index(axis)] == 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "exp(c*t)*(x_dot**2 + y_dot**2 - x**2 - 2*y**4)/2",
+        "(1 + c*cos(t))*(x_dot**2 + y_dot**2)/2 - x**2/2 - y**4",
+        "(x_dot**2 + y_dot**2)/2 - x**4 - c*y**4",
+        "(x_dot**2 + y_dot**2)/2 - (x**2 + y**2)**2 - 1e-6*c*x*y",
+    ],
+)
+def test_systems_without(text):
+    system = LagrangianSystem.from_text(name="none", coordinates=["x", "y"], lagrangian=text, parameters={"c": 0.1})
+    assert symmetries(system) == ()
+
+
+def test_a_parameter_that_is_zero_by_default_breaks_symmetries_all_the_same():
+    """Momentum maps are compiled for all values of the parameters."""
+    assert symmetries(particle("(x**2 + y**2)**2 + eps*x**4", eps=0.0)) == ()
+
+
+def test_point_vortices():
+    found = formulas(point_vortices(3))
+    assert found["linear invariant"] == "strength_1*x_1 + strength_2*x_2 + strength_3*x_3"
+    squares = [f"strength_{k}*x_{k}**2" for k in (1, 2, 3)] + [f"y_{k}**2/strength_{k}" for k in (1, 2, 3)]
+    assert found["quadratic invariant"] == " + ".join(squares)
+
+
+def test_a_hamiltonian_has_the_symmetries_of_its_lagrangian():
+    for system in (particle("m*g*y", g=2.0), magnetic(), problem("kepler").system):
+        assert formulas(hamiltonian_of(system)) == formulas(system)
+
+
+def rate(system: MechanicalSystem, symmetry: Symmetry) -> sympy.Expr:
+    """dJ/dt along a motion, by SymPy's own derivatives: accelerations from the Euler-Lagrange equations, solved."""
+    at = dict(zip(symmetry.momenta, momentum(system), strict=True))
+    J = symmetry.momentum_map
+    terms = [J.diff(p) * f for p, f in zip(symmetry.momenta, force(system), strict=True)]
+    terms += [J.diff(q) * v for q, v in zip(system.coordinates, system.velocities, strict=True)]
+    return sympy.simplify((sympy.Add(*terms) + J.diff(system.time)).subs(at))
+
+
+@pytest.mark.parametrize("system", [particle("m*g*y", g=9.81), magnetic(), particle("1/sqrt(x**2 + y**2)")], ids=str)
+def test_each_is_conserved_identically(system):
+    for symmetry in symmetries(system):
+        assert rate(system, symmetry) == 0
+        assert euler_lagrange(system)
+        products = [p * xi for p, xi in zip(symmetry.momenta, symmetry.direction, strict=True)]
+        assert sympy.expand(sympy.Add(*products) - symmetry.gauge - symmetry.momentum_map) == 0
+
+
+def test_searching_takes_no_time_to_speak_of():
+    for name in (*PROBLEMS, "fput-chain:64"):
+        system = problem(name).system
+        symmetries.cache_clear()
+        began = time.process_time()
+        symmetries(system)
+        assert time.process_time() - began < 1.0, name  # 0.1 s measured for the slowest
+
+
+# What is given.
+
+
+def test_given_directions_are_checked():
+    kepler = problem("kepler").system
+    x, y = kepler.coordinates
+    for direction in (["-q2", "q1"], [-y, x], [-Symbol("q2"), Symbol("q1")]):
+        assert check_symmetry(kepler, direction).formula == "q1*p_q2 - q2*p_q1"
+    assert check_symmetry(particle("m*g*y", g=9.81), [0, "-t"]).formula == "m*y - p_y*t - g*m*t**2/2"
+    assert check_symmetry(hamiltonian_of(kepler), ["-q2", "q1"]).formula == "q1*p_q2 - q2*p_q1"
+
+
+def test_a_gauge_of_ones_own():
+    cart = problem("cart-pole").system
+    found = check_symmetry(cart, ["t", 0], gauge="(M + m)*x + m*l*sin(theta)", name="centre of mass")
+    assert str(found) == "centre of mass = -l*m*sin(theta) + p_x*t - x*(M + m)"
+    assert not is_exact(found, SVI(4))
+
+
+WRONG = {
+    "along it L changes by -mu*q1/(q1**2 + q2**2)**(3/2), not the time derivative of a polynomial f": ["1", "0"],
+    "along it L changes by .*q1_dot": ["t", "0"],
+    "L changes by .* \\+ q1_dot\\*\\*2 \\+ q2_dot\\*\\*2": ["q1", "q2"],
+    "is no symmetry of 'Kepler problem'": ["-q2*(1 + 1e-9)", "q1"],
+    "unknown name 'w'": ["w", "q1"],
+    "2 components, one for each of q1, q2": ["q1"],
+    "unknown name 'q1_dot'": ["q1_dot", "0"],
+    "'momentum' is not a coordinate, time or parameter": [Symbol("momentum"), 0],
+    "text or a SymPy expression, not None": [None, 0],
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_wrong_direction_is_refused_with_its_defect(message):
+    pattern = message if "\\" in message or ".*" in message else message.translate({ord(c): f"\\{c}" for c in "()*+/"})
+    with pytest.raises(SystemDefinitionError, match=pattern):
+        check_symmetry(problem("kepler").system, WRONG[message])
+
+
+def test_a_wrong_gauge_is_refused():
+    with pytest.raises(SystemDefinitionError, match=r"differs by .*, not 0"):
+        check_symmetry(particle(), ["t", 0], gauge="2*m*x")
+
+
+def test_a_symmetry_of_another_system_or_of_a_name_in_use_is_refused():
+    kepler = problem("kepler").system
+    with pytest.raises(SystemDefinitionError, match="of another system"):
+        all_symmetries(kepler, [symmetries(particle())[0]])
+    with pytest.raises(SystemDefinitionError, match="two symmetries are called 'angular momentum'"):
+        all_symmetries(kepler, symmetries(kepler))
+
+
+# Compiled, tracked, shown.
+
+
+def test_values_are_those_of_the_formulas(quickly_compiled):
+    system = magnetic()
+    stepper = quickly_compiled(system, SVI(2))
+    generator = np.random.default_rng(1)
+    q, p, t = generator.uniform(-1, 1, (5, 3)), generator.uniform(-1, 1, (5, 3)), generator.uniform(-1, 1, 5)
+    values = stepper.momentum_maps(q, p, t, {"m": 2.5})
+    assert values.shape == (5, 5)
+    assert stepper.momentum_map_names == tuple(symmetry.name for symmetry in symmetries(system))
+    constants = system.with_parameters(m=2.5).constants
+    for k, symmetry in enumerate(symmetries(system)):
+        for n in range(5):
+            at = dict(zip((*symmetry.coordinates, *symmetry.momenta), (*q[n], *p[n]), strict=True))
+            exact = symmetry.momentum_map.subs(at | {symmetry.time: t[n]} | constants)
+            assert values[n, k] == pytest.approx(float(exact), rel=1e-13)
+    assert np.array_equal(stepper.momentum_maps(q[0], p[0], t[0], {"m": 2.5}), values[0])
+
+
+def test_without_symmetries_nothing_is_emitted(quickly_compiled):
+    entry = problem("henon-heiles")
+    stepper = quickly_compiled(entry.system, SVI(2))
+    assert "momentum_maps" not in stepper.source.header + stepper.source.code
+    assert stepper.momentum_maps([0.1, 0.2], [0.1, 0.2]).shape == (0,)
+    assert stepper.integrate([0.1, 0.2], [0.1, 0.2], h=0.1, steps=3).momentum_errors().shape == (4, 0)
+
+
+SYSTEMS = {
+    "fields": (magnetic(), [0.3, 0.2, 0.1], [0.5, 0.4, 0.2]),
+    "falling": (particle("m*g*y", g=2.1), [0.3, 0.2], [0.5, 0.4]),
+    "bodies": (bodies(gravity=True), [0.0, 0.1, 4.0, 0.2, -0.5, 5.9], [0.1, 0.4, -0.2, 1.1, 1.3, -0.8]),
+    "vortices": (point_vortices(3), [-0.5, 0.5, -0.25], [0.1, 0.2, -0.1]),
+}
+EXACT = [
+    *(("fields", m) for m in (SVI(2), SVI(3, "gauss-legendre:4"), SCVI(3), Gauss(2), SVI(2, "gauss-lobatto:3"))),
+    *(("falling", m) for m in (SVI(3), SCVI(2), StoermerVerlet(), Composition(8), Gauss(3))),
+    *(("bodies", m) for m in (SVI(4), SVI(1), StoermerVerlet())),
+    ("vortices", SVI(3)),
+]
+
+
+@pytest.mark.parametrize(("name", "method"), EXACT, ids=lambda value: getattr(value, "name", value))
+def test_what_a_method_is_said_to_conserve_it_conserves(quickly_compiled, name, method):
+    system, q, p = SYSTEMS[name]
+    stepper = quickly_compiled(system, method)
+    errors = np.abs(stepper.integrate(q, p, h=0.05, steps=400).momentum_errors()).max(axis=0)
+    exact = np.array(stepper.interface.map_exact)
+    assert exact.sum() >= 3
+    assert errors[exact].max() < ROUNDOFF
+
+
+BROKEN = [
+    ("fields", StoermerVerlet(), "angular momentum z"),
+    ("fields", SVI(3, "clenshaw-curtis:4"), "angular momentum z"),
+    ("fields", RadauIIA(2), "angular momentum z"),
+    ("fields", SCVI(3, variational=False), "momentum of x"),
+    ("bodies", ExplicitEuler(), "angular momentum"),
+    ("bodies", SpectralCollocation(3), "angular momentum"),
+    ("vortices", RadauIIA(2), "quadratic invariant"),
+]
+
+
+@pytest.mark.parametrize(("name", "method", "broken"), BROKEN, ids=lambda value: getattr(value, "name", value))
+def test_what_is_not_promised_may_be_broken(quickly_compiled, name, method, broken):
+    """Where the promise would be wrong; 100 times the round-off bound."""
+    system, q, p = SYSTEMS[name]
+    stepper = quickly_compiled(system, method)
+    k = stepper.momentum_map_names.index(broken)
+    errors = np.abs(stepper.integrate(q, p, h=0.05, steps=400).momentum_errors()).max(axis=0)
+    assert not stepper.interface.map_exact[k]
+    assert errors[k] > 100 * ROUNDOFF
+
+
+def test_a_given_symmetry_is_tracked(quickly_compiled):
+    entry = problem("cart-pole")
+    centre = check_symmetry(entry.system, ["t", 0], gauge="(M + m)*x + m*l*sin(theta)", name="centre of mass")
+    plain = quickly_compiled(entry.system, SVI(2))
+    stepper = compile_stepper(entry.system, SVI(2), flags=plain.flags, symmetries=[centre])
+    assert stepper.momentum_map_names == ("momentum of x", "centre of mass")
+    run = stepper.integrate(entry.q, stepper.momentum(entry.q, [0.3, 0.1]), h=0.05, steps=200)
+    errors = np.abs(run.momentum_errors()).max(axis=0)
+    assert errors[0] < ROUNDOFF
+    assert 1e-12 < errors[1] < 1e-5  # the quadrature of cos(theta) theta_dot is not exact
+    assert plain.momentum_map_names == ("momentum of x",)
+
+
+def test_ensembles_track_them_with_parameters_of_their_own(quickly_compiled):
+    stepper = quickly_compiled(particle("k*(x**2 + y**2)**2", k=1.0), SVI(2))
+    q, p = np.array([[1.0, 0.2], [0.3, 0.4]]), np.array([[0.1, 0.9], [0.5, -0.2]])
+    runs = stepper.integrate_ensemble(q, p, h=0.05, steps=20, parameters={"k": [0.5, 2.0]})
+    assert runs.momentum_maps().shape == (21, 2, 1)
+    assert np.abs(runs.momentum_errors()).max() < ROUNDOFF
+    alone = stepper.integrate(q[1], p[1], h=0.05, steps=20, parameters={"k": 2.0})
+    assert np.allclose(alone.momentum_maps(), runs.momentum_maps()[:, 1], rtol=1e-13)
+
+
+def test_derivations_show_them():
+    derived = derive(magnetic(), RadauIIA(2))
+    assert "  momentum of x = p_x - B*e*y - E*e*t\n" in derived.to_text()
+    assert "  boost of z = m*z - p_z*t  (not guaranteed by this method)\n" in derived.to_text()
+    assert r"J &= m z - p_{z} t \tag{boost of z}" in derived.to_latex()
+    assert "conserved" not in derive(problem("henon-heiles").system, SVI(1)).to_text()
+
+
+def test_headers_say_what_is_conserved():
+    source, interface = generate_source(magnetic(), RadauIIA(2))
+    assert " *   momentum of x = p_x - B*e*y - E*e*t\n" in source.header
+    assert " *   boost of z = m*z - p_z*t (not guaranteed by this method)\n" in source.header
+    assert interface.map_formulas[0] == "p_x - B*e*y - E*e*t"
+
+
+def test_hamiltonians_without_lagrangian_that_are_free():
+    system = HamiltonianSystem.from_text(name="shear", coordinates=["q"], hamiltonian="p_q*c", parameters={"c": 2.0})
+    assert set(formulas(system).values()) >= {"p_q"}

@@ -1,0 +1,274 @@
+"""Model files: what is written reads back equal, and what is wrong is named."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import ExpressionError, ModelFileError, SystemDefinitionError
+from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
+from scvi_codegen.models.model_file import Model, dump_model, load_model, parse_model, save_model
+from scvi_codegen.models.problems import PROBLEMS, problem
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import lobatto_iiib
+
+PENDULUM = """
+[system]
+name = "pendulum"
+coordinates = ["q"]
+lagrangian = "m*q_dot**2/2 + cos(q)"
+
+[parameters]
+m = 2.0
+
+[initial]
+q = [0.5]
+q_dot = [0]
+t = 1.5
+
+[method]
+method = "svi"
+degree = 3
+
+[run]
+step = 0.25
+span = 10
+every = 4
+"""
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def kepler(**changes: object) -> Model:
+    return replace(Model.from_problem(problem("kepler")), **changes)
+
+
+def test_reads_what_the_file_says():
+    model = parse_model(PENDULUM)
+    assert model.system.name == "pendulum"
+    assert [symbol.name for symbol in model.system.coordinates] == ["q"]
+    assert model.system.defaults == (2.0,)
+    assert model.method == SVI(3)
+    assert (model.q, model.p, model.velocity, model.t) == ((0.5,), None, (0.0,), 1.5)
+    assert (model.h, model.span, model.steps, model.every, model.step_count) == (0.25, 10.0, None, 4, 40)
+
+
+def test_the_layout_described_in_the_module_is_read():
+    from scvi_codegen.models import model_file
+
+    lines = (model_file.__doc__ or "").splitlines()
+    text = "\n".join(line for line in lines if line.startswith("    ") or not line)
+    assert parse_model(text).method == SVI(8)
+
+
+def test_vectors_may_be_tables_by_coordinate():
+    by_name = PENDULUM.replace("q = [0.5]\nq_dot = [0]\nt = 1.5", "t = 1.5\nq = {q = 0.5}\n[initial.q_dot]\nq = 0")
+    assert parse_model(by_name) == parse_model(PENDULUM)
+
+
+@pytest.mark.parametrize("name", [*PROBLEMS, "fput-chain:40"])
+def test_every_problem_survives_a_round_trip(name, tmp_path):
+    model = Model.from_problem(problem(name))
+    save_model(model, tmp_path / "model.toml")
+    assert load_model(tmp_path / "model.toml") == model
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        SVI(3, "clenshaw-curtis:5", "equispaced"),
+        SCVI(3, "gauss-lobatto:4", "legendre-lobatto", variational=False),
+        SpectralCollocation(4, form="phase-space"),
+        Gauss(3, form="position"),
+        CollocationRK((0.1, 1 / 3, 0.9)),
+        StoermerVerlet(),
+        METHODS["explicit-euler"](form="position"),
+    ],
+    ids=lambda method: method.name,
+)
+def test_every_kind_of_method_survives_a_round_trip(method):
+    model = kepler(method=method)
+    assert parse_model(dump_model(model)) == model
+
+
+@given(
+    q=st.tuples(finite, finite),
+    p=st.tuples(finite, finite),
+    t=finite,
+    h=st.floats(min_value=1e-3, max_value=1e3),
+    back=st.booleans(),
+    steps=st.integers(0, 10**12),
+    every=st.integers(1, 10**6),
+    mu=finite,
+)
+def test_every_number_survives_a_round_trip(q, p, t, h, back, steps, every, mu):
+    model = kepler(q=q, p=p, velocity=None, t=t, h=-h if back else h, span=None, steps=steps, every=every)
+    model = replace(model, system=model.system.with_parameters(mu=mu))
+    again = parse_model(dump_model(model))
+    assert again == model
+    assert np.array_equal(np.signbit([*again.q, *again.p]), np.signbit([*q, *p]))
+
+
+def test_names_that_need_quotes_survive_a_round_trip():
+    system = replace(kepler().system, name='a "Kepler"\\ problem\n*/ ü')
+    assert parse_model(dump_model(kepler(system=system))).system == system
+
+
+def test_methods_without_a_name_are_refused_rather_than_changed():
+    own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
+    for method in (SVI(2, own), METHODS["collocation"](("1/3", 1)), replace(Gauss(3), tableau=lobatto_iiib(3))):
+        with pytest.raises(ModelFileError, match=r"quadrature|method"):
+            dump_model(kepler(method=method))
+
+
+def test_a_failed_save_leaves_the_old_file(tmp_path):
+    path = tmp_path / "model.toml"
+    save_model(kepler(), path)
+    own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
+    with pytest.raises(ModelFileError):
+        save_model(kepler(method=SVI(2, own)), path)
+    assert load_model(path) == kepler()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_catalogue_reference_may_be_all_there_is():
+    assert parse_model('[system]\ncatalogue = "kepler"\n') == kepler()
+
+
+def test_a_catalogue_reference_may_be_changed():
+    text = '[system]\ncatalogue = "kepler"\n[parameters]\nmu = 2\n[run]\nstep = 0.5\nsteps = 3\n'
+    model = parse_model(text)
+    assert model.system == kepler().system.with_parameters(mu=2.0)
+    assert (model.h, model.steps, model.span, model.method) == (0.5, 3, None, SVI(8))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[run]", "[rum]", "unknown section 'rum' in the file; did you mean 'run'?"),
+        ("[method]", "[zzz]", "known: system, parameters, initial, method, run"),
+        ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
+        ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
+        ("every", "evry", "unknown key 'evry' in [run]; did you mean 'every'?"),
+        ('name = "pendulum"\n', "", "[system] lacks 'name'"),
+        ("step = 0.25\n", "", "[run] lacks 'step'"),
+        ("degree = 3\n", "", "svi needs 'degree'"),
+        ("q = [0.5]\n", "", "[initial] lacks 'q'"),
+        ("q_dot = [0]\n", "", "[initial] has neither of p and q_dot"),
+        ("q_dot = [0]\n", "q_dot = [0]\np = [0]\n", "[initial] has both of p and q_dot"),
+        ("span = 10\n", "", "[run] has neither of span and steps"),
+        ("span = 10\n", "span = 10\nsteps = 40\n", "[run] has both of span and steps"),
+        ("q = [0.5]", "q = 0.5", "[initial] q must be a list of numbers or a table"),
+        ("q = [0.5]", "q = [0.5, 1]", "[initial] q must have 1 numbers for (q), not 2"),
+        ("q = [0.5]", "q = {q_ = 1}", "unknown coordinate 'q_' in [initial] q; did you mean 'q'?"),
+        ("q = [0.5]", "q = {}", "[initial] q lacks 'q'"),
+        ("q = [0.5]", "q = [nan]", "[initial] q, q, is nan"),
+        ("q = [0.5]", 'q = ["a"]', "[initial] q, q, must be a number, not 'a'"),
+        ("q = [0.5]", "q = [true]", "must be a number, not True"),
+        ("t = 1.5", "t = inf", "[initial] t is inf"),
+        ("m = 2.0", "m = nan", "[parameters] m is nan"),
+        ("m = 2.0", 'm = "2"', "[parameters] m must be a number, not '2'"),
+        ("m = 2.0", "m = 1" + "0" * 400, "[parameters] m is inf"),
+        ("step = 0.25", "step = 0", "the step is 0"),
+        ("step = 0.25", "step = 1e-300", "fewer than 2^53 steps"),
+        ("span = 10", "span = -10", "a positive length of time"),
+        ("every = 4", "every = 0", "[run] every must be at least 1"),
+        ("every = 4", "every = 1.5", "[run] every must be a whole number, not 1.5"),
+        ("span = 10", "steps = -1", "[run] steps must be at least 0"),
+        ('"svi"', '"svj"', "there is no method 'svj'"),
+        ('"svi"', "3", "[method] method must be text between quotes, not 3"),
+        ("degree = 3", "degree = 0", "[method]: "),
+        ("degree = 3", 'degree = 3\nquadrature = "gauss:3"', "unknown quadrature 'gauss'"),
+        ("degree = 3", "degree = 3\nquadrature = 3", "[method]: a quadrature is wanted"),
+        ('"svi"\ndegree = 3', '"scvi"\ndegree = 3\nvariational = "no"', "[method] variational must be true or false"),
+        ('"svi"\ndegree = 3', '"collocation"\nabscissae = 0.5', "[method] abscissae must be a list"),
+        ('["q"]', '"q"', "[system] coordinates must be a list of names"),
+        ("cos(q)", "cos(x)", "unknown name 'x'"),
+        ("m*q_dot**2/2 + ", "", "[system]: velocity 'q_dot' does not occur"),
+        ("[system]", "system = 3\n[zzz]", "unknown section 'zzz'"),
+        ("[system]", '[system]\ncatalogue = "kepler"', "unknown key 'name' in [system] beside catalogue"),
+        ("[run]", "[run", "this is not TOML"),
+    ],
+)
+def test_mistakes_are_named(old, new, message, tmp_path):
+    assert old in PENDULUM
+    path = tmp_path / "model.toml"
+    path.write_text(PENDULUM.replace(old, new, 1))
+    with pytest.raises(ModelFileError, match=re.escape(message)) as caught:
+        load_model(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_missing_section_is_named():
+    with pytest.raises(ModelFileError, match=r"the section \[run\] is missing"):
+        parse_model(PENDULUM[: PENDULUM.index("[run]")])
+    with pytest.raises(ModelFileError, match="must be a section"):
+        parse_model("run = 3\n" + PENDULUM[: PENDULUM.index("[run]")])
+
+
+def test_a_faulty_formula_is_pointed_at_and_the_cause_is_kept():
+    with pytest.raises(ModelFileError, match="column 20") as caught:
+        parse_model(PENDULUM.replace("cos(q)", "cos(x)"))
+    assert isinstance(caught.value.__cause__, ExpressionError)
+
+
+def test_unreadable_files_are_errors_of_the_model_file(tmp_path):
+    with pytest.raises(ModelFileError, match="cannot be read"):
+        load_model(tmp_path / "missing.toml")
+    with pytest.raises(ModelFileError, match="cannot be read"):
+        load_model(tmp_path)
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ModelFileError, match="not a text file in UTF-8"):
+        load_model(tmp_path / "binary.toml")
+
+
+def test_models_made_in_python_are_checked_and_take_arrays():
+    model = kepler(q=np.array([0.5, 0.0]), steps=np.int64(7), span=None, h=np.float64(0.5))
+    assert model == kepler(steps=7, span=None, h=0.5)
+    assert hash(model) == hash(kepler(steps=7, span=None, h=0.5))
+    for changes, message in (
+        ({"p": (0.0, 1.0)}, "exactly one of p and velocity"),
+        ({"steps": 3}, "exactly one of span and steps"),
+        ({"q": (1.0,)}, "q must have 2 numbers for (q1, q2), not 1"),
+        ({"q": 1.0}, "q must be 2 numbers"),
+        ({"velocity": (1.0, float("nan"))}, "velocity[1] (q2) is nan"),
+    ):
+        with pytest.raises(ModelFileError, match=re.escape(message)):
+            kepler(**changes)
+
+
+def test_step_count_is_the_whole_number_nearest_to_the_span():
+    assert kepler(h=0.3, span=1.0).step_count == 3
+    assert kepler(h=-0.3, span=1.0).step_count == 3
+    assert kepler(h=5.0, span=1.0).step_count == 1
+    assert kepler(steps=0, span=None).step_count == 0
+
+
+def test_a_model_starts_from_its_velocities_and_parameters():
+    model = parse_model(PENDULUM.replace("q_dot = [0]", "q_dot = [0.75]"))
+    stepper = compile_stepper(model.system.with_parameters(m=5.0), model.method)
+    run = model.start(stepper)
+    assert (run.q[0], run.p[0], run.t) == (0.5, 1.5, 1.5)
+    expected = stepper.integrate([0.5], [1.5], h=0.25, steps=40, t=1.5, parameters={"m": 2.0})
+    assert np.array_equal(run.record(40).q, expected.q)
+
+
+def test_errors_of_the_catalogue_are_errors_of_the_file():
+    with pytest.raises(ModelFileError, match="did you mean 'kepler'") as caught:
+        parse_model('[system]\ncatalogue = "keplr"\n')
+    assert isinstance(caught.value.__cause__, SystemDefinitionError)
+    with pytest.raises(ModelFileError, match="no parameter 'nu'"):
+        parse_model('[system]\ncatalogue = "kepler"\n[parameters]\nnu = 1.0\n')
+
+
+def test_the_example_of_the_outer_solar_system_is_the_catalogue_entry():
+    path = Path(__file__).parents[2] / "examples" / "outer_solar_system.toml"
+    assert load_model(path) == Model.from_problem(problem("outer-solar-system"))
+    assert "catalogue" not in path.read_text()

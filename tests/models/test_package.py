@@ -1,0 +1,217 @@
+"""Generated folders: C that any compiler takes, Python that needs no SymPy, files that are not lost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import BuildError, PackageError, StateError
+from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
+from scvi_codegen.models.model_file import Model, load_model
+from scvi_codegen.models.package import generate_package, load_package
+from scvi_codegen.models.problems import problem
+from scvi_codegen.tables.quadrature import Quadrature
+
+STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror"
+COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+
+WITHOUT_SYMPY = """
+import sys
+for name in ("sympy", "mpmath", "jinja2"):
+    sys.modules[name] = None               # importing it is an error
+import {name}
+q, p = {name}.stepper.step({q}, {p}, {h})
+print(*map(float.hex, [*q, *p]))
+"""
+
+
+def model_of(name: str, **changes: object) -> Model:
+    return replace(Model.from_problem(problem(name)), **changes)
+
+
+@pytest.fixture
+def pendulum() -> Model:
+    return model_of("planar-pendulum", method=SVI(3))
+
+
+def test_writes_all_that_belongs_to_an_integrator(pendulum, tmp_path):
+    folder = generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
+    assert folder == tmp_path / "made" / "pendulum_svi"
+    names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h"
+    assert sorted(path.name for path in folder.iterdir()) == names.split()
+    assert load_model(folder / "model.toml") == pendulum
+    assert "pendulum_svi_step" in (folder / "README.md").read_text()
+
+
+def test_equal_models_give_equal_bytes(pendulum, tmp_path):
+    one, two = (generate_package(pendulum, tmp_path / parent / "same") for parent in ("a", "b"))
+    for path in one.iterdir():
+        assert path.read_bytes() == (two / path.name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])
+def test_is_a_python_package_that_steps_as_the_compiled_system_without_sympy(name, tmp_path):
+    model = model_of(name, method=Gauss(2))
+    stepper = compile_stepper(model.system, model.method)
+    p = model.momenta(stepper)
+    folder = generate_package(model, tmp_path / "generated_stepper")
+    script = WITHOUT_SYMPY.format(name=folder.name, q=list(model.q), p=list(map(float, p)), h=model.h)
+    result = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    expected = np.concatenate(stepper.step(model.q, p, model.h))
+    assert [float.fromhex(word) for word in result.stdout.split()] == expected.tolist()
+
+
+def test_load_package_gives_an_equal_stepper(pendulum, tmp_path):
+    loaded = load_package(generate_package(pendulum, tmp_path / "pendulum_svi"))
+    stepper = compile_stepper(pendulum.system, pendulum.method)
+    assert (loaded.coordinates, loaded.parameters) == (stepper.coordinates, stepper.parameters)
+    assert loaded.interface.prefix == "pendulum_svi"
+    ours, theirs = (one.integrate([2.0], [0.1], h=0.3, steps=50, parameters={"g": 2.0}) for one in (loaded, stepper))
+    assert np.array_equal(ours.q, theirs.q)
+    assert np.array_equal(ours.energy(), theirs.energy())
+
+
+def test_the_c_text_is_compiled_as_it_stands(pendulum, tmp_path):
+    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    (folder / "pendulum_svi.c").write_text("#error edited\n")
+    with pytest.raises(BuildError, match="edited"):
+        load_package(folder)
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("planar-pendulum", SVI(3)), ("duffing", SpectralCollocation(2)), ("outer-solar-system", SVI(2))],
+)
+def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compiler, name, method, tmp_path):
+    model = model_of(name, method=method)
+    folder = generate_package(model, tmp_path / "generated_stepper")
+    command = ["make", "-s", "-C", str(folder), "run", f"CC={compiler}", f"CFLAGS={STRICT}"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, "warning" in result.stderr) == (0, False)
+    header, *lines = result.stdout.splitlines()
+    names = [coordinate.name for coordinate in model.system.coordinates]
+    assert header.split() == ["#", "t", *names, *(f"p_{name}" for name in names), "energy_error"]
+    table = np.array([line.split() for line in lines], dtype=float)
+    stepper = compile_stepper(model.system, method)
+    trajectory = model.start(stepper).record(model.step_count, every=model.step_count // 20)
+    assert np.array_equal(table[:, 0], trajectory.t)
+    states = np.hstack([trajectory.q, trajectory.p])
+    assert np.abs(table[:, 1:-1] - states).max() < 1e-8 * np.abs(states).max()
+    assert np.abs(table[:, -1]).max() <= 2 * np.abs(trajectory.energy() - trajectory.energy()[0]).max() + 1e-13
+
+
+def test_large_workspaces_are_not_on_the_stack(tmp_path):
+    text = (generate_package(model_of("kepler"), tmp_path / "kepler_svi") / "main.c").read_text()
+    assert "static double workspace[" in text
+    assert "static kepler_svi_run run;" in text
+
+
+def test_names_of_the_user_do_not_reach_the_program_text(tmp_path):
+    base = model_of("planar-pendulum", method=SVI(1))
+    model = replace(base, system=replace(base.system, name='*/ #error " ? \\\n """ evil'))
+    folder = generate_package(model, tmp_path / "pendulum_svi")
+    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
+    assert subprocess.run(command, capture_output=True, text=True, check=False).returncode == 0
+    subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
+
+
+def test_other_files_are_kept_and_own_files_are_replaced(pendulum, tmp_path):
+    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    (folder / "notes.txt").write_text("mine")
+    generate_package(replace(pendulum, method=SVI(2)), folder)
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert load_model(folder / "model.toml").method == SVI(2)
+
+
+@pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
+def test_files_of_others_and_edited_files_are_overwritten_only_by_force(pendulum, tmp_path, name):
+    folder = tmp_path / "pendulum_svi"
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    with pytest.raises(PackageError, match="force"):
+        generate_package(pendulum, folder)
+    assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(name, "mine")]
+    generate_package(pendulum, folder, force=True)
+    generate_package(replace(pendulum, h=0.125), folder)  # they are ours now
+    if name != "interface.json":
+        with (folder / name).open("a") as file:
+            file.write("\n")
+        with pytest.raises(PackageError, match="edited"):
+            generate_package(pendulum, folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("Pendulum-SVI", "pendulum_svi"),
+        ("1st", "integrator_1st"),
+        ("a b", "a_b"),
+        ("main", "main_integrator"),
+        ("math", "math_integrator"),
+        ("class", "class_integrator"),
+        ("json", "json_integrator"),
+        ("numpy", "numpy_integrator"),
+        ("x" * 80, "x" * 64),
+    ],
+)
+def test_folder_names_that_do_not_serve_are_refused_with_one_that_does(pendulum, tmp_path, name, hint):
+    with pytest.raises(PackageError, match=f"'{hint}'"):
+        generate_package(pendulum, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_dot_means_the_name_of_the_folder_one_is_in(pendulum, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    generate_package(pendulum, ".")
+    assert (tmp_path / "here" / "here.c").is_file()
+
+
+def test_folders_that_cannot_be_written_are_named(pendulum, tmp_path):
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(PackageError, match="taken"):
+        generate_package(pendulum, tmp_path / "taken")
+
+
+def test_methods_that_no_file_can_hold_are_generated_without_a_model_file(pendulum, tmp_path):
+    own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
+    folder = generate_package(replace(pendulum, method=SVI(1, own)), tmp_path / "own")
+    assert not (folder / "model.toml").exists()
+    assert load_package(folder).dimension == 1
+
+
+def test_velocities_without_momenta_are_refused(tmp_path):
+    model = model_of("relativistic-particle", velocity=(2.0,))
+    with pytest.raises(StateError, match="no momenta"):
+        generate_package(model, tmp_path / "too_fast")
+
+
+def test_folders_that_are_no_packages_are_named(pendulum, tmp_path):
+    with pytest.raises(PackageError, match="not a generated package"):
+        load_package(tmp_path)
+    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    path = folder / "interface.json"
+    record = json.loads(path.read_text())
+    for text, message in (
+        ("{", "damaged"),
+        ("[]", "another format"),
+        (json.dumps(record | {"format": 99}), "another format"),
+        (json.dumps(record | {"interface": {}}), "damaged"),
+        (json.dumps({"format": 1}), "damaged"),
+    ):
+        path.write_text(text)
+        with pytest.raises(PackageError, match=message):
+            load_package(folder)
+    path.write_text(json.dumps(record))
+    Path(folder / "pendulum_svi.h").unlink()
+    with pytest.raises(PackageError, match=r"pendulum_svi\.h"):
+        load_package(folder)

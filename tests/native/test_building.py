@@ -1,0 +1,324 @@
+"""The cache, the compilers and their failures."""
+
+import hashlib
+import importlib.util
+import json
+import multiprocessing
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from scvi_codegen.errors import BuildError, ScviCodegenError
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+
+FAST = ("-O0",)
+HERE = Path(__file__).parent
+
+
+def source(code: str = "double tiny_answer(void)\n{\n  return 42.0;\n}\n") -> Source:
+    """An integrator reduced to what building looks at."""
+    declaration = "double tiny_answer(void);\n"
+    return Source(prefix="tiny", header=declaration, code=f'#include "tiny.h"\n{code}', declarations=declaration)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> Path:
+    """An empty cache on disk, and nothing remembered in memory."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(folder))
+    forget(monkeypatch)
+    return folder
+
+
+def forget(monkeypatch) -> None:
+    """As a new process would."""
+    monkeypatch.setattr(building, "_loaded", {})
+    building._compiler_version.cache_clear()
+
+
+def answer() -> float:
+    return building.load(source(), flags=FAST).lib.tiny_answer()
+
+
+def entries(cache: Path) -> list[Path]:
+    return sorted(cache.iterdir())
+
+
+def compiler_runs(monkeypatch) -> list[list[str]]:
+    """A growing list of the commands run from now on, except questions for a version."""
+    commands: list[list[str]] = []
+    run = subprocess.run
+
+    def recorded(command, *args, **kwargs):
+        if "--version" not in command:
+            commands.append(command)
+        return run(command, *args, **kwargs)
+
+    monkeypatch.setattr(building.subprocess, "run", recorded)
+    return commands
+
+
+# The cache.
+
+
+def test_an_empty_cache_gets_one_entry_with_its_text_and_its_checksum(cache):
+    assert answer() == 42.0
+    (entry,) = entries(cache)
+    assert {path.name for path in entry.iterdir()} == {"tiny.c", "tiny.h", f"{entry.name}.so", "manifest.json"}
+    assert json.loads((entry / "manifest.json").read_text())["prefix"] == "tiny"
+
+
+def test_a_hit_runs_no_compiler(cache, monkeypatch):
+    answer()
+    forget(monkeypatch)
+    commands = compiler_runs(monkeypatch)
+    assert answer() == 42.0
+    assert commands == []
+
+
+def test_a_second_load_in_one_process_touches_nothing(cache):
+    first = building.load(source(), flags=FAST)
+    shutil.rmtree(cache)
+    assert building.load(source(), flags=FAST) is first
+    assert not cache.exists()
+
+
+@pytest.mark.parametrize(
+    "changed", [{"flags": ("-O1",)}, {"source": source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")}], ids=str
+)
+def test_another_text_or_flag_is_another_entry(changed, cache):
+    answer()
+    building.load(**{"source": source(), "flags": FAST, **changed})
+    assert len(entries(cache)) == 2
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.unlink()
+    path.write_bytes(data)
+
+
+def truncate(path: Path) -> None:
+    data = path.read_bytes()[:100]
+    path.unlink()
+    path.write_bytes(data)
+
+
+DAMAGE = {
+    "corrupt": lambda entry: flip(building._library(entry)),
+    "truncated": lambda entry: truncate(building._library(entry)),
+    "empty": lambda entry: (building._library(entry).unlink(), building._library(entry).touch()),
+    "no library": lambda entry: building._library(entry).unlink(),
+    "no manifest": lambda entry: (entry / "manifest.json").unlink(),
+    "manifest of garbage": lambda entry: (entry / "manifest.json").write_bytes(b"\xff{"),
+    "manifest of another shape": lambda entry: (entry / "manifest.json").write_text("[1, 2]"),
+    "no folder but a file": lambda entry: (shutil.rmtree(entry), entry.write_text("not a folder")),
+    "empty folder": lambda entry: (shutil.rmtree(entry), entry.mkdir()),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_entry_is_built_anew(damage, cache, monkeypatch):
+    answer()
+    (entry,) = entries(cache)
+    DAMAGE[damage](entry)
+    forget(monkeypatch)
+    commands = compiler_runs(monkeypatch)
+    assert answer() == 42.0
+    assert commands
+    assert entries(cache) == [entry]
+    assert building._is_intact(entry)
+
+
+def of_another_processor(data: bytes) -> bytes:
+    """The header of an ELF file with another machine in it, RISC-V."""
+    return data[:18] + b"\xf3\x00" + data[20:]
+
+
+def of_another_system(_data: bytes) -> bytes:
+    return b"MZ: not for this system"
+
+
+LOADING = "import test_building; print(test_building.answer())"
+
+
+@pytest.mark.parametrize("changed", [of_another_processor, of_another_system])
+@pytest.mark.skipif(sys.platform == "darwin", reason="the header is that of ELF files")
+def test_a_foreign_library_with_a_fitting_manifest_is_built_anew(changed, cache):
+    answer()
+    (entry,) = entries(cache)
+    library = building._library(entry)
+    data = changed(library.read_bytes())
+    library.unlink()
+    library.write_bytes(data)
+    (entry / "manifest.json").write_text(json.dumps({"sha256": hashlib.sha256(data).hexdigest()}))
+    assert building._is_intact(entry)
+    # In another process, because this one has the library open under its name.
+    result = subprocess.run([sys.executable, "-c", LOADING], cwd=HERE, capture_output=True, text=True, check=False)
+    assert (result.stdout, result.stderr) == ("42.0\n", "")
+    assert entries(cache) == [entry]
+    assert library.read_bytes() != data
+
+
+def test_a_cache_that_cannot_be_written_is_replaced_by_a_temporary_folder(tmp_path, monkeypatch):
+    blocking = tmp_path / "file"
+    blocking.write_text("no folder can be made below a file, by root neither")
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(blocking / "cache"))
+    assert answer() == 42.0
+    assert blocking.read_text().startswith("no folder")
+
+
+def test_without_any_writable_folder_the_error_says_so(tmp_path, monkeypatch):
+    blocking = tmp_path / "file"
+    blocking.touch()
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(blocking / "cache"))
+    monkeypatch.setattr(building.tempfile, "mkdtemp", lambda **_: str(blocking / "temporary"))
+    with pytest.raises(BuildError, match="neither the cache folder nor the temporary folder"):
+        answer()
+
+
+def test_a_relative_cache_folder_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(building.CACHE_VARIABLE, "beside")
+    assert answer() == 42.0
+
+
+def test_a_cache_folder_with_spaces_and_quotes_works(tmp_path, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path / 'it\'s a "folder" of mine'))
+    assert answer() == 42.0
+
+
+def race(cache: str, barrier=None) -> float:
+    """One process of several that want the same library at once."""
+    building.os.environ[building.CACHE_VARIABLE] = cache
+    building._loaded.clear()
+    if barrier is not None:
+        barrier.wait()
+    return answer()
+
+
+def racer(cache: str, barrier, results) -> None:
+    results.put(race(cache, barrier))
+
+
+def test_processes_that_race_into_an_empty_cache_all_succeed_with_one_entry(cache):
+    context = multiprocessing.get_context("spawn")
+    barrier, results = context.Barrier(6), context.Queue()
+    processes = [context.Process(target=racer, args=(str(cache), barrier, results)) for _ in range(6)]
+    for process in processes:
+        process.start()
+    assert [results.get(timeout=60) for _ in processes] == [42.0] * 6
+    for process in processes:
+        process.join(timeout=60)
+        assert process.exitcode == 0
+    (entry,) = entries(cache)
+    assert building._is_intact(entry)
+
+
+# Compilers.
+
+
+def test_cc_is_honoured_with_its_arguments(cache, monkeypatch):
+    monkeypatch.setenv("CC", "gcc -DUNUSED='1 2'" if shutil.which("gcc") else "cc -DUNUSED='1 2'")
+    commands = compiler_runs(monkeypatch)
+    assert answer() == 42.0
+    assert all(command[1] == "-DUNUSED=1 2" for command in commands)
+
+
+def test_a_cc_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler -O9")
+    with pytest.raises(BuildError, match=r"environment variable CC \('no-such-compiler -O9'\) was not found"):
+        answer()
+
+
+def test_a_cc_that_does_not_compile_is_shown_with_what_it_said(monkeypatch):
+    monkeypatch.setenv("CC", f"{sys.executable} -c 'import sys; sys.exit(\"I am no compiler\")'")
+    with pytest.raises(BuildError, match="I am no compiler"):
+        answer()
+
+
+def test_a_cc_that_cannot_run_is_named(tmp_path, monkeypatch):
+    script = tmp_path / "broken-cc"
+    script.write_text("#!/no/such/interpreter\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    with pytest.raises(BuildError, match="broken-cc"):
+        answer()
+
+
+def without_compilers(monkeypatch) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(building.shutil, "which", lambda _: None)
+
+
+def test_without_a_compiler_the_error_says_what_to_install(monkeypatch):
+    without_compilers(monkeypatch)
+    monkeypatch.setattr(building.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(
+        BuildError, match=r"apt install gcc.*pip install 'scvi-codegen\[compiler\]' \(ziglang\)"
+    ) as error:
+        answer()
+    assert isinstance(error.value, ScviCodegenError)
+
+
+def test_the_compiler_from_the_wheel_is_the_last_resort(monkeypatch):
+    without_compilers(monkeypatch)
+    monkeypatch.setattr(building.importlib.util, "find_spec", lambda _: SimpleNamespace())
+    assert building.find_compiler() == (sys.executable, "-m", "ziglang", "cc")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="pip install 'scvi-codegen[compiler]'")
+def test_the_compiler_from_the_wheel_compiles(monkeypatch):
+    monkeypatch.setenv("CC", f"{sys.executable} -m ziglang cc")
+    assert building.load(source(), flags=building.TUNED_FLAGS).lib.tiny_answer() == 42.0
+
+
+CROSS_COMPILER = """#!/bin/sh
+cc "$@" || exit
+for last; do :; done
+case "$last" in *.so) echo "for another machine" > "$last" ;; esac
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the script calls cc")
+def test_a_compiler_for_another_machine_is_named(tmp_path, monkeypatch):
+    script = tmp_path / "cross-cc"
+    script.write_text(CROSS_COMPILER)
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    with pytest.raises(BuildError, match="cross-cc' made cannot be loaded here"):
+        answer()
+
+
+def test_compiler_errors_are_shown_with_the_offending_lines():
+    broken = source("double tiny_answer(void)\n{\n  return forty_two;\n}\n")
+    with pytest.raises(BuildError) as error:
+        building.load(broken, flags=FAST)
+    assert "refused the text" in str(error.value)
+    assert "tiny.c:4" in str(error.value)
+    assert "return forty_two;" in str(error.value)
+
+
+def test_a_text_that_is_refused_leaves_nothing_in_the_cache(cache):
+    with pytest.raises(BuildError):
+        building.load(source("this is not C\n"), flags=FAST)
+    assert entries(cache) == []
+
+
+def test_missing_headers_of_python_are_explained(tmp_path, monkeypatch):
+    fake = SimpleNamespace(get_paths=lambda: {"include": str(tmp_path)}, get_config_var=sysconfig.get_config_var)
+    monkeypatch.setattr(building, "sysconfig", fake)
+    with pytest.raises(BuildError, match="apt install python3-dev"):
+        answer()
+
+
+def test_nothing_is_printed(capfd):
+    answer()
+    assert capfd.readouterr() == ("", "")

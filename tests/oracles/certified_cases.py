@@ -1,0 +1,75 @@
+"""Integrators that are certified, and sabotaged: systems at states without symmetry, and methods of every kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sabotage import Case
+from samples import driven_duffing, pumped_cart_pole
+
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    ChebyshevGauss,
+    Composition,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    Method,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.models.problems import point_vortices, problem
+
+__all__ = ["CASES", "case"]
+
+STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], float]] = {
+    "pendulum": (problem("planar-pendulum").system, (0.7,), (0.9,), 0.2),
+    "driven": (driven_duffing(), (0.6,), (-0.3,), 0.2),
+    "kepler": (problem("kepler").system, (0.3, 0.8), (-1.1, 0.4), 0.1),
+    "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
+    "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
+    "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
+}
+METHODS: dict[str, Callable[[], Method]] = {
+    "svi": lambda: SVI(2),
+    "svi-3": lambda: SVI(3),
+    "lobatto-svi": lambda: SVI(2, "gauss-lobatto:3"),
+    "hermite": lambda: SVI(3, "hermite:2"),
+    "splines": lambda: SVI(2, space="splines:2"),
+    "trigonometric": lambda: SVI(3, space="trigonometric:0.5"),
+    "scvi": lambda: SCVI(2),
+    "scvi-gauss": lambda: SCVI(2, abscissae="gauss"),
+    "printed": lambda: SCVI(3, variational=False),
+    "sc": lambda: SpectralCollocation(2),
+    "sc-phase-space": lambda: SpectralCollocation(2, form="phase-space"),
+    "gauss": lambda: Gauss(2),
+    "gauss-position": lambda: Gauss(2, form="position"),
+    "radau-iia": lambda: RadauIIA(2),
+    "radau-ia": lambda: RadauIA(2),
+    "lobatto": lambda: LobattoIIIA(3),
+    "chebyshev": lambda: ChebyshevGauss(3),
+    "verlet": StoermerVerlet,
+    "composition": lambda: Composition(8),
+    "euler": ExplicitEuler,
+}
+
+
+def case(name: str) -> Case:
+    """``kepler/svi``."""
+    system, _, own = name.partition("/")
+    given, q, p, h = STATES[system]
+    return Case(given, METHODS[own], q, p, h)
+
+
+WHOLE = """
+    pendulum/svi driven/svi kepler/svi-3 double/svi double/lobatto-svi cart/svi pendulum/hermite pendulum/splines
+    pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss kepler/printed double/printed
+    double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss double/gauss-position kepler/radau-iia
+    double/radau-ia kepler/lobatto driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
+"""
+CASES = {name: case(name) for name in WHOLE.split()}
+"""Everything that is sabotaged, whole."""

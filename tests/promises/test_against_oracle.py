@@ -1,0 +1,186 @@
+"""Compiled steps equal those of the slow oracle, for every kind of Lagrangian and every family of methods."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import pytest
+
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    ChebyshevGauss,
+    ChebyshevLobatto,
+    CollocationRK,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.native.building import TUNED_FLAGS
+
+SEPARABLE = ("planar-pendulum", "kepler")
+COUPLED = ("double-pendulum", "cart-pole")
+SYSTEMS = (
+    *SEPARABLE,
+    *COUPLED,
+    "charged-particle",
+    "driven-duffing",
+    "pumped-cart-pole",
+    "relativistic-particle",
+)
+FEW = (
+    SVI(2, "gauss-legendre:3"),
+    SCVI(3),
+    SCVI(2, abscissae="chebyshev-gauss"),
+    SCVI(2, variational=False),
+    SpectralCollocation(2),
+    RadauIIA(2),
+)
+MANY = (
+    SVI(1, "gauss-lobatto:2"),
+    *(SVI(s) for s in (1, 2, 3, 4, 5)),
+    *(SVI(s, f"gauss-lobatto:{s + 1}") for s in (2, 3, 4, 5)),
+    SVI(3, "clenshaw-curtis:6"),
+    SVI(2, "fejer:5"),
+    SVI(3, "gauss-radau-left:4"),
+    SVI(2, "gauss-radau-right:3"),
+    *(SCVI(s, f"gauss-legendre:{s}") for s in (1, 2, 4, 5)),
+    *(SCVI(s, f"gauss-legendre:{s + 1}") for s in (2, 3)),
+    SCVI(3, "gauss-lobatto:6"),
+    SCVI(3, nodes="legendre-lobatto"),
+    SCVI(2, "gauss-legendre:1"),
+    SCVI(2, abscissae="gauss"),
+    SCVI(3, abscissae="radau-iia"),
+    SCVI(3, abscissae="lobatto-iiia"),
+    SCVI(2, "gauss-lobatto:4", abscissae=(0.125, 0.75)),
+    SCVI(4, "gauss-legendre:3", variational=False),
+    SCVI(1, "gauss-lobatto:2", variational=False),
+    *(SpectralCollocation(s, form=form) for s in (1, 3, 5) for form in ("position", "phase-space")),
+    SpectralCollocation(4, nodes="equispaced"),
+    Gauss(1),
+    Gauss(4),
+    Gauss(2, form="position"),
+    RadauIIA(3, form="position"),
+    RadauIA(1),
+    RadauIA(2),
+    RadauIA(3),
+    RadauIA(1, form="position"),
+    RadauIA(3, form="position"),
+    LobattoIIIA(2),
+    LobattoIIIA(4),
+    LobattoIIIA(3, form="position"),
+    ChebyshevGauss(3),
+    ChebyshevLobatto(4),
+    CollocationRK([0.1, 0.35, 0.8]),
+    CollocationRK([0.2, 0.9], form="position"),
+    StoermerVerlet(),
+    ExplicitEuler(),
+    ExplicitEuler(form="position"),
+)
+H, T = 0.11, 0.37
+TOLERANCE = 2e-14
+"""Of the state: a step rounds its answer once (1e-16), and its kernels and Newton's last update some tens of times."""
+
+
+def relative(found, expected):
+    """The largest difference, relative to the size of the state (never less than 1)."""
+    return np.abs(np.array(found) - expected).max() / max(1.0, np.abs(expected).max())
+
+
+def check(sample, compiled, name, method, *, h=H, t=T, **how):
+    case = sample(name)
+    q, p = case.state
+    assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
+def test_every_kind_of_lagrangian_steps_as_the_oracle(sample, compiled, name, method):
+    check(sample, compiled, name, method, flags=TUNED_FLAGS)
+
+
+SOLVED_BOTH_WAYS = (
+    ("kepler", SVI(3)),
+    ("kepler", SVI(2, "gauss-legendre:4")),
+    ("kepler", SpectralCollocation(3)),
+    ("double-pendulum", SVI(3)),
+    ("double-pendulum", RadauIIA(2)),
+    ("pumped-cart-pole", SVI(2, "gauss-lobatto:2")),
+    ("relativistic-particle", Gauss(2)),
+    ("driven-duffing", RadauIA(3)),
+    ("charged-particle", StoermerVerlet()),
+    ("double-pendulum", SpectralCollocation(3)),
+    ("pumped-cart-pole", SCVI(3, "gauss-legendre:4", variational=False)),
+    ("kepler", SCVI(2, variational=False)),
+    ("charged-particle", RadauIA(2, form="position")),
+    ("relativistic-particle", LobattoIIIA(3, form="position")),
+)
+
+
+@pytest.mark.parametrize("solver", ["newton", "fixed-point"])
+@pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
+def test_both_solvers_step_as_the_oracle(sample, compiled, name, method, solver):
+    check(sample, compiled, name, method, solver=solver)
+
+
+@pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
+def test_every_family_of_methods_steps_as_the_oracle(sample, compiled, method):
+    """On a Lagrangian with everything in it: coupled, mass depending on angle and time, velocity-dependent terms."""
+    check(sample, compiled, "pumped-cart-pole", method)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
+def test_every_method_on_every_system_steps_as_the_oracle(sample, compiled, name, method):
+    check(sample, compiled, name, method)
+
+
+@pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3), RadauIIA(2)], ids=lambda method: method.name)
+@pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])
+def test_steps_back_and_far_from_time_zero_are_the_oracles(sample, compiled, method, h, t):
+    check(sample, compiled, "pumped-cart-pole", method, h=h, t=t)
+
+
+@pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3)], ids=lambda method: method.name)
+def test_parameters_given_at_the_step_are_the_oracles(sample, compiled, method):
+    case, changed = sample("pumped-cart-pole"), {"a": 0.35, "m": 1.3, "k": -0.2}
+    mechanics = oracle.Mechanics(case.system, changed)
+    q, p = case.state
+    expected = oracle.oracle_step(mechanics, method.specification(), q, p, H, T)
+    stepper = compiled("pumped-cart-pole", method)
+    assert relative(stepper.step(q, p, H, T, changed), np.array(expected)) < TOLERANCE
+    assert relative(stepper.step(q, p, H, T), np.array(expected)) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "driven-duffing"])
+def test_verlet_is_the_leapfrog_of_separable_systems(sample, compiled, name):
+    case = sample(name)
+    q, p = case.state
+    arguments = (oracle.mp.mpf(T), oracle.numbers(q), oracle.numbers(p), oracle.mp.mpf(H))
+    expected = np.array(oracle.leapfrog(case.mechanics, *arguments)).astype(float)
+    assert relative(compiled(name, StoermerVerlet()).step(q, p, H, T), expected) < TOLERANCE
+
+
+def test_the_oracle_tells_apart_what_should_differ(sample):
+    """The comparison has teeth: neighbouring methods and a slightly other time are far outside the tolerance."""
+    case = sample("pumped-cart-pole")
+    q, p = case.state
+    right = case.oracle(SVI(3), q, p, H, T)
+    assert relative(case.oracle(SVI(3, "gauss-legendre:4"), q, p, H, T), right) > 1e3 * TOLERANCE
+    assert relative(case.oracle(SCVI(3), q, p, H, T), right) > 1e3 * TOLERANCE
+    assert relative(case.oracle(SVI(3), q, p, H, T + 1e-9), right) > 1e3 * TOLERANCE
+
+
+def test_the_oracles_radau_ia_satisfies_its_simplifying_condition():
+    """D(s): sum_i b_i c_i^(k-1) a_ij = b_j (1 - c_j^k) / k, and b integrates polynomials below degree 2 s - 1."""
+    for s in (1, 2, 3):
+        A, b, c = oracle.radau_ia(s).values()
+        for k in range(1, s + 1):
+            assert max(abs((b * c ** (k - 1)) @ A - b * (1 - c**k) / k)) < 1e-45
+        for k in range(2 * s - 1):
+            assert abs(b @ c**k - oracle.mp.mpf(1) / (k + 1)) < 1e-45

@@ -1,0 +1,97 @@
+"""Other builds of the same text: plain x86-64, AVX2, and one under the address and undefined-behaviour sanitizers."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scvi_codegen.native import building
+
+ROOT = Path(__file__).parents[2]
+SANITIZERS = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer"
+
+
+def run_stepper_tests(tmp_path: Path, flags: str, *arguments: str, **environment: str) -> None:
+    """The tests of steppers, in a process of their own whose integrators are compiled with other flags."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *arguments]
+    result = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=os.environ | {building.CACHE_VARIABLE: str(tmp_path), building.FLAGS_VARIABLE: flags} | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout[-5000:] + result.stderr[-5000:]
+
+
+def sanitizer_library(name: str) -> str:
+    """Path of a run-time library of gcc's, which must be there before the interpreter."""
+    compiler = shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("gcc is not installed")
+    result = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+    path = result.stdout.strip()
+    if not Path(path).is_absolute():
+        pytest.skip(f"{name} is not installed")
+    return path
+
+
+@pytest.mark.full
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="flags of x86-64")
+@pytest.mark.parametrize("level", ["x86-64", "x86-64-v3"])
+def test_steppers_work_on_lesser_processors(tmp_path, level):
+    if level == "x86-64-v3" and "avx2" not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("this processor has no AVX2")
+    files = [f"tests/*/test_{name}.py" for name in ("stepper", "ensemble", "identities", "structure")]
+    run_stepper_tests(tmp_path, f"-march={level}", *files)
+
+
+@pytest.mark.full
+@pytest.mark.skipif(sys.platform != "linux", reason="the sanitizers are preloaded")
+def test_sanitizers_find_nothing(tmp_path):
+    libraries = " ".join(map(sanitizer_library, ("libasan.so", "libubsan.so")))
+    options = "detect_leaks=0:allocator_may_return_null=1"  # the interpreter keeps what it has; too much is refused
+    files = ("tests/test_stepper.py", "tests/test_fuzz_steppers.py")
+    run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
+
+
+def test_a_build_with_wanted_flags_is_another_one(tmp_path, monkeypatch):
+    """Flags of the environment are part of the name in the cache, and reach the compiler."""
+    from scvi_codegen.compiler import compile_stepper
+    from scvi_codegen.methods import StoermerVerlet
+    from scvi_codegen.models.problems import problem
+
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
+    for flags in ("", "-O0"):
+        monkeypatch.setenv(building.FLAGS_VARIABLE, flags)
+        compile_stepper(problem("harmonic-oscillator").system, StoermerVerlet())
+    assert len(list(tmp_path.glob("_scvi_*"))) == 2
+    monkeypatch.setenv(building.FLAGS_VARIABLE, "-no-such-flag")
+    with pytest.raises(building.BuildError, match="no-such-flag"):
+        compile_stepper(problem("harmonic-oscillator").system, StoermerVerlet())
+
+
+@pytest.mark.skipif(not (shutil.which("gcc") and shutil.which("clang")), reason="gcc and clang are not both installed")
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
+def test_portable_flags_fix_every_bit(tmp_path, monkeypatch, name):
+    """Different compilers, one libm: the same numbers; the tuned build differs by roundings."""
+    from scvi_codegen.compiler import compile_stepper
+    from scvi_codegen.methods import SVI
+    from scvi_codegen.models.problems import problem
+
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
+    chosen, ends = problem(name), {}
+    for compiler in ("gcc", "clang"):
+        monkeypatch.setenv("CC", compiler)
+        stepper = compile_stepper(chosen.system, SVI(8), flags=building.PORTABLE_FLAGS)
+        p = stepper.momentum(chosen.q, chosen.velocity)
+        run = stepper.integrate(chosen.q, p, h=chosen.step, steps=200)
+        ends[compiler] = (run.q.tobytes(), run.p.tobytes())
+    assert ends["gcc"] == ends["clang"]

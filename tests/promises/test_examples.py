@@ -1,0 +1,121 @@
+"""The examples run as they stand and show what they say."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from scvi_codegen.cli import main
+from scvi_codegen.models.model_file import load_model
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SCRIPTS = (
+    "curves_and_quadratures",
+    "custom_sympy_system",
+    "import_generated_stepper",
+    "inspect_derivation",
+    "kepler_conservation",
+    "poincare_section",
+)
+ENERGY_ERRORS = {
+    "outer_solar_system": 1e-13,
+    "pendulum": 1e-8,
+    "kepler": 1e-12,
+    "double_pendulum": 1e-11,
+    "vortex_pairs": 1e-12,
+}
+
+
+def output_of(name: str, tmp_path: Path) -> str:
+    """What a Python example prints, run from elsewhere."""
+    path = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
+    result = subprocess.run(
+        [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    return result.stdout
+
+
+def test_every_example_is_tried_here():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
+    assert {path.stem for path in EXAMPLES.glob("*.toml")} == set(ENERGY_ERRORS)
+
+
+@pytest.mark.parametrize("name", ENERGY_ERRORS)
+def test_model_files_run_and_keep_their_energy(name, tmp_path):
+    output = tmp_path / "run.npz"
+    result = CliRunner().invoke(main, ["run", str(EXAMPLES / f"{name}.toml"), "-o", str(output)])
+    assert result.exit_code == 0, result.output
+    found = re.search(r"energy error: (\S+) at most", result.output)
+    assert found is not None
+    assert float(found[1]) < ENERGY_ERRORS[name]
+    model = load_model(EXAMPLES / f"{name}.toml")
+    with np.load(output) as written:
+        assert len(written["t"]) == model.step_count // model.every + 1
+
+
+def test_kepler_conservation_tells_the_methods_apart(tmp_path):
+    errors = {
+        line[:32].strip(): [float(word) for word in line[32:].split()]
+        for line in output_of("kepler_conservation", tmp_path).splitlines()[1:]
+    }
+    assert max(errors["SVI, degree 4"]) < 1e-7
+    assert max(errors["SVI, degree 4"]) < 1.1 * min(errors["SVI, degree 4"])
+    assert errors["spectral collocation, degree 4"][2] > 10 * errors["spectral collocation, degree 4"][0]
+    assert min(errors["explicit Euler"]) > 0.1
+
+
+def test_curves_and_quadratures_win_where_they_say(tmp_path):
+    errors = [
+        float(line.split()[-1]) for line in output_of("curves_and_quadratures", tmp_path).splitlines() if "e-" in line
+    ]
+    polynomials, harmonics, smooth, splines, trapezoid, hermite, more = errors
+    assert harmonics < polynomials / 100
+    assert splines < smooth / 1e4
+    assert more < 1e-7 < hermite < trapezoid
+
+
+def test_import_generated_stepper_runs_without_sympy(tmp_path):
+    output = output_of("import_generated_stepper", tmp_path)
+    assert "pendulum_svi.c" in output
+    assert float(output.rsplit(maxsplit=1)[1]) < 1e-8
+
+
+def test_custom_sympy_system_finds_the_bifurcation(tmp_path):
+    output = output_of("custom_sympy_system", tmp_path)
+    assert "the same from LagrangesMethod: True" in output
+    slow, fast = re.findall(r"between (\S+) and (\S+)", output)
+    assert float(slow[0]) < 0 < float(slow[1])
+    assert 0 < float(fast[0]) < float(fast[1])
+
+
+def test_inspect_derivation_shows_equations_latex_and_radicals(tmp_path):
+    output = output_of("inspect_derivation", tmp_path)
+    assert "27a" in output
+    assert r"\tag{27a}" in output
+    assert "sqrt(3)" in output
+
+
+def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(tmp_path):
+    lines = output_of("poincare_section", tmp_path).splitlines()
+    assert len(lines) == 3
+    for line in lines:
+        count, away, error = re.search(r"(\d+) crossings, .x. < (\S+), energy error (\S+)", line).groups()
+        assert int(count) > 1000
+        assert float(away) < 1e-14
+        assert float(error) < 1e-13
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        f"section_{name}.png" for name in ("regular", "mixed", "chaotic")
+    }

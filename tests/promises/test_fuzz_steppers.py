@@ -1,0 +1,359 @@
+"""Hostile numbers: a compiled stepper answers right to round-off, or says no; never something else."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from fractions import Fraction
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+from fuzzing import guarded
+from mpmath import mp, mpc
+from samples import QUICK_FLAGS, stepper_for
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.stepper import Stepper
+
+Q, P = np.array([1.0, 0.25]), np.array([0.0, 1.0])
+REFUSED = (StateError, StepFailedError)
+
+
+@pytest.fixture(scope="module")
+def kepler() -> Stepper:
+    return stepper_for("kepler", SVI(3))
+
+
+# Layouts, types and shapes.
+
+CLEAN: dict[str, Callable[[np.ndarray], Any]] = {
+    "list": list,
+    "tuple of numpy numbers": tuple,
+    "float32": lambda x: x.astype(np.float32),
+    "float16": lambda x: x.astype(np.float16),
+    "long double": lambda x: x.astype(np.longdouble),
+    "big-endian": lambda x: x.astype(">f8"),
+    "big-endian float32": lambda x: x.astype(">f4"),
+    "strided": lambda x: np.repeat(x, 3)[::3],
+    "reversed": lambda x: np.ascontiguousarray(x[::-1])[::-1],
+    "column": lambda x: np.column_stack([x + 1, x, x + 2])[:, 1],
+    "broadcast view": lambda x: np.broadcast_to(x, (3, len(x)))[1],
+    "unaligned": lambda x: np.frombuffer(b"\0" + x.tobytes(), dtype=np.uint8)[1:].view(np.float64),
+    "objects": lambda x: np.array([Fraction(value) for value in x.tolist()], dtype=object),
+    "read-only": lambda x: _read_only(x),
+    "nothing masked": lambda x: np.ma.array(x, mask=False),
+    "memory": memoryview,
+}
+"""The same numbers in other clothes."""
+
+
+def _read_only(x: np.ndarray) -> np.ndarray:
+    copy = x.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+WRONG: dict[str, Callable[[np.ndarray], Any]] = {
+    "masked": lambda x: np.ma.array(x, mask=[True, *[False] * (len(x) - 1)]),
+    "complex": lambda x: x + 0j,
+    "complex objects": lambda x: [1j, *x[1:]],
+    "text": lambda x: x.astype(str),
+    "bytes": lambda x: x.tobytes(),
+    "dates": lambda x: x.astype("M8[s]"),
+    "spans of time": lambda x: x.astype("m8[s]"),
+    "truth values": lambda x: x > 0,
+    "records": lambda x: np.zeros(len(x), dtype=[("a", "f8"), ("b", "i4")]),
+    "None": lambda x: None,
+    "a hole": lambda x: [None, *x[1:]],
+    "nan": lambda x: [np.nan, *x[1:]],
+    "infinity": lambda x: [*x[:-1], -np.inf],
+    "beyond double": lambda x: [10**400, *x[1:]],
+    "beyond double, as long double": lambda x: x.astype(np.longdouble) * np.longdouble("1e4000"),
+    "ragged": lambda x: [[1.0], list(x[1:]) * 3],
+    "short": lambda x: x[:-1],
+    "long": lambda x: [*x, 0.0],
+    "deep": lambda x: x[:, None],
+    "a matrix": np.asmatrix,
+    "empty": lambda x: [],
+    "a number": lambda x: 1.0,
+    "a dictionary": lambda x: dict(enumerate(x)),
+    "a generator": lambda x: (value for value in x),
+}
+
+
+def calls(stepper: Stepper) -> dict[str, Callable[[Any, Any], Any]]:
+    """Everything that takes a state, as a function of the two vectors; the result as one array."""
+    return {
+        "step": lambda q, p: np.hstack(stepper.step(q, p, 0.125)),
+        "integrate": lambda q, p: stepper.integrate(q, p, h=0.125, steps=3).q,
+        "momentum": lambda q, p: stepper.momentum(q, p),
+        "velocity": lambda q, p: stepper.velocity(q, p),
+        "energy": lambda q, p: np.array(stepper.energy(q, p)),
+        "action": lambda q, p: np.array(stepper.discrete_lagrangian(q, p, 0.5)),
+    }
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning", "ignore:the matrix subclass")
+@pytest.mark.parametrize("name", ["step", "integrate", "momentum", "velocity", "energy", "action"])
+def test_a_state_in_any_clothes_is_itself_and_nothing_else_is_a_state(name, kepler):
+    call = calls(kepler)[name]
+    expected = call(Q, P)
+    for dress in CLEAN.values():
+        assert np.array_equal(call(dress(Q), P), expected)
+        assert np.array_equal(call(Q, dress(P)), expected)
+    for what, spoil in WRONG.items():
+        for q, p in ((spoil(Q), P), (Q, spoil(P))):
+            with pytest.raises(REFUSED), guarded():
+                pytest.fail(f"{what} gave {call(q, p)}")
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning", "ignore:the matrix subclass")
+def test_an_ensemble_in_any_clothes_is_itself_and_nothing_else_is_one(kepler):
+    def final(q: Any, p: Any) -> np.ndarray:
+        return kepler.integrate_ensemble(q, p, h=0.125, steps=3, threads=1).q[-1]
+
+    q, p = np.array([Q, 2 * Q, 3 * Q]), np.array([P, P, P])
+    expected = final(q, p)
+    for dress in (np.asfortranarray, lambda x: np.repeat(x, 2, axis=1)[:, ::2], lambda x: x.astype(">f8"), list):
+        assert np.array_equal(final(dress(q), p), expected)
+    for what in set(WRONG) - {"short", "a number", "a matrix", "beyond double, as long double", "deep", "bytes"}:
+        with pytest.raises(REFUSED):
+            pytest.fail(f"{what} gave {final([WRONG[what](row) for row in q], p)}")
+    masked = np.ma.array(q, mask=q > 2)
+    with pytest.raises(StateError, match="masked"):
+        final(masked, p)
+
+
+NUMBERS: dict[str, Any] = {
+    "nan": np.nan,
+    "infinity": -np.inf,
+    "text": "0.1",
+    "None": None,
+    "complex": 0.1 + 0j,
+    "numpy complex": np.complex128(1),
+    "list": [0.1],
+    "one-element array": np.array([0.1]),
+    "masked": np.ma.masked,
+    "huge": 10**400,
+    "a date": np.datetime64(1, "s"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Warning. converting a masked element:UserWarning")
+@pytest.mark.parametrize("what", NUMBERS)
+def test_a_number_is_a_real_number(what, kepler):
+    value = NUMBERS[what]
+    for call in (
+        lambda: kepler.step(Q, P, value),
+        lambda: kepler.step(Q, P, 0.1, t=value),
+        lambda: kepler.step(Q, P, 0.1, parameters={"mu": value}),
+        lambda: kepler.step(Q, P, 0.1, parameters=[[value]]),
+        lambda: kepler.start(Q, P, h=value),
+        lambda: kepler.integrate(Q, P, h=0.1, steps=value),
+        lambda: kepler.integrate(Q, P, h=0.1, steps=4, every=value),
+        lambda: kepler.integrate_ensemble([Q], [P], h=value, steps=1),
+        lambda: SolverOptions(tolerance=value),
+        lambda: SolverOptions(max_iterations=value),
+        lambda: SolverOptions(absolute=value),
+    ):
+        with pytest.raises(StateError), guarded():
+            call()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda s: s.step(Q, P, 0.0),
+        lambda s: s.step(Q, P, -0.0),
+        lambda s: s.step(Q, P, 0.1, parameters=np.ma.array([1.0], mask=[True])),
+        lambda s: s.step(Q, P, 0.1, parameters=np.array([1j])),
+        lambda s: s.step(Q, P, 0.1, parameters={1: 1.0}),
+        lambda s: s.step(Q, P, 0.1, parameters={"\x00": 1.0}),
+        lambda s: s.step(Q, P, 0.1, parameters=[]),
+        lambda s: s.step(Q, P, 0.1, options=1),
+        lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=1, options="x"),
+        lambda s: s.integrate(Q, P, h=0.1, steps=2**53),
+        lambda s: s.integrate(Q, P, h=0.1, steps=2**50),
+        lambda s: s.integrate(Q, P, h=0.1, steps=4, every=2**63),
+        lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=2**50),
+        lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=2**52, threads=-1),
+        lambda s: s.energy([Q, Q], [P, P], [0.0, np.nan]),
+        lambda s: s.energy([Q, [np.nan, 1.0]], [P, P]),
+        lambda s: s.restore("x" * 232),
+        lambda s: s.restore(None),
+        lambda s: s.restore(b""),
+    ],
+)
+def test_refused_by_name(call, kepler):
+    with pytest.raises(StateError), guarded():
+        call(kepler)
+
+
+@pytest.mark.parametrize("method", [SVI(3), StoermerVerlet()], ids=lambda method: method.name)
+def test_damaged_bytes_of_a_run_are_refused_or_continued_within_bounds(method):
+    stepper = stepper_for("kepler", method)
+    run = stepper.start(Q, P, h=0.1)
+    run.record(3)
+    saved, random = run.save(), Random(5)
+    for byte in (b"\0", b"\xff", b"\x7f"):
+        with pytest.raises(StateError, match="not a saved run"):
+            stepper.restore(byte * len(saved))
+    for _ in range(300):
+        damaged = bytearray(saved)
+        for _ in range(random.choice((1, 1, 8))):
+            damaged[random.randrange(len(damaged))] = random.randrange(256)
+        with guarded():
+            try:
+                states = stepper.restore(bytes(damaged)).record(3)
+            except REFUSED:
+                continue
+        assert np.isfinite(states.q).all()
+
+
+# Magnitudes.
+
+SIZES = [
+    0.0,
+    5e-324,
+    1e-310,
+    2.3e-308,
+    1e-200,
+    1e-16,
+    1e-3,
+    0.7,
+    1.0,
+    3.0,
+    40.0,
+    1e8,
+    1e100,
+    1e154,
+    1e155,
+    1e300,
+    1.7e308,
+]
+
+
+def oscillator(kind: str) -> LagrangianSystem | HamiltonianSystem:
+    if kind == "hamiltonian":
+        return HamiltonianSystem.from_text(name="o", coordinates=["q"], hamiltonian="p_q**2/2 + q**2/2")
+    return LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+
+
+def exact_step(q: float, p: float, h: float, steps: int) -> complex:
+    """q + i p after steps of the two-stage Gauss method, the Pade approximant (2, 2) of the exponential function."""
+    with mp.workdps(700):
+        z = -1j * mp.mpf(h)
+        factor = (1 + z / 2 + z**2 / 12) / (1 - z / 2 + z**2 / 12)
+        return complex(mpc(q, p) * factor**steps)
+
+
+def rounding(q: float, p: float, h: float) -> float:
+    """What the solver calls round-off level, of |q| + h|v| and |p| + h|L_q| as the header says, and underflow."""
+    return 5e-13 * ((float(abs(q)) + float(abs(p))) * (1.0 + abs(h))) + 1e-319 * (1.0 + abs(h)) ** 2
+
+
+def check_oscillator(stepper: Stepper, random: Random) -> bool:
+    """Whether a run from a random state was completed; its end must then be right."""
+    q, p = (
+        random.choice((-1, 1)) * random.choice(SIZES) * random.choice((1.0, random.uniform(0.5, 1.0))) for _ in "qp"
+    )
+    h = random.choice((-1, 1)) * random.choice(SIZES[1:]) * random.choice((1.0, random.uniform(0.5, 1.0)))
+    if h == 0.0:
+        return False
+    steps = random.choice((1, 1, 5))
+    with guarded(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            if steps == 1:
+                found = complex(*(x[0] for x in stepper.step([q], [p], h)))
+            else:
+                run = stepper.integrate([q], [p], h=h, steps=steps)
+                found = complex(run.q[-1, 0], run.p[-1, 0])
+        except REFUSED:
+            return False
+    expected = exact_step(q, p, h, steps)
+    allowed = steps * rounding(q, p, h)
+    assert abs(found - expected) <= allowed, (q, p, h, steps, found, expected)
+    return True
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton", "fixed-point"])
+@pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
+def test_an_oscillator_of_any_size_with_any_step_is_right_or_refused(kind, solver, request):
+    """SVI(2) with two Gauss points is the two-stage Gauss method, and on the oscillator a rational function of h."""
+    stepper = compile_stepper(oscillator(kind), SVI(2), solver=solver, flags=QUICK_FLAGS)
+    random = Random(11)
+    done = sum(check_oscillator(stepper, random) for _ in range(400))
+    assert done > 100
+
+
+def test_an_ensemble_of_any_sizes_is_right_or_says_which_are_not():
+    stepper = compile_stepper(oscillator("lagrangian"), SVI(2), flags=QUICK_FLAGS)
+    random = Random(3)
+    q, p = (np.array([[random.choice((-1, 1)) * random.choice(SIZES)] for _ in range(200)]) for _ in "qp")
+    for h in (1e-310, 1e-3, 0.7, -1.0, 40.0, 1e8):
+        runs = stepper.integrate_ensemble(q, p, h=h, steps=3, threads=1)
+        assert runs.ok.sum() > 20
+        for j in np.flatnonzero(runs.ok):
+            found = complex(runs.q[-1, j, 0], runs.p[-1, j, 0])
+            expected = exact_step(q[j, 0], p[j, 0], h, 3)
+            assert abs(found - expected) <= 3 * rounding(q[j, 0], p[j, 0], h)
+        assert np.isnan(runs.q[-1, ~runs.ok]).all()
+
+
+NONLINEAR = [
+    ("kepler", SVI(3)),
+    ("double-pendulum", SCVI(2)),
+    ("planar-pendulum", Gauss(2)),
+    ("charged-particle", SpectralCollocation(2, form="position")),
+    ("cart-pole", SVI(2)),
+    ("kepler", StoermerVerlet()),
+]
+
+
+def check_nonlinear(name: str, method: Any, random: Random) -> bool:
+    """Whether two solvers both took a step; they must then agree, where the step is one of reason."""
+    steppers = [stepper_for(name, method, solver=solver) for solver in ("auto", "newton")]
+    q, p = (
+        [random.choice((-1, 1)) * random.choice(SIZES) * random.uniform(0.5, 1.0) for _ in range(steppers[0].dimension)]
+        for _ in "qp"
+    )
+    h = random.choice((-1, 1)) * random.choice(SIZES[1:])
+    found = []
+    for stepper in steppers:
+        with guarded(), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                found.append(np.hstack(stepper.step(q, p, h)))
+            except REFUSED:
+                continue
+        assert np.isfinite(found[-1]).all()
+    sizes = np.abs([*q, *p])
+    if len(found) == 2 and abs(h) < 0.01 and sizes.min() > 0.3 and sizes.max() < 5.0:
+        np.testing.assert_allclose(found[0], found[1], rtol=1e-11, atol=1e-11)
+    return len(found) == 2
+
+
+@pytest.mark.parametrize(("name", "method"), NONLINEAR, ids=lambda value: str(getattr(value, "name", value)))
+def test_any_state_is_stepped_to_a_finite_one_or_refused(name, method):
+    random = Random(7)
+    assert sum(check_nonlinear(name, method, random) for _ in range(300)) > 10
+
+
+@pytest.mark.full
+def test_many_more_states():
+    for kind in ("lagrangian", "hamiltonian"):
+        for solver in ("auto", "newton", "fixed-point"):
+            stepper = compile_stepper(oscillator(kind), SVI(2), solver=solver, flags=QUICK_FLAGS)
+            random = Random(1)
+            assert sum(check_oscillator(stepper, random) for _ in range(20_000)) > 5_000
+    for name, method in NONLINEAR:
+        random = Random(2)
+        assert sum(check_nonlinear(name, method, random) for _ in range(20_000)) > 500

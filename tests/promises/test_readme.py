@@ -1,0 +1,74 @@
+"""The README does what it says, from top to bottom, in a temporary folder with the examples in it.
+
+Blocks marked ``python`` run in one namespace; of those marked ``sh`` or ``console``, every command that begins with
+``scvi-codegen``.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def runnable() -> Iterator[tuple[str, str]]:
+    """("python", text) or ("command", text) in order; Python text stands on the line it has in the README."""
+    for match in BLOCK.finditer(README):
+        language, text = match.groups()
+        if language == "python":
+            yield "python", "\n" * (README.count("\n", 0, match.start()) + 1) + text
+        for command in commands(text) if language in ("sh", "console") else ():
+            if command.startswith("scvi-codegen "):
+                yield "command", command
+
+
+def commands(block: str) -> list[str]:
+    """The commands of a shell block: a prompt is taken off, lines joined at a backslash and split at ``&&``."""
+    lines = block.replace("\\\n", " ").splitlines()
+    return [command.strip() for line in lines for command in line.removeprefix("$ ").split(" && ")]
+
+
+def run_command(command: str) -> None:
+    """Run one line of a shell in the present folder, with the programs of this interpreter's environment."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = {**os.environ, "PATH": path}
+    result = subprocess.run(command, shell=True, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, f"{command}\n{result.stdout}{result.stderr}"
+
+
+def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
+    found = list(runnable())
+    assert {kind for kind, _ in found} == {"python", "command"}, "the README shows both"
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    namespace: dict[str, Any] = {"__name__": "readme"}
+    for kind, text in found:
+        if kind == "python":
+            exec(compile(text, "README.md", "exec"), namespace)
+        else:
+            run_command(text)
+
+
+@pytest.mark.parametrize("command", ["pip install -e '.[test]'", "pytest -n auto"])
+def test_the_checks_use_the_commands_of_the_readme(command):
+    assert command in [
+        shown for language, text in BLOCK.findall(README) if language == "sh" for shown in commands(text)
+    ]
+    used = (ROOT / ".ci" / "run").read_text(encoding="utf-8").replace("--quiet ", "").replace(" || status=1", "")
+    assert command in used.splitlines()
+
+
+def test_every_file_that_the_readme_links_to_is_there():
+    targets = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", README) + re.findall(r'src="([^":]+)"', README)
+    assert [target for target in targets if not (ROOT / target).exists()] == []

@@ -1,0 +1,262 @@
+"""What the steps preserve: dq ^ dp, momentum maps, reversibility, energy without drift; and what they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    ChebyshevGauss,
+    ChebyshevLobatto,
+    CollocationRK,
+    ExplicitEuler,
+    Gauss,
+    LobattoIIIA,
+    RadauIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.models.problems import problem
+
+SLOPE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+"""Central differences of order six."""
+WIDTH = 2e-3
+"""Where round-off (1e-16 / WIDTH) and truncation (WIDTH^6 f^(7) / 140) both stay near 1e-13 at the states used here."""
+
+
+def step_jacobian(step, state):
+    """d step(z) / dz by sixth-order differences."""
+    columns = [
+        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in SLOPE_WEIGHTS.items())
+        for unit in np.eye(len(state)) * WIDTH
+    ]
+    return np.array(columns).T
+
+
+def symplecticity_defect(stepper, q, p, h, t=0.0):
+    """Max |J^T Omega J - Omega|."""
+    m = len(q)
+    J = step_jacobian(lambda z: np.concatenate(stepper.step(z[:m], z[m:], h, t)), np.concatenate([q, p]))
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m))
+    return np.abs(J.T @ omega @ J - omega).max()
+
+
+def reversal_defect(stepper, q, p, h, t=0.0):
+    """How far the step with -h misses the start of the step with h."""
+    back = stepper.step(*stepper.step(q, p, h, t), -h, t + h)
+    return np.abs(np.array(back) - [q, p]).max()
+
+
+def angular_momentum(q, p):
+    return q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]
+
+
+# Symplecticity.
+
+SYMPLECTIC = (
+    SVI(1),
+    SVI(2, "gauss-legendre:3"),
+    SVI(4, "gauss-lobatto:5"),
+    SVI(3, "clenshaw-curtis:5"),
+    SVI(2, "gauss-radau-left:2"),
+    *(SCVI(s) for s in (1, 2, 3, 4, 5, 6)),
+    SCVI(3, "gauss-legendre:2"),
+    SCVI(3, abscissae="lobatto-iiia"),
+    SCVI(2, abscissae="radau-iia"),
+    SCVI(3, "gauss-lobatto:5"),
+    Gauss(3),
+    StoermerVerlet(),
+)
+FINITE_DIFFERENCES = 2e-12
+"""Five times the noise of the differences (4e-13 measured); the smallest real defect below is 1e-7."""
+
+
+SHOOTING = tuple(SCVI(s) for s in (2, 3, 4, 5, 6))
+ON_SYSTEMS = (
+    *(("double-pendulum", method) for method in SYMPLECTIC),
+    *(("kepler", method) for method in (SVI(2, "gauss-legendre:3"), SVI(3, "clenshaw-curtis:5"), *SHOOTING)),
+    *(("charged-particle", method) for method in (SVI(4, "gauss-lobatto:5"), Gauss(3), *SHOOTING)),
+)
+
+
+@pytest.mark.parametrize(("name", "method"), ON_SYSTEMS, ids=lambda value: getattr(value, "name", value))
+def test_symplectic_methods_preserve_the_two_form(sample, compiled, name, method):
+    q, p = sample(name).state
+    assert method.symplectic
+    assert symplecticity_defect(compiled(name, method), q, p, 0.15, 0.4) < FINITE_DIFFERENCES
+
+
+@pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
+def test_forced_time_dependent_systems_too(sample, compiled, method):
+    q, p = sample("pumped-cart-pole").state
+    assert symplecticity_defect(compiled("pumped-cart-pole", method), q, p, 0.15, 0.4) < FINITE_DIFFERENCES
+
+
+PRINTED = {
+    (2, 2): (0.0, 0.0),
+    (3, 2): (4.6e-2, -2.3e-2),
+    (5, 4): (6.6e-4, 6.7e-5),
+    (9, 7): (1.0e-7, -1.2e-9),
+}
+"""(points, quadrature points) -> (defect, change of angular momentum) of one Kepler step of the printed equations."""
+KEPLER = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
+
+
+@pytest.mark.parametrize(("size", "expected"), PRINTED.items())
+def test_the_printed_shooting_equations_break_what_the_variational_ones_keep(compiled, size, expected):
+    points, count = size
+    printed = compiled("kepler", SCVI(points - 1, f"gauss-legendre:{count}", variational=False))
+    variational = compiled("kepler", SCVI(points - 1, f"gauss-legendre:{count}"))
+    before = angular_momentum(*KEPLER)
+    assert angular_momentum(*printed.step(*KEPLER, 0.3)) - before == pytest.approx(expected[1], rel=0.05, abs=1e-15)
+    assert abs(angular_momentum(*variational.step(*KEPLER, 0.3)) - before) < 1e-14
+    assert symplecticity_defect(printed, *KEPLER, 0.3) == pytest.approx(expected[0], rel=0.05, abs=FINITE_DIFFERENCES)
+    assert symplecticity_defect(variational, *KEPLER, 0.3) < FINITE_DIFFERENCES
+
+
+# The properties that methods claim.
+
+METHODS = (
+    *(SVI(s) for s in (1, 2, 3)),
+    SVI(2, "gauss-lobatto:3"),
+    SVI(2, "gauss-radau-right:2"),
+    SVI(2, "gauss-radau-left:3"),
+    *(SCVI(s) for s in (1, 2, 3)),
+    SCVI(1, "gauss-radau-left:2"),
+    SCVI(2, nodes="equispaced"),
+    *(SCVI(s, variational=False) for s in (1, 2, 3)),
+    *(SCVI(2, abscissae=family) for family in ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss")),
+    SCVI(2, "gauss-radau-left:3", abscissae="gauss"),
+    *(SpectralCollocation(s, form=form) for s in (1, 2, 3) for form in ("position", "phase-space")),
+    *(family(2, form="position") for family in (Gauss, RadauIIA, LobattoIIIA, ChebyshevGauss)),
+    *(family(2) for family in (Gauss, RadauIIA, LobattoIIIA, ChebyshevGauss)),
+    Gauss(1),
+    Gauss(1, form="position"),
+    LobattoIIIA(3),
+    ChebyshevGauss(3),
+    ChebyshevLobatto(4),
+    RadauIA(1),
+    RadauIA(2),
+    CollocationRK([0.5]),
+    CollocationRK([0.2, 0.9]),
+    CollocationRK([0.25, 0.75]),
+    StoermerVerlet(),
+    ExplicitEuler(),
+    ExplicitEuler(form="position"),
+)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: f"{method.name}")
+def test_claims_of_symmetry_and_symplecticity_agree_with_measurement(sample, compiled, method):
+    """Both ways: what is claimed holds, and what is not claimed fails by far more than noise."""
+    q, p = sample("double-pendulum").state
+    stepper = compiled("double-pendulum", method)
+    reversal, defect = reversal_defect(stepper, q, p, 0.15), symplecticity_defect(stepper, q, p, 0.15)
+    assert reversal < 1e-12 if method.symmetric else reversal > 1e-7
+    assert defect < FINITE_DIFFERENCES if method.symplectic else defect > 1e-6
+
+
+@pytest.mark.parametrize("family", [SCVI, SpectralCollocation])
+def test_reversal_on_chebyshev_lobatto_nodes_fails_ever_less_with_the_degree(sample, compiled, family):
+    q, p = sample("planar-pendulum").state
+    defects = [reversal_defect(compiled("planar-pendulum", family(s)), q, p, 0.6) for s in (2, 3, 5)]
+    # 2e-5, 2e-7, 2e-12 for SCVI; 4e-3, 2e-4, 6e-7 for SC.
+    assert defects[0] > 10 * defects[1] > 100 * defects[2] > 1e-10
+    assert reversal_defect(compiled("planar-pendulum", SVI(2)), q, p, 0.6) < 1e-15
+
+
+# Momentum maps over long runs.
+
+VARIATIONAL = (SVI(4), SVI(2, "gauss-legendre:3"), SCVI(4), StoermerVerlet())
+STEPS = 10_000
+
+
+@pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
+def test_kepler_keeps_its_angular_momentum_to_round_off(compiled, method):
+    entry = problem("kepler")
+    run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
+    L = angular_momentum(run.q, run.p)
+    assert np.abs(L - L[0]).max() < 2e-14
+
+
+def test_newtons_solver_keeps_it_too(compiled):
+    entry = problem("kepler")
+    run = compiled("kepler", SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
+    L = angular_momentum(run.q, run.p)
+    assert np.abs(L - L[0]).max() < 2e-14
+
+
+@pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
+def test_the_spherical_pendulum_keeps_its_azimuthal_momentum_exactly(sample, compiled, method):
+    q, p = sample("spherical-pendulum").state
+    run = compiled("spherical-pendulum", method).integrate(q, p, h=0.05, steps=STEPS)
+    assert np.abs(run.p[:, 1] - p[1]).max() == 0.0
+
+
+@pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
+def test_free_bodies_keep_linear_and_angular_momentum_to_round_off(sample, compiled, method):
+    q, p = sample("three-bodies").state
+    run = compiled("three-bodies", method).integrate(q, p, h=0.1, steps=STEPS)
+    q, p = (x.reshape(len(run), 3, 2) for x in (run.q, run.p))
+    linear, angular = p.sum(axis=1), angular_momentum(q, p).sum(axis=1)
+    assert np.abs(linear - linear[0]).max() < 1e-14
+    assert np.abs(angular - angular[0]).max() < 1e-12
+
+
+def check_solar_system(compiled, method, steps):
+    entry = problem("outer-solar-system")
+    stepper = compiled("outer-solar-system", method)
+    run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=entry.step, steps=steps, every=10)
+    q, p = (x.reshape(len(run), 6, 3) for x in (run.q, run.p))
+    linear, angular = p.sum(axis=1), np.cross(q, p).sum(axis=1)
+    scale = np.abs(np.cross(q[0], p[0])).sum(axis=0).max()
+    assert np.abs(linear - linear[0]).max() < 1e-14 * np.abs(p[0]).sum()
+    assert np.abs(angular - angular[0]).max() < 1e-13 * scale
+
+
+def test_the_outer_solar_system_keeps_its_momenta_to_round_off(compiled):
+    check_solar_system(compiled, SVI(3), 1000)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", [SVI(3), SVI(6), SCVI(4)], ids=lambda method: method.name)
+def test_the_outer_solar_system_keeps_its_momenta_for_long(compiled, method):
+    check_solar_system(compiled, method, STEPS)
+
+
+def test_methods_without_a_discrete_lagrangian_lose_angular_momentum(compiled):
+    """What the tests above would show if conservation were an accident."""
+    entry = problem("kepler")
+    for method in (SpectralCollocation(4), SCVI(4, variational=False), RadauIIA(3)):
+        run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=1000)
+        assert abs(angular_momentum(run.q, run.p)[-1] - angular_momentum(run.q, run.p)[0]) > 1e-9
+
+
+# Energy.
+
+
+def energy_errors(compiled, name, method, q, p, h):
+    """Largest |energy error| in the first and in the last tenth of a long run."""
+    run = compiled(name, method).integrate(q, p, h=h, steps=STEPS)
+    error = np.abs(run.energy() - run.energy()[0])
+    return error[: STEPS // 10].max(), error[-STEPS // 10 :].max()
+
+
+DRIFTLESS = (SVI(3), SVI(3, "gauss-legendre:4"), SCVI(3), StoermerVerlet())
+DRIFTING = (SpectralCollocation(3), RadauIIA(3), SCVI(3, variational=False))
+
+
+@pytest.mark.parametrize("method", DRIFTLESS, ids=lambda method: method.name)
+@pytest.mark.parametrize("name", ["planar-pendulum", "henon-heiles"])
+def test_symplectic_methods_show_no_energy_drift(sample, compiled, name, method):
+    first, last = energy_errors(compiled, name, method, *sample(name).state, 0.3)
+    assert 0.0 < last < 1.1 * first
+
+
+@pytest.mark.parametrize("method", DRIFTING, ids=lambda method: method.name)
+def test_other_methods_drift(sample, compiled, method):
+    first, last = energy_errors(compiled, "planar-pendulum", method, *sample("planar-pendulum").state, 0.3)
+    assert last > 2.0 * first

@@ -1,0 +1,308 @@
+"""C for microcontrollers: builds for ARM Cortex-M without a warning, runs under QEMU to the numbers of the host."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from samples import sample_named, stepper_for
+
+from scvi_codegen.cli import main
+from scvi_codegen.compiler import generate_source
+from scvi_codegen.errors import MethodError, PackageError
+from scvi_codegen.lowering.program import FUNCTIONS
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SCVI, SVI, SpectralCollocation, StoermerVerlet
+from scvi_codegen.methods.method import Method
+from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.package import generate_package, load_package
+from scvi_codegen.models.problems import problem
+from scvi_codegen.rendering.single_precision import SPELLING, check_single, to_single
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.text import EMBEDDED, Embedded
+
+HERE = Path(__file__).parent / "embedded"
+CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
+STRICT = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -ffp-contract=off".split()  # noqa: SIM905
+PURE_SINGLE = ("-Wdouble-promotion", "-Wfloat-conversion", "-Wunsuffixed-float-constants")
+KINDS = {"double": np.float64, "single": np.float32}
+H, STEPS = 0.0625, 50
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board that QEMU has, the flags for its processor, and the precision of its registers."""
+
+    machine: str
+    flags: tuple[str, ...]
+    precision: Embedded
+
+
+BOARDS = {
+    "cortex-m3": Board("mps2-an385", ("-mcpu=cortex-m3",), "double"),
+    "cortex-m4": Board("mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"), "single"),
+    "cortex-m7": Board("mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard"), "double"),
+}
+"""Double precision in software, single precision in hardware, double precision in hardware."""
+
+CASES: dict[str, tuple[str, Method]] = {
+    "kepler": ("kepler", SVI(4)),
+    "verlet": ("kepler", StoermerVerlet()),
+    "pendulum": ("double-pendulum", SVI(3)),
+    "shooting": ("planar-pendulum", SCVI(3)),
+    "driven": ("driven-duffing", SVI(2)),
+}
+
+
+def run(command: list[str], folder: Path) -> str:
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    assert result.returncode == 0, f"{' '.join(command)}\n{result.stdout[-2000:]}{result.stderr}"
+    return result.stdout
+
+
+def tools(*names: str) -> None:
+    for name in names:
+        if shutil.which(name) is None:
+            pytest.skip(f"{name} is not installed (Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm)")
+
+
+@cache
+def embedded(case: str, precision: Embedded) -> tuple[Source, Interface]:
+    name, method = CASES[case]
+    return generate_source(sample_named(name).system, method, prefix="integrator", embedded=precision)
+
+
+@cache
+def start(case: str) -> tuple[np.ndarray, np.ndarray]:
+    """(q, p) of a case, in numbers that single precision holds."""
+    q, p = sample_named(CASES[case][0]).state
+    return np.float32(q).astype(float), np.float32(p).astype(float)
+
+
+def write_case(case: str, precision: Embedded, folder: Path) -> list[str]:
+    """The integrator, its start and a program that prints its states; the C files."""
+    source, interface = embedded(case, precision)
+    q, p = start(case)
+    arrays = {"q0": q, "p0": p, "parameters": interface.defaults or (0.0,)}
+    kind, suffix = ("float", "f") if precision == "single" else ("double", "")
+    lines = [f"#define REAL {kind}", f"#define H {H!r}{suffix}", f"#define STEPS {STEPS}"]
+    for name, values in arrays.items():
+        lines.append(f"static const {kind} {name}[] = {{{', '.join(f'{float(x)!r}{suffix}' for x in values)}}};")
+    (folder / "start.h").write_text("\n".join(lines) + "\n")
+    (folder / "integrator.h").write_text(source.header)
+    (folder / "integrator.c").write_text(source.code)
+    return ["integrator.c", str(HERE / "states.c"), str(HERE / "board.c")]
+
+
+def states(output: str, precision: Embedded) -> tuple[np.ndarray, np.ndarray]:
+    """(steps,) iterations and (steps, 2m) states from the bits printed."""
+    rows = [line.split() for line in output.splitlines()]
+    assert len(rows) == STEPS
+    assert {int(row[0], 16) for row in rows} == {0}
+    numbers = [[int(word, 16) for word in row[2:]] for row in rows]
+    whole = np.uint32 if precision == "single" else np.uint64
+    return np.array([int(row[1], 16) for row in rows]), np.array(numbers, whole).view(KINDS[precision])
+
+
+def on_host(case: str, precision: Embedded, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    tools("gcc")
+    files = write_case(case, precision, folder)
+    run(["gcc", "-O2", *STRICT, f"-I{HERE}", "-I.", *files, "-lm", "-o", "host"], folder)
+    return states(run(["./host"], folder), precision)
+
+
+def on_board(case: str, board: Board, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    tools(CROSS, QEMU)
+    files = write_case(case, board.precision, folder)
+    pure = PURE_SINGLE if board.precision == "single" else ()
+    common = [CROSS, "-mthumb", *board.flags, "-O2", *STRICT, "-ffreestanding", f"-I{HERE}", "-I."]
+    run([*common, *pure, "-Wvla", "-Wstack-usage=512", "-c", "integrator.c"], folder)
+    check_needs(folder)
+    linked = ["-nostartfiles", "--specs=nosys.specs", f"-T{HERE / 'mps2.ld'}", "-Wl,--gc-sections"]
+    run([*common, "-Wno-pedantic", *linked, "integrator.o", *files[1:], "-lm", "-o", "board.elf"], folder)
+    machine = ["-M", board.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
+    hosted = ["-chardev", "stdio,id=text", "-semihosting-config", "enable=on,target=native,chardev=text"]
+    return states(run([QEMU, *machine, *hosted, "-kernel", "board.elf"], folder), board.precision)
+
+
+def check_needs(folder: Path) -> None:
+    """The object needs the arithmetic of the compiler, libm and two functions that every compiler asks for, no more."""
+    needs = set(run(["arm-none-eabi-nm", "-u", "integrator.o"], folder).split()) - {"U"}
+    needs = {name.removesuffix("f") for name in needs if not name.startswith("__aeabi_")}
+    assert needs <= {*FUNCTIONS.values(), "memcpy", "memset", "fabs", "sqrt"}
+    text, data, bss, *_ = run(["arm-none-eabi-size", "integrator.o"], folder).splitlines()[1].split()
+    assert (int(data), int(bss)) == (0, 0)
+    assert int(text) < 32 * 1024
+
+
+@pytest.mark.parametrize("name", BOARDS)
+@pytest.mark.parametrize("case", CASES)
+def test_a_board_gives_the_numbers_of_the_host(case, name, tmp_path):
+    """Bit for bit where only arithmetic and square roots are used, else to the rounding of two libms."""
+    board = BOARDS[name]
+    iterations, found = on_board(case, board, tmp_path)
+    host_iterations, expected = on_host(case, board.precision, tmp_path)
+    if CASES[case][0] == "kepler":
+        assert np.array_equal(found, expected)
+        assert np.array_equal(iterations, host_iterations)
+    unit = np.finfo(KINDS[board.precision]).eps
+    np.testing.assert_allclose(found, expected, rtol=0, atol=300 * unit * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_double_precision_is_that_of_the_compiled_stepper_and_single_is_near_it(case, tmp_path):
+    name, method = CASES[case]
+    trajectory = stepper_for(name, method).integrate(*start(case), h=H, steps=STEPS)
+    expected = np.hstack([trajectory.q, trajectory.p])[1:]
+    size = np.abs(expected).max()
+    _, double = on_host(case, "double", tmp_path)
+    assert np.abs(double - expected).max() < 1e-12 * size
+    _, single = on_host(case, "single", tmp_path)
+    assert np.abs(single[:10] - expected[:10]).max() < 1e-6 * size
+    assert np.abs(single - expected).max() < 1e-4 * size
+
+
+# A bound for the time of a step.
+
+
+COUNTING = """
+#include <stdio.h>
+#include "integrator.h"
+int main(void)
+{
+  static double workspace[INTEGRATOR_WORKSPACE];
+  const integrator_options patient = {1e-300, 1000000, 1};
+  const double mu = 1.0, q0[2] = {1.0, 0.0}, p0[2] = {0.0, 1.0};
+  double q[2], p[2];
+  integrator_report report;
+  const int status = integrator_step(0.0, 0.5, q0, p0, &mu, &patient, q, p, &report, workspace);
+  printf("%d %lld", status, report.iterations);
+  return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("bound", [1, 3, 8])
+def test_iterations_are_bounded_when_it_is_compiled_whatever_the_options_say(bound, tmp_path):
+    tools("gcc")
+    write_case("kepler", "double", tmp_path)
+    (tmp_path / "count.c").write_text(COUNTING)
+    define = f"-DINTEGRATOR_MAX_ITERATIONS={bound}"
+    run(["gcc", *STRICT, define, "integrator.c", "count.c", "-lm", "-o", "count"], tmp_path)
+    assert run(["./count"], tmp_path).split() == ["1", str(bound)]
+
+
+# Single precision.
+
+
+DOUBLE = """#include "double.h" /* 1.0 double sin */
+double x = 0.1, y = sin(2.0)*1e-05 + 3.5e+2/.5; puts("double 1.0");
+int k = 10, double_sin = 1LL; DBL_EPSILON; a.b1 = 2.;"""
+SINGLE = """#include "double.h" /* 1.0 double sin */
+float x = 0.100000001f, y = sinf(2.0f)*9.99999975e-06f + 350.0f/0.5f; puts("double 1.0");
+int k = 10, double_sin = 1LL; FLT_EPSILON; a.b1 = 2.0f;"""
+
+
+def test_the_text_in_single_precision_differs_in_spelling_only():
+    assert to_single(DOUBLE) == SINGLE
+
+
+@pytest.mark.parametrize(
+    "value", [*np.float32([0.1, 1 / 3, np.pi, 2.0**-126, 3.4028234e38, 1 + 2.0**-23]).tolist(), 0.0]
+)
+def test_literals_read_back_as_the_nearest_number(value):
+    text = to_single(repr(value))
+    assert text.endswith("f")
+    assert np.float32(text[:-1]) == np.float32(value)
+
+
+def test_what_is_left_of_a_zero_in_a_table_becomes_zero_and_a_number_of_a_model_is_refused():
+    assert to_single("1.7e-63") == "0.0f"
+    for value in (1e-39, 1e39, -1e300):
+        with pytest.raises(MethodError, match="single precision cannot hold"):
+            check_single([1.0, value])
+
+
+@pytest.mark.parametrize("number", ["1e-45", "1e40"])
+def test_models_with_numbers_beyond_single_precision_are_refused(number):
+    """As constants of the Lagrangian and as values of parameters."""
+    text = "q_dot**2/2 - {}*q**2/2"
+    for system in (
+        LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian=text.format(number)),
+        LagrangianSystem.from_text(
+            name="s", coordinates=["q"], lagrangian=text.format("k"), parameters={"k": float(number)}
+        ),
+    ):
+        generate_source(system, SVI(1), embedded="double")
+        with pytest.raises(MethodError, match="other units"):
+            generate_source(system, SVI(1), embedded="single")
+
+
+def test_every_function_of_a_lagrangian_has_a_name_in_single_precision():
+    assert set(FUNCTIONS.values()) <= set(SPELLING)
+
+
+def test_energy_does_not_drift_in_single_precision(tmp_path):
+    """Twenty thousand steps of the pendulum: the error stays at that of a few, which for a sum without care grows."""
+    tools("gcc")
+    folder = generate_package(
+        replace(Model.from_problem(problem("planar-pendulum")), method=SVI(3), h=0.125, span=None, steps=20_000),
+        tmp_path / "pendulum",
+        embedded="single",
+    )
+    lines = run(["make", "-s", "-C", str(folder), "run"], tmp_path).splitlines()[1:]
+    errors = np.abs([float(line.split()[-1]) for line in lines])
+    assert len(errors) == 21
+    assert 0.0 < errors.max() < 1e-5
+
+
+# What the user meets.
+
+
+FOLDER = ("main.c", "Makefile", "README.md", "interface.json", "model.toml")
+
+
+def test_the_command_line_writes_a_folder_without_python(tmp_path):
+    tools("gcc")
+    outputs = {}
+    for precision in EMBEDDED:
+        folder = tmp_path / f"kepler_{precision}"
+        result = CliRunner().invoke(main, ["generate", "kepler", "--embedded", precision, "-o", str(folder)])
+        assert result.exit_code == 0
+        assert "import" not in result.output
+        names = {f"{folder.name}.c", f"{folder.name}.h", *FOLDER}
+        assert {path.name for path in folder.iterdir()} == names
+        kind = "float" if precision == "single" else "double"
+        assert f"static {kind} workspace" in (folder / "README.md").read_text()
+        lines = run(["make", "-s", "-C", str(folder), "run"], tmp_path).splitlines()[1:]
+        outputs[precision] = np.array([line.split() for line in lines], dtype=float)
+        with pytest.raises(PackageError, match="without --embedded"):
+            load_package(folder)
+    assert 0.0 < np.abs(outputs["single"] - outputs["double"]).max() < 1e-2
+
+
+def test_lanes_are_refused_by_name():
+    system = problem("kepler").system
+    with pytest.raises(MethodError, match="vector registers"):
+        generate_source(system, SVI(2), solver="fixed-point", embedded="double")
+    with pytest.raises(MethodError, match="double or single"):
+        generate_source(system, SVI(2), embedded="half")
+    assert "lanes" not in generate_source(system, SVI(2), embedded="double")[0].code
+
+
+def test_other_methods_compile_in_either_precision(tmp_path):
+    tools("gcc")
+    methods = {"collocation": SpectralCollocation(2, form="position"), "printed": SCVI(2, variational=False)}
+    for prefix, method in methods.items():
+        for precision in EMBEDDED:
+            source, _ = generate_source(sample_named("cart-pole").system, method, prefix=prefix, embedded=precision)
+            (tmp_path / f"{prefix}.h").write_text(source.header)
+            (tmp_path / f"{prefix}.c").write_text(source.code)
+            pure = PURE_SINGLE if precision == "single" else ()
+            run(["gcc", *STRICT, *pure, "-c", f"{prefix}.c"], tmp_path)

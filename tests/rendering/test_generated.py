@@ -1,0 +1,73 @@
+"""The integrators in ``generated/`` are those of today's generator, and compile with every warning an error."""
+
+import difflib
+import importlib.util
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import scvi_codegen
+
+FOLDER = Path(__file__).parents[2] / "generated"
+STRICT = "-std=c99 -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror".split()  # noqa: SIM905  (as typed)
+REMEDY = "run: python generated/remake.py"
+
+
+@cache
+def fresh() -> dict[str, str]:
+    """Text by file name, as the generator makes it now."""
+    spec = importlib.util.spec_from_file_location("remake", FOLDER / "remake.py")
+    assert spec is not None
+    assert spec.loader is not None
+    remake = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(remake)
+    return remake.texts()
+
+
+def stored() -> dict[str, str]:
+    """Text by file name, as it stands in the folder."""
+    return {path.name: path.read_bytes().decode("utf-8") for path in sorted(FOLDER.glob("*.[ch]"))}
+
+
+def test_no_file_is_missing_or_orphaned():
+    assert sorted(stored()) == sorted(fresh()), REMEDY
+
+
+def test_no_file_is_stale():
+    old, new = stored(), fresh()
+    changes = [
+        line
+        for name in sorted(set(old) & set(new))
+        for line in difflib.unified_diff(
+            old[name].splitlines(True), new[name].splitlines(True), f"generated/{name}", f"{name} as generated now"
+        )
+    ]
+    if changes:
+        pytest.fail(f"generated files are stale, {REMEDY}\n{''.join(changes)}", pytrace=False)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_every_file_compiles_with_every_warning_an_error(compiler, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed")
+    files = sorted(FOLDER.glob("*.c"))
+    assert files
+    command = [compiler, *STRICT, f"-I{FOLDER}", "-c", *map(str, files)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "warning" not in result.stderr
+
+
+def test_no_text_holds_a_date_a_path_or_a_version():
+    for name, text in stored().items():
+        assert scvi_codegen.__version__ not in text, name
+        assert re.findall(r"\b(?:19|20)\d\d-\d\d|/home/|/usr/|/tmp/|C:\\", text) == [], name
+
+
+def test_the_readme_names_every_integrator():
+    readme = (FOLDER / "README.md").read_text(encoding="utf-8")
+    assert {Path(name).stem for name in stored()} == set(re.findall(r"^\| `(\w+)`", readme, re.MULTILINE))

@@ -1,0 +1,77 @@
+"""Generated texts are made once, and again whenever anything they depend on is another."""
+
+from __future__ import annotations
+
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen import compiler
+from scvi_codegen.native import building
+from scvi_codegen.rendering import text_cache
+
+
+@pytest.fixture
+def made(tmp_path, monkeypatch) -> list[str]:
+    """The methods derived from here on, with an empty cache."""
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
+    names: list[str] = []
+    derive = compiler.program_of
+
+    def counted(system, method, **options):
+        names.append(method.name)
+        return derive(system, method, **options)
+
+    monkeypatch.setattr(compiler, "program_of", counted)
+    return names
+
+
+def spring(stiffness: float = 1.0) -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
+        name="spring", coordinates=["q"], lagrangian="q_dot**2/2 - k*q**2/2", parameters={"k": stiffness}
+    )
+
+
+def test_what_was_derived_is_not_derived_again(made):
+    first, second = (sc.compile_stepper(spring(), sc.SVI(2)) for _ in range(2))
+    assert len(made) == 1
+    assert (first.source, first.interface, first.ensemble) == (second.source, second.interface, second.ensemble)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda: sc.compile_stepper(spring(2.0), sc.SVI(2)),
+        lambda: sc.compile_stepper(spring(), sc.SVI(2, "gauss-legendre:3")),
+        lambda: sc.compile_stepper(spring(), sc.SVI(2), solver="newton"),
+        lambda: sc.compile_stepper(spring(), sc.SVI(2), prefix="other"),
+    ],
+    ids=["parameter", "method", "solver", "prefix"],
+)
+def test_anything_else_is(made, other):
+    sc.compile_stepper(spring(), sc.SVI(2))
+    other()
+    assert len(made) == 2
+
+
+def test_another_generator_makes_it_anew(made, monkeypatch):
+    sc.compile_stepper(spring(), sc.SVI(2))
+    monkeypatch.setattr(text_cache, "_generator", lambda: "the next version")
+    sc.compile_stepper(spring(), sc.SVI(2))
+    assert len(made) == 2
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b'{"source": {}}', b"\xff\xfe"])
+def test_a_damaged_entry_is_made_anew(made, tmp_path, damage):
+    sc.compile_stepper(spring(), sc.SVI(2))
+    (entry,) = (tmp_path / "texts").glob("*.json")
+    entry.write_bytes(damage)
+    sc.compile_stepper(spring(), sc.SVI(2))
+    assert len(made) == 2
+    assert len(entry.read_bytes()) > 1000
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(made, tmp_path):
+    (tmp_path / "texts").write_text("a file where the folder should be")
+    sc.compile_stepper(spring(), sc.SVI(2))
+    sc.compile_stepper(spring(), sc.SVI(2))
+    assert len(made) == 2

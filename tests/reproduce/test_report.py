@@ -1,0 +1,358 @@
+"""The paper's experiments are run, written and put on one page; the page is looked at in a browser."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import toy_experiments
+from click.testing import CliRunner
+from html_page import Page
+from toy_experiments import EXPERIMENTS, GOOD
+
+from scvi_codegen.cli import main
+from scvi_codegen.cli.reproducing import Reproduction, experiments_table
+from scvi_codegen.display.page.typesetting import cell, prose
+from scvi_codegen.errors import StateError
+from scvi_codegen.reproduce.laboratory.experiment import Picture, Result
+from scvi_codegen.reproduce.report import report_html, tally
+from scvi_codegen.reproduce.runner import Failure, run_experiments, with_needs
+from scvi_codegen.reproduce.svg import DARK_PAPER, color_variables, contrast, inline_svg
+from scvi_codegen.reproduce.writing import draw
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+TOYS = toy_experiments.__name__
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, Result]:
+    return {result.name: result for result in run_experiments(GOOD, 1, module=TOYS) if isinstance(result, Result)}
+
+
+@pytest.fixture(scope="module")
+def page(results: dict[str, Result]) -> str:
+    return report_html(list(results.values()))
+
+
+class TestRunner:
+    def test_needs_come_first_and_once(self):
+        assert with_needs(["table-8", "figure-4", "last"], EXPERIMENTS) == [
+            "figure-4",
+            "table-8",
+            "broken",
+            "after-broken",
+            "last",
+        ]
+
+    def test_an_unknown_name_is_answered_with_the_nearest(self):
+        with pytest.raises(StateError, match=r"no experiment called 'figur-4'; did you mean 'figure-4'\?"):
+            run_experiments(["figur-4"], module=TOYS)
+
+    def test_failures_stop_nothing_but_what_needs_them(self):
+        outcomes = list(run_experiments(["last", "misnamed", "table-8"], 1, module=TOYS))
+        assert [outcome.name for outcome in outcomes if isinstance(outcome, Result)] == ["figure-4", "table-8"]
+        failures = {outcome.name: outcome for outcome in outcomes if isinstance(outcome, Failure)}
+        assert failures["broken"].message == "ValueError: no such luck"
+        assert "raise ValueError" in failures["broken"].details
+        assert failures["after-broken"].message == "it needs 'broken', which failed"
+        assert failures["last"].message == "it needs 'after-broken', which failed"
+        assert failures["misnamed"].message == "its result is called 'another'"
+
+    def test_processes_give_the_same_and_survive_a_crash(self):
+        seen: list[tuple[str, ...]] = []
+        names = ["crash", "table-8", "unportable", "table-9", "broken"]
+        outcomes = list(run_experiments(names, 2, module=TOYS, watch=lambda running: seen.append(tuple(running))))
+        assert {outcome.name for outcome in outcomes if isinstance(outcome, Result)} == {
+            "figure-4",
+            "table-8",
+            "table-9",
+        }
+        failures = {outcome.name: outcome.message for outcome in outcomes if isinstance(outcome, Failure)}
+        assert failures["crash"] == "its process ended with exit status 7"
+        assert "lambda" in failures["unportable"]
+        assert failures["broken"] == "ValueError: no such luck"
+        assert max(map(len, seen)) == 2
+        assert seen[-1] == ()
+        order = [outcome.name for outcome in outcomes]
+        assert order.index("figure-4") < order.index("table-8")
+
+    def test_closing_it_ends_the_processes(self):
+        outcomes = run_experiments(["table-9", "slow"], 2, module=TOYS)
+        assert next(outcomes).name == "table-9"
+        began = time.perf_counter()
+        outcomes.close()
+        assert time.perf_counter() - began < 10.0
+
+
+def an_svg(draw_on: Callable[[Axes], object]) -> str:
+    picture = Picture(draw=lambda figure: draw_on(figure.add_subplot()))
+    return inline_svg(draw(picture, "svg"), prefix="one", label="")
+
+
+class TestSvg:
+    def test_it_is_small_and_in_the_colours_of_the_page(self, results):
+        drawn = draw(results["figure-4"].picture, "svg")
+        text = inline_svg(drawn, prefix="one", label='a "b" & <c>')
+        assert len(text) < 0.6 * len(drawn)
+        assert not re.search(r"#[0-9a-f]{6}", text)
+        assert "currentColor" in text
+        assert "var(--paper)" in text
+        assert 'aria-label="a &quot;b&quot; &amp; &lt;c&gt;"' in text
+        identifiers = re.findall(r'id="([^"]*)"', text)
+        referred = set(re.findall(r'(?:url\(#|href="#)([^")]*)', text))
+        assert set(identifiers) == referred
+        assert len(identifiers) == len(referred)
+        assert all(name.startswith("one-") for name in identifiers)
+
+    def test_colours_are_readable_on_both_papers(self, results):
+        text = inline_svg(draw(results["figure-4"].picture, "svg"), prefix="one", label="")
+        light, dark = (color_variables([text], dark=dark) for dark in (False, True))
+        assert light["--line-1f5fa8"] == "#1f5fa8"
+        assert light.keys() == dark.keys()
+        assert contrast(dark["--line-1f5fa8"], DARK_PAPER) >= 4.5
+        assert contrast(dark["--text-888888"], DARK_PAPER) >= 4.5
+        assert contrast(light["--text-888888"], "#ffffff") >= 4.5
+        grid = contrast(light["--line-b0b0b0"], "#ffffff"), contrast(dark["--line-b0b0b0"], DARK_PAPER)
+        assert grid[0] == pytest.approx(grid[1], rel=0.05)
+
+    def test_a_pale_area_stays_pale(self):
+        text = an_svg(lambda axes: axes.axhspan(0.0, 1.0, color="#ffffcc"))
+        dark = color_variables([text], dark=True)
+        assert contrast(dark["--line-ffffcc"], DARK_PAPER) == pytest.approx(contrast("#ffffcc", "#ffffff"), abs=0.05)
+
+    def test_images_and_colour_scales_keep_their_colours(self):
+        image = an_svg(lambda axes: axes.imshow([[0.0, 1.0], [2.0, 3.0]]))
+        scale = an_svg(lambda axes: axes.pcolormesh(np.arange(36.0).reshape(6, 6)))
+        for text in (image, scale):
+            assert 'class="light"' in text
+            assert "var(--line" not in text
+            assert "var(--paper)" not in text
+
+
+M, T, N = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
+
+
+@pytest.mark.parametrize(
+    ("text", "typeset"),
+    [
+        ("1.5e-09 and 1e-14, 2e+05", f"1.5{N}{T}{N}10<sup>{M}9</sup> and 10<sup>{M}14</sup>, 2{N}{T}{N}10<sup>5</sup>"),
+        ("2.1e+00", "2.1"),
+        ("h = -0.1, degree 2-5, e=.5", f"h{N}={N}{M}0.1, degree 2-5, e=.5"),
+        ("h^2, Q^{s-1}, x^(k+1), dq ^ dp", f"h<sup>2</sup>, Q<sup>s{M}1</sup>, x<sup>k+1</sup>, dq ^ dp"),
+        ("L_d, a_34, q_(k+1), lambda_1", "L<sub>d</sub>, a<sub>34</sub>, q<sub>k+1</sub>, λ<sub>1</sub>"),
+        ("q_dot, add_boundary, x_max", "q_dot, add_boundary, x_max"),
+        ("1 - e <= 2 >= x -> y, 0, .., +-1", f"1 {M} e ≤ 2 ≥ x → y, 0, …, ±1"),
+        ("<b> & SC-like, p0e-3x", "&lt;b&gt; &amp; SC-like, p0e-3x"),
+        ("q'' = -q is -J_0, not -o", f"q&#39;&#39; = {M}q is {M}J<sub>0</sub>, not -o"),
+    ],
+)
+def test_prose_is_typeset(text, typeset):
+    assert str(prose(text)) == typeset
+
+
+def test_cells_are_formatted():
+    given = [(None, None), (1520, None), (0.25, None), (1.24e-11, ".2g"), (float("inf"), None), ("a_1", ".3g")]
+    assert [str(cell(*pair)) for pair in given] == [
+        "\N{EN DASH}",
+        "1520",
+        "0.25",
+        f"1.2{N}{T}{N}10<sup>{M}11</sup>",
+        "inf",
+        "a<sub>1</sub>",
+    ]
+
+
+class TestPage:
+    def test_it_is_complete_and_well_formed(self, page):
+        parsed = Page(page)
+        assert parsed.all("html") == [{"lang": "en"}]
+        assert len(parsed.all("h1")) == 1
+        assert len(parsed.all("section")) == len(parsed.all("h2")) == len(GOOD)
+        assert len(parsed.all("svg")) == 1
+        assert parsed.all("svg")[0]["aria-label"] == "Figure 4. Energy errors of <SVI> & SC"
+        assert len(parsed.all("caption")) == len(parsed.all("table")) == 3
+        assert len(parsed.all("math")) > 10
+        assert toy_experiments.LONG_LINE in page
+
+    def test_identifiers_are_unique_and_references_resolve(self, page):
+        parsed = Page(page)
+        identifiers = [attributes["id"] for _, attributes in parsed.elements if "id" in attributes]
+        assert len(identifiers) == len(set(identifiers))
+        referred = set(re.findall(r'(?:url\(#|href="#)([^")]*)', page)) | set(re.findall(r'labelledby="([^"]*)"', page))
+        assert referred <= set(identifiers)
+        assert set(GOOD) <= referred
+
+    def test_it_needs_nothing_else(self, page):
+        parsed = Page(page)
+        assert parsed.all("script") == []
+        for _, attributes in parsed.elements:
+            for name in ("src", "href", "srcset", "data", "action", "poster"):
+                assert (attributes.get(name) or "#").startswith(("#", "data:"))
+        assert "http:" not in page
+        assert "https:" not in page
+        assert "@import" not in page
+
+    def test_text_is_escaped_and_its_numbers_are_typeset(self, page):
+        assert "Energy errors of &lt;SVI&gt; &amp; SC" in page
+        assert "&lt;the positions&gt;" in page
+        assert "h<sup>2</sup> &lt; 1 &amp; \N{MINUS SIGN}1 &gt; \N{MINUS SIGN}2." in page
+        assert "2.10\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10<sup>\N{MINUS SIGN}9</sup>" in page
+        assert "Q<sup>1</sup>" in page
+
+    def test_names_of_results_are_links(self, page):
+        assert f'See <a href="#figure-4">Figure{N}4</a>, not figure-40.' in page
+
+    def test_tables_show_what_is_to_be_shown(self, page):
+        assert '<td class="word">SVI</td>' in page
+        assert '<td class="number">500</td>' in page
+        assert '<td class="number">\N{EN DASH}</td>' in page
+        assert "series" not in page
+        assert '<td class="number">0.50</td>' in page
+
+    def test_verdicts_are_summed_up(self, page, results):
+        assert [text for _, text in tally([result.verdict for result in results.values()])] == [
+            "2 hold in part",
+            "2 shown",
+        ]
+        assert page.count('<span class="verdict partly">') == 5
+        assert "The equations of one step</span>" in page
+
+    def test_equal_results_give_equal_pages(self, page, results):
+        assert report_html(list(results.values())) == page
+
+    def test_a_result_alone_is_a_page_of_its_own(self, results):
+        parsed = Page(text := report_html([results["section-3.1"]]))
+        assert len(parsed.all("h1")) == 1
+        assert parsed.all("h2") == []
+        assert "All results" not in text
+        assert "<title>The equations of one step</title>" in text
+
+
+@pytest.fixture
+def toys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("scvi_codegen.reproduce.catalogue.EXPERIMENTS", EXPERIMENTS)
+
+
+def invoke(*words: str) -> Any:
+    return CliRunner().invoke(main, ["reproduce", "--jobs", "1", *words], prog_name="scvi-codegen")
+
+
+@pytest.mark.usefixtures("toys")
+class TestCommand:
+    def test_files_and_the_page_are_written(self):
+        done = invoke("section-3.1", "table-8", "-o", "made/here", "--html", "all.html")
+        assert done.exit_code == 0, done.output
+        assert sorted(path.name for path in Path("made/here").iterdir()) == [
+            "figure-4-series.csv",
+            "figure-4.csv",
+            "figure-4.png",
+            "figure-4.svg",
+            "figure-4.txt",
+            "section-3.1.html",
+            "section-3.1.txt",
+            "table-8.csv",
+            "table-8.txt",
+        ]
+        assert "3 results, 2 hold in part, 1 shown\nwrote 10 files to . and made/here" in done.stdout
+        assert "figure-4     holds in part  Energy errors of <SVI> & SC\n" in done.stdout
+        text = Path("all.html").read_text(encoding="utf-8")
+        assert text.index('<section id="section-3.1"') < text.index('<section id="figure-4"')
+
+    def test_a_claim_that_does_not_hold_is_no_failure(self):
+        assert invoke("figure-4").exit_code == 0
+        assert Path("reproduced/figure-4.txt").is_file()
+
+    def test_an_experiment_that_fails_is_named_at_the_end(self):
+        done = invoke("broken", "table-9")
+        assert done.exit_code == 1
+        assert "1 experiment failed to run\n  broken: ValueError: no such luck" in done.stderr
+        assert Path("reproduced/table-9.txt").is_file()
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["figur-4"], "did you mean 'figure-4'?"),
+            ([], "say what to reproduce"),
+            (["table-9", "-o", "file"], "'file' is not a folder"),
+            (["table-9", "--html", "no/where.html"], "there is no folder 'no'"),
+            (["table-9", "--jobs", "0"], "Invalid value for '--jobs'"),
+        ],
+    )
+    def test_what_is_wrong_is_said_before_anything_runs(self, words, message):
+        Path("file").write_text("")
+        done = invoke(*words)
+        assert done.exit_code == 2
+        assert message in done.stderr
+        assert not Path("reproduced").exists()
+
+    def test_a_file_that_cannot_be_written_ends_with_1(self):
+        Path("made/table-9.txt").mkdir(parents=True)
+        done = invoke("table-9", "-o", "made")
+        assert done.exit_code == 1
+        assert "made" in done.stderr
+
+    def test_without_matplotlib_it_says_what_to_install(self, monkeypatch):
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+        done = invoke("table-9")
+        assert done.exit_code == 2
+        assert "pip install 'scvi-codegen[plot]'" in done.stderr
+
+    def test_the_list(self):
+        assert "figure-4      Energy errors\n" in invoke("--list").stdout
+        assert invoke("--list", "table-8").stdout == "figure-4  Energy errors\ntable-8   Iterations\n"
+        assert experiments_table(module=TOYS) == invoke("--list").stdout.rstrip("\n")
+
+    def test_after_ctrl_c_it_ends_with_130(self, monkeypatch):
+        interrupted = Reproduction(interrupted=True)
+        monkeypatch.setattr("scvi_codegen.cli.reproducing.reproduce_experiments", lambda *words: interrupted)
+        done = invoke("slow")
+        assert done.exit_code == 130
+        assert "interrupted" in done.stderr
+
+
+INTERRUPTED = """
+from pathlib import Path
+from scvi_codegen.cli.reproducing import reproduce_experiments
+done = reproduce_experiments(["table-9", "slow"], Path("made"), None, 2, module="toy_experiments")
+print("interrupted" if done.interrupted else "not interrupted", [path.name for path in done.files])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals for process groups")
+def test_ctrl_c_ends_everything_at_once_and_keeps_what_was_written(tmp_path):
+    path = f"import sys; sys.path[:0] = {sys.path!r}\n"
+    child = subprocess.Popen(
+        [sys.executable, "-c", path + INTERRUPTED],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline().startswith("table-9")
+    began = time.perf_counter()
+    interrupt_group(child)
+    output, errors = child.communicate(timeout=30.0)
+    assert time.perf_counter() - began < 10.0
+    assert output == "interrupted ['table-9.txt']\n"
+    assert "Traceback" not in errors
+    assert (tmp_path / "made" / "table-9.txt").is_file()
+
+
+def interrupt_group(child: subprocess.Popen[str]) -> None:
+    """What a terminal does on Ctrl-C: the signal goes to all processes."""
+    os.killpg(child.pid, signal.SIGINT)

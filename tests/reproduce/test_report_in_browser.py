@@ -1,0 +1,72 @@
+"""The report in a headless Chromium: formulas, widths, colours, paper, and that it asks for nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import toy_experiments
+from browsing import (
+    FORMULAS,
+    FRACTIONS,
+    UNREADABLE,
+    VIEWS,
+    assert_it_asks_for_nothing,
+    assert_nothing_sticks_out,
+    opened,
+)
+from toy_experiments import GOOD
+
+from scvi_codegen.reproduce.laboratory.experiment import Result
+from scvi_codegen.reproduce.report import report_html
+from scvi_codegen.reproduce.runner import run_experiments
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    outcomes = run_experiments(GOOD, 1, module=toy_experiments.__name__)
+    return report_html([outcome for outcome in outcomes if isinstance(outcome, Result)])
+
+
+class TestInABrowser:
+    @pytest.fixture(params=VIEWS, ids="-".join)
+    def view(self, request: pytest.FixtureRequest, browser: Any, page: str, tmp_path: Path) -> Iterator[Any]:
+        with opened(browser, page, tmp_path / "report.html", *request.param) as view:
+            yield view
+
+    def test_it_asks_for_nothing_and_complains_of_nothing(self, view):
+        assert_it_asks_for_nothing(view)
+
+    def test_nothing_sticks_out(self, view):
+        assert_nothing_sticks_out(view)
+        boxes = "[...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth, e.clientWidth])"
+        assert view.width > 390 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
+
+    def test_formulas_are_set_by_the_browser(self, view):
+        boxes = view.evaluate(FORMULAS)
+        assert len(boxes) > 10
+        assert all(width > 5.0 and height > 8.0 for width, height in boxes)
+        fractions = view.evaluate(FRACTIONS)
+        assert len(fractions) > 50
+        assert all(height > 12.0 and above <= below + 0.5 for height, above, below in fractions)
+
+    def test_all_text_is_readable(self, view):
+        assert view.evaluate(UNREADABLE) == []
+
+    def test_on_paper_it_is_light_and_figures_stay_whole(self, view):
+        view.emulate_media(media="print")
+        style = "e => getComputedStyle(document.querySelector(e))"
+        assert view.evaluate(f"({style})('body').backgroundColor") == "rgb(255, 255, 255)"
+        assert view.evaluate(f"({style})('figure').breakInside") == "avoid"
+        assert view.evaluate(f"({style})('.back').display") == "none"
+        assert view.evaluate(UNREADABLE) == []
+
+
+def test_dark_is_dark(browser, page):
+    view = browser.new_page(color_scheme="dark")
+    view.set_content(page)
+    assert view.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 28)"
+    assert view.evaluate("getComputedStyle(document.querySelector('svg text')).fill") == "rgb(227, 228, 230)"
+    view.close()

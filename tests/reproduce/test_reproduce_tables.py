@@ -1,0 +1,162 @@
+"""The tables of the paper, section 4.3 and the claims: numbers against those measured by independent programs."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import sympy
+
+from scvi_codegen.methods import SpectralCollocation
+from scvi_codegen.rendering import outline as c_outline
+from scvi_codegen.reproduce import claims
+from scvi_codegen.reproduce.laboratory import full_newton
+from scvi_codegen.reproduce.laboratory.experiment import Check, Result, Verdict
+from scvi_codegen.reproduce.oscillators import two_point_pendulum as two_point
+from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
+from scvi_codegen.reproduce.writing import statement
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.tableau import exact_tableau, gauss
+
+MODULES = (tableaux, properties, outlines, two_point)
+QUICK = [experiment for module in MODULES for experiment in module.EXPERIMENTS]
+
+
+@pytest.mark.parametrize("experiment", QUICK, ids=lambda experiment: experiment.name)
+def test_experiments_travel_between_processes_and_can_be_written(experiment):
+    result = experiment.run({})
+    again = pickle.loads(pickle.dumps(result))
+    assert again.name == experiment.name
+    assert statement(again) == statement(result)
+    assert all(len(row) == len(table.columns) for table in result.tables for row in table.rows)
+
+
+def test_tables_1_to_3_are_as_printed_but_for_one_entry():
+    found = [experiment.run({}) for experiment in tableaux.EXPERIMENTS]
+    assert [result.verdict for result in found] == [Verdict.HOLDS, Verdict.HOLDS, Verdict.PARTLY]
+    wrong = [row for result in found for row in result.tables[0].rows if row[-1] > 1e-50]
+    assert [(row[0], row[1]) for row in wrong] == [("a_34", "w1 - w'3 - w4")]
+    assert wrong[0][3] == pytest.approx(float(gauss(4).A[2][3]), abs=1e-15)
+
+
+@pytest.mark.parametrize("s", [2, 3, 4])
+def test_order_and_symplecticity_are_exact_and_can_fail(s):
+    A, b, c = exact_tableau(gauss(s))
+    assert set(tableaux.order_residuals((A, b, c))) == {0}
+    assert set(tableaux.symplectic_residuals((A, b, c))) == {0}
+    spoiled = ((A[0][0] + 1, *A[0][1:]), *A[1:])
+    assert any(residual != 0 for residual in tableaux.order_residuals((spoiled, b, c)))
+    assert any(residual != 0 for residual in tableaux.symplectic_residuals((spoiled, b, c)))
+
+
+def test_the_corrected_table_3_is_what_is_typeset():
+    formulas = [block for block in tableaux.table_3({}).body if hasattr(block, "right")]
+    A = next(block.right for block in formulas if str(block.left) == "A")
+    assert A[2, 3] == sympy.Symbol("w_1") + sympy.Symbol("w__'_3") - sympy.Symbol("w_4")
+
+
+def test_table_4_marks_are_decided_by_the_coefficients():
+    rows = {(family, stages): row for family, stages, *row in properties.table_4({}).tables[0].rows}
+    assert rows["Gauss", 5] == [10, "yes", "yes", "yes", "yes"]
+    assert rows["Chebyshev-Gauss", 1] == [2, "yes", "yes", "yes", "yes"]
+    assert rows["Chebyshev-Lobatto", 5] == [6, "yes", "yes", "no", "no"]
+    assert rows["Radau IIA", 3] == [5, "yes", "no", "no", "no"]
+    assert rows["SC", 4] == [4, "no", "no", "no", "no"]
+
+
+@pytest.mark.parametrize(("degree", "y"), [(3, 1.5), (4, 3.4), (5, 5.45), (6, 7.6), (7, 9.75), (8, 4.9), (9, 7.5)])
+def test_sc_amplifies_on_the_imaginary_axis(degree, y):
+    """Witnesses of the lack of A-stability that table 4 decides by Sturm's theorem."""
+    P, Q = SpectralCollocation(degree).tableau.stability_function()
+    assert abs(mp.polyval(P[::-1], 1j * y) / mp.polyval(Q[::-1], 1j * y)) > 1 + 4e-5
+
+
+def test_tables_6_and_7_have_the_errors_of_the_schemes():
+    pendulum, duffing = costs.costs(6), costs.costs(7)
+    assert pendulum["SVI"].energy == pytest.approx(1.27e-8, rel=0.02)
+    assert pendulum["SC"].energy == pytest.approx(6.2e-2, rel=0.02)
+    assert pendulum["SRK"].position > 100 * pendulum["SVI"].position
+    assert duffing["SVI"].energy == pytest.approx(2.8e-6, rel=0.02)
+    assert duffing["SC"].energy == pytest.approx(1.4e-2, rel=0.02)
+    assert all(0.0 < cost.seconds < 1.0 for cost in (*pendulum.values(), *duffing.values()))
+
+
+def test_a_verdict_on_costs_can_fail():
+    cheap, dear = (costs.Cost(seconds=seconds, energy=1e-9, position=1e-6) for seconds in (1.0, 2.0))
+    setting = costs.SETTINGS[6]
+    kept, lost = (
+        [check.verdict for check in costs._checks(setting, {"SRK": srk, "SVI": svi, "SC": dear})]
+        for srk, svi in ((dear, cheap), (cheap, dear))
+    )
+    assert (kept[0], kept[2], lost[0], lost[2]) == (Verdict.HOLDS, Verdict.HOLDS, Verdict.FAILS, Verdict.FAILS)
+
+
+def test_the_printed_iterations_are_those_of_the_paper():
+    table = iterations.printed_counts(8)
+    assert (table[0.5, 2, "SVI"].largest, table[0.5, 2, "SVI"].total) == (10, 1520)
+    assert (table[0.5, 5, "SC"].total, table[0.5, 5, "SVI"].total) == (1271, 1168)
+    assert not table[0.5, 2, "SC"].converged
+    assert sum(count.converged for count in table.values()) == 33
+    assert sum(count.converged for count in iterations.printed_counts(9).values()) == 24
+
+
+def test_full_newton_needs_four_iterations_a_step():
+    used = full_newton.newton_counts(iterations.KEPLER, iterations.SVI(5), *iterations._start(0.2), h=0.5, steps=200)
+    assert (max(used), sum(used)) == (4, 800)
+
+
+def test_iterations_of_the_compiled_solvers():
+    fixed, newton = (iterations._count(0.2, 0.5, 5, "SVI", solver) for solver in iterations.SOLVERS)
+    assert fixed.total == pytest.approx(1216, rel=0.05)
+    assert newton.total == pytest.approx(675, rel=0.05)
+    failed = iterations._count(0.2, 1.0, 2, "SC", "fixed-point")
+    assert (failed.converged, failed.failure) == (False, "step 0: not converged")
+
+
+def test_outlines_find_every_step_and_miss_what_is_not_there():
+    for result in (outlines.table_5({}), outlines.table_10({})):
+        assert result.verdict is Verdict.HOLDS
+        assert "newton(step, data" in result.body[1].text
+    step = outlines.Step(number=1, text="", counterpart="", evidence={"f": ("g(",), "h": ("g(",)})
+    functions = c_outline.functions_of(
+        "/* Twice\n * that. */\nstatic int f(int a,\n    const double x[2])\n{\n  return g(a);\n}\n"
+    )
+    assert functions["f"].comment == "Twice that."
+    assert functions["f"].arguments == ("a", "x")
+    assert outlines._missing(step, "", functions) == ["g("]
+
+
+def test_section_4_3_is_derived():
+    scheme = two_point.derived_scheme()
+    assert sympy.expand(scheme.stage - two_point.printed_36()) == 0
+    assert sympy.expand(scheme.momentum - two_point.printed_37()) == 0
+    result = two_point.section_4_3({})
+    failing = [check.claim for check in result.checks if check.verdict is not Verdict.HOLDS]
+    assert len(result.checks) == 6
+    assert [claim.split(",")[0] for claim in failing] == [
+        "The two-point Gauss formula has w = +-1 and tau = +-1/sqrt(3).",
+        "(27a) in matrix form is A~Q~ = G",
+    ]
+
+
+def result_with(name: str, *checks: tuple[str, Verdict]) -> Result:
+    return Result(
+        name=name,
+        title="",
+        setting=(),
+        checks=tuple(Check(claim="a", measured="b", verdict=verdict, bears_on=(key,)) for key, verdict in checks),
+    )
+
+
+def test_claims_collect_checks():
+    results = {
+        "figure-4": result_with("figure-4", ("accuracy", Verdict.HOLDS), ("stability", Verdict.FAILS)),
+        "table-8": result_with("table-8", ("stability", Verdict.FAILS), ("long-time", Verdict.HOLDS)),
+        "figure-5": result_with("figure-5", ("long-time", Verdict.FAILS), ("order", Verdict.SHOWN)),
+    }
+    verdicts = {row[0]: row[-1] for row in claims.claims(results).tables[0].rows}
+    assert verdicts["accuracy"] == "holds"
+    assert verdicts["stability"] == "does not hold"
+    assert verdicts["long-time"] == "holds in part"
+    assert verdicts["order"] == verdicts["geometric"] == "shown"
+    assert set(verdicts) == set(claims.CLAIMS)

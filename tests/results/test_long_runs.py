@@ -1,0 +1,266 @@
+"""Whatever ends the process, nothing written is lost or torn, and the run goes on bit for bit."""
+
+from __future__ import annotations
+
+import pickle
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from recorded_runs import STATE, H, assert_same, digests, recorded, start
+
+from scvi_codegen.cli import main
+from scvi_codegen.errors import RecordingError, StepFailedError
+from scvi_codegen.methods import SVI
+from scvi_codegen.results.recording import load_run, record_run, resume_run
+from scvi_codegen.runtime.stepper import Stepper
+
+
+@pytest.fixture(scope="session")
+def kepler(compiled) -> Stepper:
+    return compiled("kepler", SVI(4))
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    return
+
+
+CHILD = """
+import os, pickle, resource, sys
+from pathlib import Path
+from scvi_codegen.results.recording import record_run, resume_run
+stepper = pickle.loads(Path("stepper").read_bytes())
+settings = dict(checkpoint_seconds={seconds}, progress=lambda done: print(done, flush=True))
+{before}
+if Path("a.run/manifest.json").exists():
+    resume_run("a.run", **settings)
+else:
+    run = stepper.start([0.5, 0.0], [0.0, 1.7], h=0.05)
+    record_run(run, "a.run", steps=10**12, every=20, rows={rows}, **settings)
+"""
+
+
+def child(stepper: Stepper, *, before: str = "", seconds: float = 0.01, rows: int = 5000) -> subprocess.Popen[str]:
+    """A process that records, or goes on, printing the number of steps done; ``before`` it does something else."""
+    Path("stepper").write_bytes(pickle.dumps(stepper))
+    command = [sys.executable, "-c", CHILD.format(before=before, seconds=seconds, rows=rows)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def assert_whole(stepper: Stepper, *, further: int = 1000) -> None:
+    """The run goes on, and has the bytes of one that was never interrupted."""
+    steps, rows = load_run("a.run").steps + further, load_run("a.run").manifest.rows
+    resume_run("a.run", steps=steps)
+    shutil.rmtree("whole.run", ignore_errors=True)
+    record_run(start(stepper), "whole.run", steps=steps, every=20, rows=rows)
+    assert digests("a.run") == digests("whole.run")
+    assert {path.name for path in Path("a.run").iterdir()} == {path.name for path in Path("whole.run").iterdir()}
+
+
+def states_files() -> set[tuple[str, int]]:
+    """Names and times of what lies in the folder."""
+    found = set()
+    for path in Path("a.run").glob("states-*.npz"):
+        with suppress(FileNotFoundError):
+            found.add((path.name, path.stat().st_mtime_ns))
+    return found
+
+
+def killed_at_random(stepper: Stepper, times: int, generator: random.Random) -> list[int]:
+    """Step numbers in the folder after each kill; before there is a manifest, -1."""
+    steps = []
+    for _ in range(times):
+        before, patient = states_files(), generator.random() < 0.7
+        with child(stepper) as process:
+            while patient and states_files() == before and process.poll() is None:
+                time.sleep(0.01)  # until it has written something
+            time.sleep(generator.uniform(0.0, 0.4))
+            process.kill()
+        assert process.returncode == -signal.SIGKILL
+        steps.append(-1)
+        if Path("a.run/manifest.json").exists():
+            found = load_run("a.run")
+            assert sum(len(piece) for piece in found.pieces()) == len(found) == found.steps // 20 + 1
+            steps[-1] = found.steps
+    return steps
+
+
+@pytest.mark.parametrize("times", [5, pytest.param(100, marks=pytest.mark.full)])
+def test_a_run_killed_at_random_moments_goes_on(kepler, times):
+    steps = killed_at_random(kepler, times, random.Random(times))
+    assert steps == sorted(steps)
+    assert len(set(steps)) > times / 3
+    assert_whole(kepler)
+
+
+def test_a_file_that_may_not_grow_is_told_with_where_the_run_stands(kepler):
+    limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, resource.RLIM_INFINITY))"
+    with child(kepler, before=limit) as process:
+        _, stderr = process.communicate(timeout=60)
+    last, steps = stderr.splitlines()[-1], load_run("a.run").steps
+    assert "RecordingError: 'a.run' cannot be written: File too large. " in last
+    assert f"It holds the run whole up to step {steps} (t = {steps * H:g})" in last
+    assert "go on with 'scvi-codegen run --resume a.run' or resume_run" in last
+    assert steps > 0
+    assert_whole(kepler)
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A disk of 400 kB, where one can be made."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("no disk can be mounted here")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_loses_nothing_and_the_run_goes_on_when_there_is_room(kepler, small_disk):
+    folder = small_disk / "a.run"
+    with pytest.raises(RecordingError, match=r"No space left on device\. It holds the run whole up to step") as error:
+        recorded(kepler, 10**9, folder=str(folder), rows=2000)
+    steps = load_run(folder).steps
+    assert f"up to step {steps} " in str(error.value)
+    shutil.copytree(folder, "a.run")
+    resume_run("a.run", steps=steps + 5000)
+    recorded(kepler, steps + 5000, folder="whole.run", rows=2000)
+    assert digests("a.run") == digests("whole.run")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "csv", "h5", "zarr"])
+def test_a_file_for_which_there_is_no_room_leaves_the_old_one_and_nothing_else(kepler, small_disk, suffix):
+    pytest.importorskip({"h5": "h5py", "zarr": "zarr"}.get(suffix, "numpy"))
+    path = small_disk / f"a.{suffix}"
+    kepler.integrate(**STATE, h=H, steps=30).save(path)
+    before = {file: file.read_bytes() for file in small_disk.rglob("*") if file.is_file()}
+    with pytest.raises(OSError, match=rf"No space left on device: nothing was written.*a\.{suffix}'"):
+        kepler.integrate(**STATE, h=H, steps=100_000).save(path)
+    assert {file: file.read_bytes() for file in small_disk.rglob("*") if file.is_file()} == before
+
+
+WITHOUT_RIGHTS = """
+for path in (*Path("a.run").iterdir(), Path("a.run"), Path()):
+    path.chmod(0o555 if path.is_dir() else 0o444)
+"zip".encode("cp437")  # loaded now: the interpreter's own files may be out of reach afterwards
+if os.geteuid() == 0:
+    os.setegid(65534)
+    os.seteuid(65534)
+"""
+
+
+def test_a_folder_that_cannot_be_written_is_told_at_once(kepler, tmp_path):
+    recorded(kepler, 100, every=20, rows=5000)
+    before = digests("a.run")
+    try:
+        with child(kepler, before=WITHOUT_RIGHTS) as process:
+            _, stderr = process.communicate(timeout=60)
+    finally:
+        for folder in (tmp_path, tmp_path / "a.run"):
+            folder.chmod(0o755)
+    assert "'a.run' cannot be written: Permission denied. It holds the run whole up to step 100 (t = 5)" in stderr
+    assert digests("a.run") == before
+
+
+def test_an_exception_on_the_way_loses_nothing(kepler):
+    def interrupt(done: int) -> None:
+        if done > 300:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        recorded(kepler, 10**9, rows=10**6, progress=interrupt)
+    assert load_run("a.run").steps > 300
+    assert_same(resume_run("a.run", steps=3000), kepler.integrate(**STATE, h=H, steps=3000))
+
+
+def test_ctrl_c_at_any_time_loses_nothing(kepler):
+    with child(kepler, seconds=1000.0, rows=10**6) as process:
+        assert process.stdout is not None
+        for _ in range(20):
+            done = int(process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    assert stderr.splitlines()[-1] == "KeyboardInterrupt"
+    assert load_run("a.run").steps >= done
+    assert_whole(kepler)
+
+
+def test_a_step_that_fails_leaves_the_states_before_it(compiled):
+    stepper = compiled("runaway", SVI(4))
+    run = stepper.start([1.0], [1.0], h=0.05)
+    with pytest.raises(StepFailedError) as error:
+        record_run(run, "a.run", steps=1000, rows=8)
+    with pytest.raises(StepFailedError) as whole:
+        stepper.integrate([1.0], [1.0], h=0.05, steps=1000)
+    assert_same(load_run("a.run"), whole.value.recorded)
+    assert load_run("a.run").steps == error.value.step == whole.value.step
+    with pytest.raises(StepFailedError):
+        resume_run("a.run")
+    assert_same(load_run("a.run"), whole.value.recorded)
+
+
+class TestCommandLine:
+    @staticmethod
+    def invoke(words: str, status: int = 0) -> str:
+        result = CliRunner().invoke(main, words.split(), prog_name="scvi-codegen")
+        assert result.exit_code == status, result.output
+        return result.output
+
+    def test_a_run_into_a_folder_and_further_and_out(self):
+        text = self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --every 10 -o a.run")
+        assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states kept in 'a.run'" in text
+        assert "relative energy error" in text
+        assert "wrote a.run" in text
+        assert "holds a run already" in self.invoke("run kepler --method stoermer-verlet -o a.run", 1)
+        text = self.invoke("run --resume a.run --span 20")
+        assert "2000 steps (all)" in text
+        self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --every 10 -o whole/")
+        assert digests("a.run") == digests("whole")
+        assert "201 states kept in 'a.run'" in self.invoke("export a.run")
+        assert "wrote a.csv" in self.invoke("export a.run -o a.csv")
+        assert len(Path("a.csv").read_text().splitlines()) == 202
+
+    @pytest.mark.parametrize(
+        ("words", "message", "status"),
+        [
+            ("run", "Missing argument 'MODEL', or --resume FOLDER", 2),
+            ("run --resume none.run", "'none.run' holds no recorded run", 1),
+            ("run kepler --resume none.run", "MODEL does not go with --resume", 2),
+            ("run --resume none.run --step 0.1", "--step does not go with --resume", 2),
+            ("run kepler -o a.run --plot a.png", "--plot is for a trajectory in memory", 2),
+            ("run kepler -o a.npz --checkpoint 3", "--checkpoint is for a run that is written into a folder", 2),
+            ("run kepler -o a.run --certificate none.json", "the certificate 'none.json' cannot be read", 2),
+            ("run kepler -o no/a.run", "'no/a.run' cannot be written", 1),
+            ("export none.run", "holds no recorded run", 1),
+            ("export none.run -o a.xls", "not as 'a.xls'", 2),
+        ],
+    )
+    def test_what_does_not_work_is_told(self, words, message, status):
+        words = words.replace("kepler -o", "kepler --method stoermer-verlet --steps 10 -o")
+        assert message in self.invoke(words, status)
+
+    def test_ctrl_c_says_how_to_go_on(self):
+        words = "run kepler --method stoermer-verlet --step 0.01 --steps 1000000000000 --every 100000 -o a.run"
+        command = [sys.executable, "-m", "scvi_codegen", *words.split(), "--checkpoint", "0.1"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            while not Path("a.run/manifest.json").exists():
+                time.sleep(0.05)
+            time.sleep(0.3)
+            process.send_signal(signal.SIGINT)
+            stdout, stderr = process.communicate(timeout=60)
+        assert process.returncode == 130
+        assert "go on with: scvi-codegen run --resume a.run" in stderr
+        assert f"{load_run('a.run').steps} steps (of 1000000000000)" in stdout

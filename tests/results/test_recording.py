@@ -1,0 +1,360 @@
+"""Runs in a folder: what is in it, how it is read, continued and exported."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tracemalloc
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from recorded_runs import COLUMNS, STATE, H, StopsAfter, assert_same, digests, recorded, start
+
+from scvi_codegen.errors import MissingLibraryError, RecordingError, RecordingWarning, StateError
+from scvi_codegen.files import export
+from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
+from scvi_codegen.models.model_file import Model, dump_model
+from scvi_codegen.models.problems import problem
+from scvi_codegen.native import building
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.trajectory import Trajectory
+
+
+@pytest.fixture(scope="session")
+def kepler(compiled) -> Stepper:
+    return compiled("kepler", SVI(4))
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    return
+
+
+class TestRecording:
+    @pytest.mark.parametrize("every", [1, 7, 5000])
+    def test_a_recorded_run_is_the_one_in_memory(self, kepler, every):
+        found = recorded(kepler, 1001, every=every)
+        assert_same(found, kepler.integrate(**STATE, h=H, steps=1001, every=every))
+        assert (found.steps, found.finished, len(found)) == (1001, True, 1001 // every + 1)
+        assert len(list(Path("a.run").iterdir())) == 1 + -(-len(found) // 64)
+
+    def test_files_are_full_but_the_last(self, kepler):
+        found = recorded(kepler, 1001, rows=100)
+        assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
+
+    @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
+    @pytest.mark.parametrize("every", [1, 40, 400])
+    def test_an_interrupted_run_has_the_bytes_of_one_that_was_not(self, compiled, method, every):
+        stepper = compiled("kepler", method)
+        recorded(stepper, 600, every=every, folder="whole.run")
+        found, looks = recorded(stepper, 600, every=every, stop=StopsAfter(0), checkpoint_steps=31), 1
+        while not found.finished:
+            found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
+        assert looks > 3
+        assert digests("a.run") == digests("whole.run")
+
+    def test_options_and_parameters_are_kept(self, kepler):
+        settings = {"parameters": {"mu": 1.1}, "options": SolverOptions(tolerance=1e-9), "t": 3.0}
+        whole = kepler.integrate(**STATE, h=H, steps=300, **settings)
+        record_run(start(kepler, **settings), "a.run", steps=300, rows=64, stop=StopsAfter(2))
+        found = resume_run("a.run")
+        assert_same(found, whole)
+        assert found.manifest.options == settings["options"]
+        assert found[:3].parameters == [1.1]
+
+    def test_a_run_may_be_made_longer(self, kepler):
+        recorded(kepler, 500)
+        assert not resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
+        assert_same(resume_run("a.run"), kepler.integrate(**STATE, h=H, steps=900))
+
+    def test_resuming_a_finished_run_changes_nothing(self, kepler):
+        recorded(kepler, 500)
+        before = digests("a.run")
+        assert resume_run("a.run").finished
+        assert digests("a.run") == before
+
+    def test_checkpoints_come_by_steps(self, kepler):
+        seen = []
+        recorded(kepler, 100, checkpoint_steps=25, progress=lambda done: seen.append((done, load_run("a.run").steps)))
+        assert {25, 50, 75, 100} <= {done for done, _ in seen}
+        assert all(written >= done - done % 25 for done, written in seen)
+
+    def test_the_manifest_says_what_runs(self, kepler):
+        text = dump_model(Model.from_problem(problem("kepler")))
+        found = recorded(kepler, 10, model=text, certificate={"symplectic": True})
+        about = json.loads(Path("a.run/manifest.json").read_text())
+        assert about["source"]["code"] == kepler.source.code.split("\n")
+        assert about["certificate"] == {"symplectic": True}
+        assert (about["model"], about["steps"], about["builds"][0]["step"]) == (text, 10, 0)
+        assert found.manifest.about()["method"] == kepler.interface.method
+
+    def test_a_certificate_is_a_file_or_an_object_too(self, kepler):
+        Path("c.json").write_text('{"order": 8}')
+        assert recorded(kepler, 1, certificate="c.json").manifest.certificate == {"order": 8}
+        given = SimpleNamespace(to_json=lambda: '{"order": 4}')
+        assert recorded(kepler, 1, certificate=given, folder="b.run").manifest.certificate == {"order": 4}
+        for wrong in ("none.json", {1, 2}):
+            with pytest.raises(StateError, match="the certificate"):
+                recorded(kepler, 1, certificate=wrong, folder="c.run")
+
+    def test_memory_does_not_grow_with_the_length(self, kepler):
+        recorded(kepler, 10, folder="first.run")  # what is imported on the way is not counted
+        tracemalloc.start()
+        found = recorded(kepler, 100_000, rows=2000)
+        sum(len(piece) for piece in found.pieces())
+        found.save("a.npz")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 1.5e6 < 100_000 * (8 * 5 + 4)
+
+    def test_another_compiler_or_processor_is_told_and_kept(self, kepler, monkeypatch):
+        recorded(kepler, 500, stop=StopsAfter(3))
+        step = load_run("a.run").steps
+        monkeypatch.setattr(building, "fingerprint", lambda source, flags: "another")
+        with pytest.warns(RecordingWarning, match=f"from step {step} on other code runs"):
+            resume_run("a.run", steps=600)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = resume_run("a.run", steps=700)
+        assert [build.step for build in found.manifest.builds] == [0, step]
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"every": 0}, "every must be at least 1"),
+            ({"steps": -1}, "steps must be at least 0"),
+            ({"rows": 0}, "rows must be at least 1"),
+            ({"checkpoint_seconds": float("nan")}, "checkpoint_seconds"),
+            ({"checkpoint_steps": 0}, "checkpoint_steps must be at least 1"),
+        ],
+        ids=str,
+    )
+    def test_wrong_numbers_are_named_before_anything_is_written(self, kepler, settings, message):
+        with pytest.raises(StateError, match=message):
+            record_run(start(kepler), "a.run", **{"steps": 3} | settings)
+        assert not Path("a.run").exists()
+
+    def test_a_run_under_way_is_refused(self, kepler):
+        run = start(kepler)
+        run.record(3)
+        with pytest.raises(StateError, match="from its start, but this one has 3 steps"):
+            record_run(run, "a.run", steps=3)
+
+
+class TestFolders:
+    def test_a_folder_with_a_run_is_not_overwritten(self, kepler):
+        recorded(kepler, 10)
+        before = digests("a.run")
+        with pytest.raises(RecordingError, match=r"holds a run already: go on with it .*--resume a\.run"):
+            recorded(kepler, 10)
+        assert digests("a.run") == before
+
+    def test_a_folder_of_something_else_is_left_alone(self, kepler):
+        Path("a.run").mkdir()
+        Path("a.run/thesis.tex").touch()
+        with pytest.raises(RecordingError, match="is not empty"):
+            recorded(kepler, 10)
+        assert [path.name for path in Path("a.run").iterdir()] == ["thesis.tex"]
+
+    def test_what_a_process_left_that_was_killed_at_once_is_no_obstacle(self, kepler):
+        Path("a.run").mkdir()
+        for name in ("states-000000.npz", ".states-000000.npz.x1y2", ".manifest.json.x1y2"):
+            Path("a.run", name).write_text("torn")
+        assert recorded(kepler, 10).finished
+        assert sorted(os.listdir("a.run")) == ["manifest.json", "states-000000.npz"]  # noqa: PTH208  (hidden ones too)
+
+    def test_a_folder_without_a_run_is_named(self, kepler):
+        for act in (load_run, resume_run):
+            with pytest.raises(RecordingError, match=r"'none\.run' holds no recorded run"):
+                act("none.run")
+        with pytest.raises(RecordingError, match="nothing was recorded"):
+            recorded(kepler, 10, folder="no/such/a.run")
+
+    @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove", "remove last"])
+    def test_damage_is_found(self, kepler, damage):
+        recorded(kepler, 300)
+        path = Path("a.run/states-000001.npz")
+        data = path.read_bytes()
+        if damage == "flip":
+            path.write_bytes(data[:1000] + bytes([data[1000] ^ 1]) + data[1001:])
+        elif damage == "remove last":
+            for path in Path("a.run").glob("states-*"):
+                path.unlink()
+        elif damage == "remove":
+            path.unlink()
+        else:
+            path.write_bytes(data[:500] if damage == "truncate" else b"")
+        with pytest.raises(RecordingError, match=r"states-000001\.npz'|holds no states"):
+            np.asarray(load_run("a.run").q)
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 99}', '{"format": 1}'])
+    def test_a_damaged_manifest_is_named(self, kepler, text):
+        recorded(kepler, 10)
+        Path("a.run/manifest.json").write_text(text)
+        with pytest.raises(RecordingError, match=r"manifest\.json' is damaged"):
+            resume_run("a.run")
+
+    def test_two_processes_do_not_record_into_one_folder(self, kepler):
+        def second(done: int) -> None:
+            with pytest.raises(RecordingError, match=r"another process is recording into 'a\.run'"):
+                resume_run("a.run")
+
+        assert recorded(kepler, 500, progress=second).finished
+
+
+class TestReading:
+    @pytest.fixture
+    def pair(self, kepler) -> tuple[RecordedRun, Trajectory]:
+        return recorded(kepler, 300), kepler.integrate(**STATE, h=H, steps=300)
+
+    @pytest.mark.parametrize(
+        "index",
+        [
+            0,
+            -1,
+            64,
+            np.int64(200),
+            slice(None),
+            slice(60, 70),
+            slice(None, None, -13),
+            slice(5, 5),
+            [3, 250, 3, -1],
+            np.arange(301) % 7 == 0,
+            [],
+        ],
+        ids=str,
+    )
+    def test_columns_are_indexed_like_arrays(self, pair, index):
+        lazy, whole = pair
+        for column in COLUMNS:
+            np.testing.assert_array_equal(getattr(lazy, column)[index], getattr(whole, column)[index])
+        np.testing.assert_array_equal(lazy.q[index, 1], whole.q[index, 1])
+        np.testing.assert_array_equal(lazy.q[index, ::-1], whole.q[index, ::-1])
+
+    @pytest.mark.parametrize("index", [301, -302, [0, 301], np.ones(5, dtype=bool), [0.5], "t"], ids=str)
+    def test_rows_that_are_not_there_are_named(self, pair, index):
+        with pytest.raises(IndexError):
+            pair[0].q[index]
+
+    def test_columns_pass_for_arrays(self, pair):
+        lazy, whole = pair
+        assert (lazy.q.shape, lazy.q.ndim, lazy.iterations.dtype, len(lazy.t)) == ((301, 2), 2, np.int32, 301)
+        assert np.abs(lazy.p).max() == np.abs(whole.p).max()
+        np.testing.assert_array_equal(list(lazy.t), whole.t)
+        dask = pytest.importorskip("dask.array")
+        blocks = dask.from_array(lazy.q, chunks=lazy.q.chunks)
+        assert blocks.numblocks == (5, 1)
+        assert blocks.sum(axis=0).compute(scheduler="sync") == pytest.approx(whole.q.sum(axis=0))
+
+    def test_slices_are_trajectories(self, pair):
+        lazy, whole = pair
+        np.testing.assert_array_equal(lazy[100:200:7].energy(), whole.energy()[100:200:7])
+        np.testing.assert_array_equal(lazy.energy(), whole.energy())
+        with pytest.raises(TypeError, match="indexed by slices"):
+            lazy[3]
+
+    def test_a_run_under_way_can_be_read(self, kepler):
+        lengths = []
+
+        def look(done: int) -> None:
+            lengths.append(len(np.asarray(load_run("a.run").q)))
+
+        recorded(kepler, 2000, checkpoint_steps=50, progress=look)
+        assert lengths == sorted(lengths)
+        assert lengths[-1] > lengths[0]
+
+
+class TestFiles:
+    @pytest.fixture(params=["recorded", "in memory"])
+    def saved(self, request, kepler) -> tuple[RecordedRun | Trajectory, Trajectory]:
+        whole = kepler.integrate(**STATE, h=H, steps=300)
+        return (recorded(kepler, 300, certificate={"order": 8}) if request.param == "recorded" else whole), whole
+
+    def test_npz(self, saved):
+        given, whole = saved
+        given.save("a.npz")
+        with np.load("a.npz") as file:
+            assert_same(SimpleNamespace(**{name: file[name] for name in COLUMNS}), whole)
+            assert list(file["coordinates"]) == ["q1", "q2"]
+            assert (file["h"], file["parameters"], file["parameter_names"]) == (H, [1.0], ["mu"])
+            assert str(file["title"]) == whole.stepper.title
+            assert ("certificate" in file) == isinstance(given, RecordedRun)
+
+    def test_csv(self, saved):
+        given, whole = saved
+        given.save("a.csv")
+        assert Path("a.csv").read_text().splitlines()[0] == "t,q1,q2,p_q1,p_q2,iterations"
+        table = np.loadtxt("a.csv", delimiter=",", skiprows=1)
+        np.testing.assert_array_equal(table, np.column_stack([whole.t, whole.q, whole.p, whole.iterations]))
+
+    def test_hdf5(self, saved):
+        h5py = pytest.importorskip("h5py")
+        given, whole = saved
+        given.save("a.h5")
+        with h5py.File("a.h5") as file:
+            assert_same(SimpleNamespace(**{name: file[name][:] for name in COLUMNS}), whole)
+            assert file.attrs["title"] == whole.stepper.title
+            assert json.loads(file.attrs["parameters"]) == {"mu": 1.0}
+            assert file["q"].dims[1][0][:].tolist() == [b"q1", b"q2"]
+            assert ("certificate" in file.attrs) == isinstance(given, RecordedRun)
+
+    def test_zarr_as_xarray_reads_it(self, saved):
+        pytest.importorskip("zarr")
+        xarray = pytest.importorskip("xarray")
+        given, whole = saved
+        for _ in range(2):  # the second replaces the first
+            given.save("a.zarr")
+        dataset = xarray.open_zarr("a.zarr")
+        assert_same(SimpleNamespace(**{name: dataset[name].values for name in COLUMNS}), whole)
+        assert (dataset.q.dims, list(dataset.coordinate)) == (("t", "coordinate"), ["q1", "q2"])
+        assert dataset.attrs["method"] == whole.stepper.interface.method
+
+    def test_tables(self, kepler):
+        pytest.importorskip("xarray")
+        pytest.importorskip("pandas")
+        run = kepler.integrate(**STATE, h=H, steps=30)
+        dataset, frame = run.to_xarray(), run.to_dataframe()
+        np.testing.assert_array_equal(dataset.p.sel(coordinate="q2"), run.p[:, 1])
+        np.testing.assert_array_equal(frame["p_q2"], run.p[:, 1])
+        np.testing.assert_array_equal(frame.index, run.t)
+        assert dataset.attrs == frame.attrs
+        assert dataset.attrs["h"] == H
+
+    def test_a_missing_library_is_named_with_its_extra(self, kepler, monkeypatch):
+        run = kepler.integrate(**STATE, h=H, steps=3)
+        monkeypatch.setitem(export.LIBRARIES, ".h5", "no_such_library")
+        monkeypatch.setitem(sys.modules, "xarray", None)
+        with pytest.raises(MissingLibraryError, match=r"no_such_library, .* pip install 'scvi-codegen\[data\]'"):
+            run.save("a.h5")
+        with pytest.raises(MissingLibraryError, match=r"xarray, .*scvi-codegen\[data\]"):
+            run.to_xarray()
+        assert list(Path().iterdir()) == []
+
+    def test_a_folder_of_something_else_is_not_replaced(self, kepler):
+        pytest.importorskip("zarr")
+        Path("a.zarr").mkdir()
+        with pytest.raises(StateError, match="a folder with something else in it"):
+            kepler.integrate(**STATE, h=H, steps=3).save("a.zarr")
+
+    def test_a_file_that_cannot_be_finished_leaves_the_old_one(self, kepler, monkeypatch):
+        run = kepler.integrate(**STATE, h=H, steps=3)
+        run.save("a.npz")
+        before = Path("a.npz").read_bytes()
+
+        def fails(states: object, path: Path) -> None:
+            path.write_text("half")
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setitem(export.WRITERS, ".npz", fails)
+        with pytest.raises(OSError, match="No space left"):
+            run.save("a.npz")
+        assert [path.name for path in Path().iterdir()] == ["a.npz"]
+        assert Path("a.npz").read_bytes() == before

@@ -1,0 +1,270 @@
+"""States between steps: continuous, of the method's order, the kept ones at both ends; and the solve_ivp-like call."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
+
+from scvi_codegen.advice.motion import solve_motion
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    Composition,
+    ExplicitEuler,
+    Gauss,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.models.problems import problem
+from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.runtime.events import Event
+from scvi_codegen.runtime.stepper import Stepper
+
+METHODS = (SVI(3), SpectralCollocation(4), Composition(8), StoermerVerlet())
+MORE_METHODS = (SCVI(3), Gauss(2), RadauIIA(2), ExplicitEuler(), SVI(4, "gauss-lobatto:5"))
+each_method = pytest.mark.parametrize(
+    "method",
+    [*METHODS, *(pytest.param(method, marks=pytest.mark.full) for method in MORE_METHODS)],
+    ids=lambda method: method.name,
+)
+FLAGS = ("-O0",)
+E = 0.3
+START = {"q": [1 - E, 0.0], "p": [0.0, math.sqrt((1 + E) / (1 - E))]}
+
+
+def ellipse(t: np.ndarray) -> np.ndarray:
+    """(n, 2) exact positions on the orbit from START."""
+    anomaly = t.copy()
+    for _ in range(50):
+        anomaly -= (anomaly - E * np.sin(anomaly) - t) / (1 - E * np.cos(anomaly))
+    return np.stack([np.cos(anomaly) - E, math.sqrt(1 - E**2) * np.sin(anomaly)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def kepler() -> Stepper:
+    return compile_stepper(problem("kepler").system, SVI(4), flags=FLAGS)
+
+
+# Order, continuity, ends.
+
+
+@each_method
+def test_states_between_steps_have_the_order_of_the_method(method):
+    stepper = compile_stepper(problem("kepler").system, method, flags=FLAGS)
+    counts = (40, 80) if stepper.interface.method != "euler" else (400, 800)
+    between, kept = [], []
+    for n in counts:
+        run = stepper.integrate(**START, h=2 * math.pi / n, steps=n)
+        t = np.linspace(0, run.t[-1], 501)
+        between.append(np.abs(run.at(t)[0] - ellipse(t)).max())
+        kept.append(np.abs(run.q - ellipse(run.t)).max())
+    expected = method.order if method.order is not None else 1
+    assert between[1] > 1e-13
+    assert math.log2(between[0] / between[1]) == pytest.approx(expected, abs=0.6)
+    assert between[1] < 1.3 * kept[1]
+
+
+def test_cubics_through_positions_and_velocities_are_worse(kepler):
+    run = kepler.integrate(**START, h=2 * math.pi / 40, steps=40)
+    velocities = [kepler.velocity(q, p) for q, p in zip(run.q, run.p, strict=True)]
+    t = np.linspace(0, run.t[-1], 501)
+    cubic = np.abs(CubicHermiteSpline(run.t, run.q, velocities)(t) - ellipse(t)).max()
+    assert cubic > 1000 * np.abs(run.at(t)[0] - ellipse(t)).max()
+
+
+@each_method
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_states_are_those_kept_at_both_ends_and_nothing_jumps(compiled, sample, method, h):
+    q, p = sample("driven-duffing").state
+    run = compiled("driven-duffing", method).integrate(q, p, h=h, steps=20, t=0.4)
+    assert np.array_equal(run.at(run.t)[0], run.q)
+    assert np.array_equal(run.at(run.t)[1], run.p)
+    for near in (np.nextafter(run.t[1:], run.t[:-1]), np.nextafter(run.t[1:-1], run.t[2:])):
+        kept = run.q[1 : 1 + len(near)], run.p[1 : 1 + len(near)]
+        for value, state in zip(run.at(near), kept, strict=True):
+            assert np.abs(value - state).max() < 1e-14
+
+
+def test_any_order_any_shape_and_any_distance_of_kept_states(kepler):
+    every_one = kepler.integrate(**START, h=0.1, steps=100)
+    t = np.random.default_rng(3).uniform(0.0, 10.0, 400)
+    q, p = every_one.at(t)
+    assert q.shape == p.shape == (400, 2)
+    single = [every_one.at(time) for time in t[:20]]
+    assert np.array_equal([state[0] for state in single], q[:20])
+    assert single[0][0].shape == (2,)
+    for every in (7, 100):
+        few = kepler.integrate(**START, h=0.1, steps=100, every=every)
+        inside = t <= few.t[-1]
+        assert np.abs(few.at(t[inside])[0] - q[inside]).max() < 1e-13
+
+
+def test_options_of_the_run_hold_between_steps(kepler):
+    rough = kepler.integrate(**START, h=0.3, steps=10, options=SolverOptions(tolerance=1e-3))
+    fine = kepler.integrate(**START, h=0.3, steps=10)
+    t = 0.3 * np.arange(10) + 0.29
+    assert np.abs(rough.at(t)[0] - fine.at(t)[0]).max() > 1e-10
+
+
+def test_times_outside_and_lost_grids_are_refused(kepler):
+    run = kepler.integrate(**START, h=0.1, steps=10)
+    with pytest.raises(StateError, match=r"t = 1\.5 is outside .* from 0 to 1"):
+        run.at([0.5, 1.5])
+    with pytest.raises(StateError, match="nan"):
+        run.at(math.nan)
+    chosen = kepler.integrate(**START, h=0.1, steps=10, t_eval=[0.123, 0.456, 0.9])
+    with pytest.raises(StateError, match="t_eval"):
+        chosen.at(0.5)
+
+
+# t_eval.
+
+
+@pytest.mark.parametrize("h", [0.1, -0.1])
+def test_states_at_given_times_are_those_of_the_dense_output(kepler, h):
+    run = kepler.integrate(**START, h=h, steps=10_000)
+    times = h * np.sort(np.random.default_rng(5).uniform(0, 10_000, 300))
+    times[[0, -1]] = 0.0, run.t[-1]
+    chosen = kepler.integrate(**START, h=h, steps=10_000, t_eval=times)
+    assert np.array_equal(chosen.t, times)
+    assert np.array_equal(chosen.q, run.at(times)[0])
+    assert np.array_equal(chosen.p, run.at(times)[1])
+    assert chosen.iterations.sum() == run.iterations.sum()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"t_eval": [0.3, 0.2]}, "sorted"),
+        ({"t_eval": [0.3, 2.2]}, "outside"),
+        ({"t_eval": [[0.3]]}, "shape"),
+        ({"t_eval": [0.3], "every": 2}, "not both"),
+    ],
+)
+def test_given_times_are_checked(kepler, arguments, words):
+    with pytest.raises(StateError, match=words):
+        kepler.integrate(**START, h=0.1, steps=10, **arguments)
+
+
+def test_what_was_kept_before_a_failure_is_there():
+    runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
+    stepper = compile_stepper(runaway, SVI(3), flags=FLAGS)
+    with pytest.raises(StepFailedError) as failure:
+        stepper.integrate([1.0], [1.0], h=0.1, steps=100, t_eval=np.linspace(0, 10, 101))
+    assert 5 < len(failure.value.recorded) < 50
+
+
+# The call that is like solve_ivp.
+
+
+def test_a_motion_agrees_with_solve_ivp():
+    """The same arguments, attributes and shapes; the pendulum from rest at 2, four turning points."""
+    asked = np.linspace(0, 10, 33)
+    system = problem("planar-pendulum").system
+    ours = solve_motion(
+        system,
+        (0, 10),
+        [2.0, 0.0],
+        h=0.2,
+        t_eval=asked,
+        dense_output=True,
+        events=["q", Event("p_q", 1)],
+        parameters={"g": 1.0, "m": 1.0, "l": 1.0},
+    )
+
+    def angle(t, y):
+        return y[0]
+
+    def turning(t, y):
+        return y[1]
+
+    turning.direction = 1
+    theirs = solve_ivp(
+        lambda t, y: [y[1], -math.sin(y[0])],
+        (0, 10),
+        [2.0, 0.0],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+        t_eval=asked,
+        dense_output=True,
+        events=[angle, turning],
+    )
+    assert (ours.status, ours.success) == (theirs.status, theirs.success) == (0, True)
+    assert np.array_equal(ours.t, theirs.t)
+    assert ours.y.shape == theirs.y.shape
+    assert np.abs(ours.y - theirs.y).max() < 1e-9
+    assert ours.sol(3.3).shape == theirs.sol(3.3).shape
+    assert np.abs(ours.sol(asked + 0.0) - theirs.sol(asked)).max() < 1e-6
+    theirs_turning = theirs.t_events[1][theirs.t_events[1] > 0]  # SciPy counts the root at the start
+    assert np.abs(ours.t_events[0] - theirs.t_events[0]).max() < 1e-9
+    assert np.abs(ours.t_events[1] - theirs_turning).max() < 1e-9
+    assert ours.y_events[0].shape == theirs.y_events[0].shape
+
+
+def test_a_motion_ends_at_a_terminal_event(kepler):
+    half = solve_motion(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=Event("q2", -1, terminal=True))
+    assert (half.status, half.success) == (1, True)
+    assert "'q2'" in half.message
+    assert half.t[-1] == pytest.approx(math.pi, abs=1e-8)
+    assert half.t_events[0].tolist() == [half.t[-1]]
+    assert np.array_equal(half.y[:, -1], half.y_events[0][0])
+    chosen = solve_motion(
+        kepler,
+        (0, 100),
+        [*START["q"], *START["p"]],
+        h=0.1,
+        events=Event("q2", -1, terminal=True),
+        t_eval=np.arange(0, 100, 0.5),
+        dense_output=True,
+    )
+    assert np.array_equal(chosen.t, np.arange(0, math.pi, 0.5))
+    assert np.array_equal(chosen.sol(half.t[-1]), half.y[:, -1])
+
+
+def test_a_motion_runs_backward_and_its_last_step_ends_the_span(kepler):
+    back = solve_motion(kepler, (1.0, -2.0), [*START["q"], *START["p"]], h=0.07, dense_output=True)
+    assert back.t[0] == 1.0
+    assert back.t[-1] == pytest.approx(-2.0, abs=1e-15)
+    assert np.abs(back.sol(-0.5)[:2] - ellipse(np.array([-1.5]))[0]).max() < 1e-6
+
+
+def test_a_motion_says_that_a_step_failed():
+    runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
+    failed = solve_motion(compile_stepper(runaway, SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
+    assert (failed.status, failed.success) == (-1, False)
+    assert "smaller step" in failed.message
+    assert failed.y.shape == (2, len(failed.t))
+
+
+def test_a_motion_chooses_its_step_for_a_tolerance():
+    y0 = [*START["q"], *START["p"]]
+    motion = solve_motion(problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=SVI(4))
+    error = np.abs(motion.y[:2, -1] - ellipse(motion.t[-1:])[0]).max()
+    assert 1e-11 < error < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"t_span": (0, 0)}, "nothing to integrate"),
+        ({"t_span": (0,)}, "two times"),
+        ({"y0": [1.0, 2.0, 3.0]}, "positions and then momenta"),
+        ({"y0": [1.0, 2.0]}, "shape"),
+        ({"h": None}, "must be given"),
+        ({"method": SVI(3)}, "has its method"),
+        ({"h": math.inf}, "inf"),
+    ],
+)
+def test_arguments_of_a_motion_are_checked(kepler, arguments, words):
+    usual = {"t_span": (0, 1), "y0": [*START["q"], *START["p"]], "h": 0.1}
+    with pytest.raises(StateError, match=words):
+        solve_motion(kepler, **(usual | arguments))

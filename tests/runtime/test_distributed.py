@@ -1,0 +1,160 @@
+"""Ensembles over a cluster equal those of one machine, also when a worker is killed on the way."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
+from scvi_codegen.methods import SVI
+from scvi_codegen.models.problems import problem
+from scvi_codegen.runtime.distributed import _slices, _stepper, integrate_ensemble
+from scvi_codegen.runtime.stepper import Stepper
+
+COUNT = 70
+
+
+@pytest.fixture(scope="module")
+def kepler() -> Stepper:
+    return compile_stepper(problem("kepler").system, SVI(5), flags=QUICK_FLAGS)
+
+
+def states() -> tuple[np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(1)
+    q = np.array([1.0, 0.0]) + 0.1 * generator.uniform(-1, 1, (COUNT, 2))
+    return q, np.array([0.0, 1.1]) + 0.1 * generator.uniform(-1, 1, (COUNT, 2))
+
+
+@pytest.fixture(scope="module")
+def distributed() -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return pytest.importorskip("distributed", reason="needs the extra 'distributed'")
+
+
+@pytest.fixture(scope="module")
+def cluster(distributed: Any) -> Iterator[Any]:
+    """Two worker processes of one thread."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
+    ) as cluster:
+        yield cluster
+
+
+def test_parts_are_full_registers_and_cover_everything():
+    for count, blocks in ((70, 4), (70, 100), (1, 3), (64, 8), (1000, 3)):
+        parts = list(_slices(count, blocks))
+        assert len(parts) <= blocks
+        assert [j for part in parts for j in range(count)[part]] == list(range(count))
+        assert all((part.stop - part.start) % 8 == 0 for part in parts[:-1])
+
+
+class TestCluster:
+    def test_in_this_process_by_default(self, distributed: Any, kepler: Stepper):
+        q, p = states()
+        mu = np.linspace(0.9, 1.1, COUNT)
+        arguments = {"h": 0.05, "steps": 100, "every": 30, "t": 1.0, "parameters": {"mu": mu}}
+        here = kepler.integrate_ensemble(q, p, **arguments)
+        done: list[int] = []
+        result = integrate_ensemble(kepler, q, p, **arguments, progress=done.append)
+        for name in ("t", "q", "p", "status", "steps", "parameters"):
+            assert np.array_equal(getattr(result, name), getattr(here, name))
+        assert done[-1] == COUNT
+        assert done == sorted(done)
+
+    def test_faults_are_found_before_anything_is_sent(self, kepler: Stepper):
+        q, p = states()
+        for faults in ({"h": 0.0}, {"steps": -1}, {"blocks": 0}, {"parameters": {"nu": 1.0}}):
+            with pytest.raises(StateError):
+                integrate_ensemble(kepler, q, p, **({"h": 0.1, "steps": 1} | faults))  # type: ignore[arg-type]
+
+    def test_failures_of_trajectories_come_back(self, distributed: Any, cluster: Any, kepler: Stepper):
+        q, p = states()
+        mu = np.where(np.arange(COUNT) == 5, 1e9, 1.0)  # the sixth falls into the centre
+        result = integrate_ensemble(
+            kepler, q, p, h=0.05, steps=50, parameters={"mu": mu}, address=cluster.scheduler_address, blocks=3
+        )
+        assert np.flatnonzero(~result.ok).tolist() == [5]
+        assert result.steps[5] < 50
+
+    def test_a_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: Stepper):
+        q, p = states()
+        arguments = {"h": 0.05, "steps": 150_000, "every": 50_000}
+        here = kepler.integrate_ensemble(q, p, **arguments)
+        pids = [worker.pid for worker in cluster.workers.values()]
+        killed: list[int] = []
+
+        def kill_one(done: int) -> None:
+            if not killed:
+                killed.append(done)
+                os.kill(pids[0], signal.SIGKILL)
+
+        result = integrate_ensemble(
+            kepler, q, p, **arguments, address=cluster.scheduler_address, blocks=9, progress=kill_one
+        )
+        assert 0 < killed[0] < COUNT
+        assert result.ok.all()
+        assert np.array_equal(result.q, here.q)
+        assert np.array_equal(result.p, here.p)
+
+    def test_a_worker_compiles_the_source_into_its_own_cache(self, distributed: Any, kepler: Stepper, tmp_path: Path):
+        q, p = states()
+        with distributed.LocalCluster(
+            n_workers=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=50,
+            env={"SCVI_CODEGEN_CACHE": str(tmp_path)},
+        ) as cluster:
+            result = integrate_ensemble(kepler, q, p, h=0.05, steps=20, address=cluster.scheduler_address)
+        assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
+        assert any(tmp_path.iterdir())
+
+    def test_nothing_is_left_running(self, distributed: Any, kepler: Stepper):
+        q, p = states()
+        counts = []
+        for _ in range(3):
+            integrate_ensemble(kepler, q, p, h=0.05, steps=20)
+            files = list(Path("/proc/self/fd").iterdir()) if sys.platform == "linux" else []
+            counts.append((threading.active_count(), len(files)))
+        assert counts[2] == counts[1]
+
+    def test_an_interruption_calls_the_rest_off(self, distributed: Any, cluster: Any, kepler: Stepper):
+        def interrupt(done: int) -> None:
+            raise KeyboardInterrupt
+
+        q, p = states()
+        with pytest.raises(KeyboardInterrupt):
+            integrate_ensemble(
+                kepler, q, p, h=0.05, steps=50_000, address=cluster.scheduler_address, blocks=9, progress=interrupt
+            )
+        with distributed.Client(cluster.scheduler_address) as client:
+            end = time.monotonic() + 10.0
+            while any(client.processing().values()) and time.monotonic() < end:
+                time.sleep(0.05)
+            assert not any(client.processing().values())
+
+
+def test_workers_compile_the_source_once_and_keep_it(kepler: Stepper):
+    pickled = pickle.dumps(kepler)
+    assert kepler.source.code.encode() in pickled
+    assert _stepper(pickled) is _stepper(pickled)
+
+
+def test_without_the_extra_the_message_says_how_to_get_it(kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r"pip install 'scvi-codegen\[distributed\]'"):
+        integrate_ensemble(kepler, *states(), h=0.1, steps=1)

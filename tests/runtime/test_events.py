@@ -1,0 +1,398 @@
+"""Zero crossings: none missed, none twice, at exact times, in the order of the run."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import sympy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import ellipk
+from sympy.physics.mechanics import dynamicsymbols
+
+from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.errors import EventError, ExpressionError, StateError, StepFailedError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    Composition,
+    Gauss,
+    LobattoIIIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+from scvi_codegen.methods.method import Method
+from scvi_codegen.models.problems import problem
+from scvi_codegen.runtime.events import Event
+from scvi_codegen.runtime.stepper import Stepper
+
+METHODS = (SVI(3), SpectralCollocation(6), Composition(8))
+MORE_METHODS = (SCVI(3), Gauss(3), RadauIIA(2), LobattoIIIA(3), StoermerVerlet(), SVI(4), SVI(4, "gauss-lobatto:5"))
+each_method = pytest.mark.parametrize(
+    "method",
+    [*METHODS, *(pytest.param(method, marks=pytest.mark.full) for method in MORE_METHODS)],
+    ids=lambda method: method.name,
+)
+FLAGS = ("-O0",)
+FREE = LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
+
+
+def compiled_plainly(system: MechanicalSystem, method: Method) -> Stepper:
+    """Most of the time of these tests is the compiler's: each list of events is compiled."""
+    return compile_stepper(system, method, flags=FLAGS)
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Stepper:
+    return compiled_plainly(problem("planar-pendulum").system, SVI(8))
+
+
+@pytest.fixture(scope="module")
+def kepler() -> Stepper:
+    return compiled_plainly(problem("kepler").system, SVI(8))
+
+
+def at_perihelion(e: float) -> dict[str, list[float]]:
+    return {"q": [1 - e, 0.0], "p": [0.0, math.sqrt((1 + e) / (1 - e))]}
+
+
+def crossings_in_one_step(function: str, h: float = 1.0) -> np.ndarray:
+    """Of a function of t alone, along one step from 0."""
+    stepper = compile_stepper(FREE, StoermerVerlet(), flags=FLAGS)
+    return stepper.integrate([0.0], [1.0], h=h, steps=1, events=function).events[0].t
+
+
+# Exact times.
+
+
+def test_the_period_of_the_pendulum_is_an_elliptic_integral(pendulum):
+    amplitude, rate = 2.5, math.sqrt(9.81)
+    parameters = {"m": 1.0, "l": 1.0, "g": 9.81}
+    run = pendulum.integrate([amplitude], [0.0], h=0.1, steps=1000, parameters=parameters, events=Event("q", -1))
+    period = 4 * ellipk(math.sin(amplitude / 2) ** 2) / rate
+    expected = period * (0.25 + np.arange(len(run.events[0])))
+    assert len(expected) == math.floor(100.0 / period + 0.75)
+    assert np.abs(run.events[0].t - expected).max() < 2e-12
+    assert np.abs(run.events[0].q).max() < 1e-14
+
+
+def test_apsides_of_kepler_are_at_exact_anomalies(kepler):
+    """Radial velocity 0 in velocities and in momenta; latus rectum where the true anomaly is a right angle."""
+    e = 0.5
+    apsides = ["q1*q1_dot + q2*q2_dot", "q1*p_q1 + q2*p_q2", Event("q1", -1)]
+    run = kepler.integrate(**at_perihelion(e), h=0.2, steps=200, events=apsides)
+    velocities, momenta, latus = run.events
+    assert np.abs(velocities.t - math.pi * np.arange(1, 13)).max() < 2e-12
+    assert np.abs(velocities.t - momenta.t).max() < 1e-13
+    assert np.abs(np.hypot(*velocities.q.T) - np.tile([1 + e, 1 - e], 6)).max() < 1e-13
+    anomaly = 2 * math.atan(math.sqrt((1 - e) / (1 + e)))
+    assert np.abs(latus.t - (anomaly - e * math.sin(anomaly)) - 2 * math.pi * np.arange(len(latus))).max() < 2e-12
+
+
+@each_method
+def test_times_converge_with_the_order_of_the_method_and_energy_stays(method):
+    stepper = compiled_plainly(problem("kepler").system, method)
+    errors, energies = [], []
+    for n in (64, 128) if method.order < 8 else (40, 80):
+        run = stepper.integrate(**at_perihelion(0.3), h=2 * math.pi / n, steps=n, events=["q2"])
+        found = run.events[0]
+        energy = stepper.energy(found.q, found.p)
+        errors.append(abs(found.t[0] - math.pi))
+        energies.append((np.abs(energy + 0.5).max(), np.abs(run.energy() + 0.5).max()))
+    assert errors[1] > 1e-13
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.5)
+    assert all(at <= 1.5 * along for at, along in energies)
+
+
+def test_states_at_crossings_are_those_of_the_dense_output(kepler):
+    run = kepler.integrate(**at_perihelion(0.4), h=0.25, steps=100, events="q1 - q2")
+    q, p = run.at(run.events[0].t)
+    assert np.abs(q - run.events[0].q).max() < 1e-13
+    assert np.abs(p - run.events[0].p).max() < 1e-13
+
+
+# None missed.
+
+
+@pytest.fixture(scope="module")
+def polynomials() -> Stepper:
+    """Functions of time whose roots are parameters, of degree 1 to 4, 8, and one with two roots near each other."""
+    names = "abcdefgh"
+    factors = [f"(t - {name})" for name in names]
+    system = LagrangianSystem.from_text(
+        name="free particle", coordinates=["q"], lagrangian="q_dot**2/2", parameters=dict.fromkeys([*names, "s"], 1.0)
+    )
+    functions = ["s*" + "*".join(factors[:degree]) for degree in (1, 2, 3, 4, 8)]
+    near = "s*((t - a)**2 - b**2)*(2 + t)*(3 - t)"
+    return compile_stepper(system, StoermerVerlet(), flags=FLAGS, events=[*functions, near])
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(st.integers(1, 199), min_size=4, max_size=4, unique=True),
+    st.sampled_from([1.0, -7.0, 1e-30]),
+    st.sampled_from([1.0, -1.0]),
+)
+def test_all_roots_of_polynomials_of_degree_four_are_found(polynomials, numbers, scale, h):
+    roots = h * np.array(numbers) / 200
+    values = dict(zip("abcd", roots, strict=True)) | {"s": scale}
+    run = polynomials.integrate([0.0], [1.0], h=h, steps=1, parameters=values)
+    for degree, found in enumerate(run.events[:4], 1):
+        assert len(found) == degree
+        assert np.abs(found.t - h * np.sort(np.abs(roots[:degree]))).max() < 1e-9
+
+
+def test_hardly_any_root_of_polynomials_of_degree_eight_is_missed(polynomials):
+    """Eight roots within one step are more than polynomials of degree 4 can promise to see: a measured share."""
+    generator = np.random.default_rng(8)
+    found = 0
+    for _ in range(500):
+        roots = dict(zip("abcdefgh", generator.choice(np.arange(1, 200), 8, replace=False) / 200, strict=True))
+        count = len(polynomials.integrate([0.0], [1.0], h=1.0, steps=1, parameters=roots).events[4])
+        assert count % 2 == 0
+        found += count
+    assert found > 0.98 * 500 * 8
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0.15, 0.85), st.integers(1, 7), st.sampled_from([1.0, -1.0]))
+def test_pairs_of_roots_are_found_however_near(polynomials, middle, exponent, sign):
+    distance = 10.0**-exponent
+    values = {"a": middle, "b": distance, "s": sign}
+    found = polynomials.integrate([0.0], [1.0], h=1.0, steps=1, parameters=values).events[5]
+    assert np.abs(found.t - [middle - distance, middle + distance]).max() < 1e-15 / distance
+
+
+@pytest.mark.parametrize("function", ["cos(6*t) - 0.97", "exp(t) - 1.8 - 0.05*sin(20*t)", "sin(3*pi*t + 0.1)*(t + 1)"])
+def test_crossings_of_other_functions_are_found(function):
+    t = np.linspace(0, 1, 100_001)
+    g = sympy.lambdify(sympy.Symbol("t"), sympy.sympify(function))(t)
+    expected = t[1:][np.diff(np.sign(g)) != 0]
+    found = crossings_in_one_step(function)
+    assert len(found) == len(expected)
+    assert np.abs(found - expected).max() < 1e-5
+
+
+def test_a_graze_is_two_crossings_or_none():
+    """The angle just below and just above its amplitude, which lies within a step."""
+    system = LagrangianSystem.from_text(
+        name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", parameters={"level": 0.0}
+    )
+    stepper = compile_stepper(system, SVI(8), flags=FLAGS, events=["p_q", "q - level"])
+    start = {"q": [0.0], "p": [1.0], "h": 0.37, "steps": 5}
+    (turn, _) = stepper.integrate(**start).events
+    top = float(turn.q[0, 0])
+    for depth in (1e-4, 1e-8, 1e-12):
+        below, above = (
+            stepper.integrate(**start, parameters={"level": top + side * depth}).events[1].t for side in (-1, 1)
+        )
+        assert (len(below), len(above)) == (2, 0)
+        assert np.abs(below - turn.t[0]).max() == pytest.approx(math.sqrt(2 * depth / math.sin(top)), 1e-3)
+
+
+def test_several_functions_of_one_step_come_in_their_order_and_ends_are_not_doubled():
+    functions = ["t - 0.25", "t - 0.5", "t - 0.75", "(t - 0.5)*(t - 1)"]
+    run = compile_stepper(FREE, SVI(2), flags=FLAGS).integrate([0.0], [1.0], h=0.25, steps=8, events=functions)
+    assert [found.t.tolist() for found in run.events] == [[0.25], [0.5], [0.75], [0.5, 1.0]]
+
+
+def test_a_root_at_the_start_is_none_and_one_at_the_end_is_found():
+    stepper = compile_stepper(FREE, SVI(2), flags=FLAGS)
+    run = stepper.integrate([0.0], [1.0], h=0.25, steps=8, events=["q", "q - 2", "t"])
+    assert [found.t.tolist() for found in run.events] == [[], [2.0], []]
+
+
+def test_more_crossings_than_one_call_has_room_for(pendulum):
+    run = pendulum.integrate([0.1], [0.0], h=0.5, steps=3000, events=["sin(8*t)", "cos(8*t)"])
+    for found, first in zip(run.events, (0.0, 0.5), strict=True):
+        expected = math.pi / 8 * np.arange(first, 1500 * 8 / math.pi)
+        expected = expected[expected > 0]
+        assert np.abs(found.t - expected).max() < 1e-11
+
+
+# Directions, ends, restarts.
+
+
+def test_directions_are_those_of_the_run(pendulum):
+    events = [Event("q", 1), Event("q", -1), Event("q")]
+    run = pendulum.integrate([0.5], [0.0], h=0.1, steps=400, events=events)
+    rising, falling, both = run.events
+    assert (rising.p > 0).all()
+    assert (falling.p < 0).all()
+    assert np.array_equal(np.sort(np.concatenate([rising.t, falling.t])), both.t)
+    back = pendulum.integrate(run.q[-1], run.p[-1], h=-0.1, steps=400, t=run.t[-1], events=events)
+    assert np.abs(back.events[2].t[::-1] - both.t).max() < 1e-11
+    assert (back.events[0].p < 0).all()  # rises as the run goes
+
+
+@pytest.mark.parametrize("every", [1, 7, 1000])
+def test_a_terminal_event_ends_the_run_at_its_crossing(pendulum, every):
+    plain = pendulum.integrate([0.5], [0.0], h=0.1, steps=400)
+    run = pendulum.integrate([0.5], [0.0], h=0.1, steps=400, every=every, events=["p_q", Event("q", terminal=3)])
+    last = run.events[1]
+    assert len(last) == 3
+    assert run.t[-1] == last.t[-1]
+    assert np.array_equal(run.q[-1], last.q[-1])
+    assert run.ended_by == Event("q", terminal=3)
+    assert np.array_equal(run.q[:-1], plain.q[: len(run) * every : every][: len(run) - 1])
+    assert run.t[-2] < run.t[-1] < run.t[-2] + 0.1 * every
+    assert run.events[0].t[-1] < last.t[-1]
+
+
+def test_the_run_stands_before_the_step_in_which_it_was_ended(pendulum):
+    run = pendulum.with_events(Event("q", terminal=True)).start([0.5], [0.0], h=0.1)
+    first = run.record(400)
+    assert run.t == first.t[-2]
+    assert run.record(400).t.tolist() == [first.t[-2], first.t[-1]]
+
+
+def test_a_run_from_a_crossing_does_not_find_it_again(pendulum):
+    q, p, t, found = [0.5], [0.0], 0.0, []
+    whole = pendulum.integrate(q, p, h=0.1, steps=400, events="q").events[0].t
+    for _ in whole:
+        run = pendulum.integrate(q, p, h=0.1, steps=400, t=t, events=Event("q", terminal=True))
+        q, p, t = run.q[-1], run.p[-1], run.t[-1]
+        found.append(t)
+    assert np.abs(found - whole).max() < 1e-11
+
+
+def test_a_terminal_event_before_a_step_that_fails_is_met():
+    runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
+    stepper = compiled_plainly(runaway, SVI(3))
+    with pytest.raises(StepFailedError) as failure:
+        stepper.integrate([1.0], [1.0], h=0.1, steps=100, events="q - 5")
+    assert len(failure.value.recorded.events[0]) == 1
+    run = stepper.integrate([1.0], [1.0], h=0.1, steps=100, events=Event("q - 5", terminal=True))
+    assert run.q[-1, 0] == pytest.approx(5, abs=1e-14)
+
+
+def test_states_are_the_same_bits_with_events_and_without(kepler):
+    start = at_perihelion(0.5) | {"h": 0.1, "steps": 10_000}
+    plain, watched = kepler.integrate(**start), kepler.integrate(**start, events="q1")
+    for name in ("t", "q", "p", "iterations"):
+        assert np.array_equal(getattr(plain, name), getattr(watched, name))
+    every = kepler.integrate(**start, every=9), kepler.integrate(**start, every=9, events="q1")
+    for name in ("t", "q", "p", "iterations"):
+        assert np.array_equal(getattr(every[0], name), getattr(every[1], name))
+    assert np.array_equal(plain.crossings("q1")[0].t, watched.events[0].t)
+    with pytest.raises(StateError, match="every > 1"):
+        every[0].crossings("q1")
+
+
+def test_crossings_are_found_afterwards_up_to_the_event_that_ended_the_run(kepler):
+    run = kepler.integrate(**at_perihelion(0.5), h=0.3, steps=100, events=["q1", Event("q2 + q1/9", terminal=3)])
+    again = run.crossings(["q1", "q2 + q1/9"])
+    for found, expected in zip(again, run.events, strict=True):
+        assert np.abs(found.t - expected.t).max() < 1e-13
+
+
+def test_explicit_time_and_parameters(compiled):
+    duffing = compiled("driven-duffing", SVI(4))
+    run = duffing.integrate([0.6], [-0.3], h=0.1, steps=100, t=3.0, events="sin(omega*t)", parameters={"omega": 2.0})
+    assert np.abs(run.events[0].t - math.pi / 2 * np.arange(2, 9)).max() < 1e-13
+
+
+def test_hamiltonians_call_their_momenta_as_they_like():
+    system = HamiltonianSystem.from_text(
+        name="pendulum", coordinates=["q"], momenta=["J"], hamiltonian="J**2/2 - cos(q)"
+    )
+    run = compiled_plainly(system, SVI(4)).integrate([1.0], [0.0], h=0.1, steps=100, events=["J", "q_dot", "q"])
+    twin = compiled_plainly(problem("planar-pendulum").system, SVI(4)).with_events(["p_q", "q"])
+    expected = twin.integrate([1.0], [0.0], h=0.1, steps=100).events
+    assert np.array_equal(run.events[0].t, run.events[1].t)
+    assert np.abs(run.events[0].t - expected[0].t).max() < 1e-12
+    assert np.abs(run.events[2].t - expected[1].t).max() < 1e-12
+
+
+def test_point_vortices_have_no_velocity_kernel_of_their_own():
+    vortices = problem("point-vortices")
+    stepper = compiled_plainly(vortices.system, SVI(3))
+    name = stepper.coordinates[0]
+    run = stepper.integrate(vortices.q, vortices.p, h=0.05, steps=200, events=[f"{name}_dot", name])
+    q, p = run.events[0].q, run.events[0].p
+    rates = [stepper.velocity(*state)[0] for state in zip(q, p, strict=True)]
+    assert len(rates) > 0
+    assert np.abs(rates).max() < 1e-12
+
+
+def test_sympy_expressions_in_functions_of_time():
+    theta, t = dynamicsymbols("theta"), dynamicsymbols._t
+    system = LagrangianSystem.from_sympy(
+        name="pendulum", lagrangian=theta.diff(t) ** 2 / 2 + sympy.cos(theta), coordinates=[theta]
+    )
+    events = [theta.diff(t) * theta, "theta_dot*theta", sympy.Symbol("theta") - 0.1]
+    run = compiled_plainly(system, SVI(4)).integrate([1.0], [0.0], h=0.1, steps=100, events=events)
+    assert np.array_equal(run.events[0].t, run.events[1].t)
+    assert np.abs(run.events[2].q - 0.1).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    ("event", "error", "words"),
+    [
+        ("qq", ExpressionError, "did you mean 'q'"),
+        ("q - ", ExpressionError, "column"),
+        (sympy.Symbol("z"), EventError, "'z'"),
+        ("2*m - m - m", EventError, "constant"),
+        (sympy.Abs(sympy.Symbol("q")), EventError, "not differentiable"),
+        (3.0, EventError, "not 3.0"),
+        ("log(q)", EventError, "not finite"),
+    ],
+)
+def test_errors_say_which_symbol_or_function(pendulum, event, error, words):
+    with pytest.raises(error, match=words):
+        pendulum.integrate([0.5], [0.0], h=0.1, steps=100, events=event)
+
+
+@pytest.mark.parametrize(("arguments", "error"), [({"direction": 2}, EventError), ({"terminal": -1}, StateError)])
+def test_events_are_checked(arguments, error):
+    with pytest.raises(error):
+        Event("q", **arguments)
+
+
+def test_a_stepper_with_events_is_pickled_and_keeps_them(pendulum):
+    watched = pickle.loads(pickle.dumps(pendulum.with_events([Event("q", 1), "p_q"])))
+    assert watched.events == (Event("q", 1), Event("p_q"))
+    assert [len(found) for found in watched.integrate([0.5], [0.0], h=0.1, steps=200).events] == [3, 6]
+    assert pendulum.events == ()
+    assert watched.with_events(()).source == pendulum.source
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize(
+    ("name", "method", "events"),
+    [
+        ("kepler", SVI(4), ["q1*q2_dot - 1/sqrt((q1**2 + q2**2)**3)", "q2"]),
+        ("planar-pendulum", StoermerVerlet(), ["sin(t)"]),
+        ("double-pendulum", SCVI(2), ["t*theta1_dot", "sqrt(1 + theta2**2)**-5 - p_theta1"]),
+    ],
+)
+def test_the_text_is_the_plain_one_and_more_and_strict_compilers_take_it(compiler, name, method, events, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed")
+    system = problem(name).system
+    plain, _ = generate_source(system, method, prefix="watched")
+    source, _ = generate_source(system, method, prefix="watched", events=events)
+    assert source.code.startswith(plain.code)
+    assert source.declarations in source.header
+    assert source == generate_source(system, method, prefix="watched", events=events)[0]
+    (tmp_path / "watched.h").write_text(source.header)
+    (tmp_path / "watched.c").write_text(source.code)
+    strict = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c watched.c".split()  # noqa: SIM905  (as typed)
+    result = subprocess.run([compiler, *strict], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_a_stepper_may_be_compiled_with_events():
+    stepper = compile_stepper(FREE, SVI(2), flags=FLAGS, events=Event("q - 1", terminal=True))
+    assert "free_particle" in stepper.source.prefix
+    assert stepper.integrate([0.0], [1.0], h=0.3, steps=10).t[-1] == pytest.approx(1.0, abs=1e-15)
+    assert stepper.integrate([0.0], [1.0], h=0.3, steps=10, events=()).t[-1] == pytest.approx(3.0)

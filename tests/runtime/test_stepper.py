@@ -1,0 +1,527 @@
+"""Steps, runs, transforms and errors of a compiled stepper, as a user meets them."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import oracle
+import pytest
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
+from scvi_codegen.models.problems import problem
+from scvi_codegen.native.binding import SolverOptions
+
+METHODS = (
+    SVI(3),
+    SCVI(3),
+    SCVI(2, variational=False),
+    SpectralCollocation(2),
+    RadauIIA(2),
+    StoermerVerlet(),
+    ExplicitEuler(),
+)
+SYMMETRIC = (SVI(3), SVI(2, "gauss-lobatto:3"), StoermerVerlet(), Gauss(2))
+WITH_ACTION = (SVI(2, "gauss-legendre:3"), SCVI(3), Gauss(2), StoermerVerlet())
+each_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+each_action = pytest.mark.parametrize("method", WITH_ACTION, ids=lambda method: method.name)
+KEPLER = problem("kepler")
+STATE = KEPLER.q, KEPLER.velocity
+
+
+def same(left, right):
+    """Bit for bit."""
+    return all(np.array_equal(getattr(left, name), getattr(right, name)) for name in ("t", "q", "p", "iterations"))
+
+
+@pytest.fixture
+def kepler(compiled):
+    return compiled("kepler", SVI(3))
+
+
+# Steps and runs.
+
+
+@each_method
+def test_a_run_is_repeated_steps(sample, compiled, method):
+    stepper, (q, p) = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    run = stepper.integrate(q, p, h=0.05, steps=40, t=0.3)
+    for k in range(40):
+        q, p = stepper.step(q, p, 0.05, 0.3 + k * 0.05)
+    # Forty roundings of plain steps, amplified along the trajectory; runs keep what rounding cuts off.
+    assert np.abs(run.q[-1] - q).max() < 1e-13
+    assert np.abs(run.p[-1] - p).max() < 1e-13
+
+
+def test_a_run_rounds_less_than_repeated_steps(sample, compiled):
+    """Against the oracle: a hundred small steps of leapfrog, rounded only once at the end."""
+    case, h, count = sample("planar-pendulum"), 2.0**-7, 200
+    stepper = compiled("planar-pendulum", StoermerVerlet())
+    q, p = case.state
+    exact = oracle.numbers(q), oracle.numbers(p)
+    for _ in range(count):
+        exact = oracle.leapfrog(case.mechanics, oracle.mp.zero, *exact, oracle.mp.mpf(h))
+    run = stepper.integrate(q, p, h=h, steps=count)
+    assert abs(run.q[-1] - exact[0].astype(float)) <= 2.0**-53
+    assert abs(run.p[-1] - exact[1].astype(float)) <= 2.0**-53
+
+
+def test_a_step_is_a_function_of_its_arguments(kepler):
+    first = kepler.step(*STATE, 0.1)
+    kepler.step([1.0, 1.0], [0.1, 0.2], 0.3)
+    assert np.array_equal(first, kepler.step(*STATE, 0.1))
+
+
+def test_arguments_are_not_changed(kepler):
+    q, p = np.array(STATE)
+    kepler.step(q, p, 0.1)
+    kepler.integrate(q, p, h=0.1, steps=3)
+    assert np.array_equal([q, p], STATE)
+
+
+def test_a_trajectory_begins_with_the_initial_state_and_has_float64_arrays(kepler):
+    run = kepler.integrate(*STATE, h=0.1, steps=7, t=2.0)
+    assert len(run) == 8
+    assert run.t == pytest.approx(2.0 + 0.1 * np.arange(8), abs=1e-15)
+    assert np.array_equal([run.q[0], run.p[0]], STATE)
+    assert run.q.shape == run.p.shape == (8, 2)
+    assert run.q.dtype == run.p.dtype == run.t.dtype == np.float64
+    assert run.iterations[0] == 0
+    assert (run.iterations[1:] > 0).all()
+
+
+def test_no_steps_give_the_initial_state(kepler):
+    run = kepler.integrate(*STATE, h=0.1, steps=0)
+    assert np.array_equal([run.q[0], run.p[0]], STATE)
+    assert len(run) == 1
+
+
+@pytest.mark.parametrize("every", [1, 2, 7, 300, 1000, 5000])
+def test_every_thins_the_same_run(kepler, every):
+    """1000 steps are several calls into C: their seams must not show."""
+    dense, thin = (kepler.integrate(*STATE, h=0.05, steps=1000, every=e) for e in (1, every))
+    assert np.array_equal(thin.q, dense.q[::every])
+    assert np.array_equal(thin.p, dense.p[::every])
+    assert np.array_equal(thin.t, dense.t[::every])
+    assert thin.iterations.sum() == dense.iterations[: 1000 // every * every + 1].sum()
+
+
+def test_progress_is_told_the_steps_done_up_to_the_last(kepler):
+    told = []
+    kepler.integrate(*STATE, h=0.05, steps=3000, progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 3000
+
+
+@pytest.mark.parametrize("method", SYMMETRIC, ids=lambda method: method.name)
+def test_a_symmetric_method_comes_back_along_its_own_trajectory(sample, compiled, method):
+    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    out = stepper.integrate(*state, h=0.05, steps=200, t=0.3)
+    back = stepper.integrate(out.q[-1], out.p[-1], h=-0.05, steps=200, t=out.t[-1])
+    assert back.t[-1] == pytest.approx(0.3, abs=1e-14)
+    assert np.abs(back.q[::-1] - out.q).max() < 1e-12
+    assert np.abs(back.p[::-1] - out.p).max() < 1e-12
+
+
+# Saving and restoring.
+
+
+@each_method
+def test_a_restored_run_continues_bit_for_bit(sample, compiled, method):
+    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    one = stepper.start(*state, h=0.05, t=0.3)
+    one.record(123)
+    saved = one.save()
+    other = pickle.loads(pickle.dumps(stepper)).restore(saved)
+    assert (other.t, other.steps) == (one.t, 123)
+    assert np.array_equal([other.q, other.p], [one.q, one.p])
+    assert same(one.record(200, every=3), other.record(200, every=3))
+
+
+def test_a_run_in_portions_is_one_run(kepler):
+    whole = kepler.integrate(*STATE, h=0.05, steps=100)
+    run = kepler.start(*STATE, h=0.05)
+    parts = [run.record(steps) for steps in (1, 0, 39, 60)]
+    assert np.array_equal(np.concatenate([part.q[1:] for part in parts]), whole.q[1:])
+    assert np.array_equal(parts[-1].p[0], whole.p[40])
+
+
+def test_every_counts_from_the_start_of_the_run(kepler):
+    run = kepler.start(*STATE, h=0.05)
+    run.record(5)
+    assert run.record(10, every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
+
+
+def test_a_restored_run_keeps_parameters_only_if_they_are_given(kepler):
+    run = kepler.start(*STATE, h=0.05, parameters={"mu": 0.9})
+    saved = run.save()
+    expected = run.record(5)
+    assert same(kepler.restore(saved, parameters={"mu": 0.9}).record(5), expected)
+    assert not same(kepler.restore(saved).record(5), expected)
+
+
+def test_bytes_of_another_length_are_refused(kepler):
+    with pytest.raises(StateError, match="3 bytes are not a saved run"):
+        kepler.restore(b"abc")
+
+
+# Wrong arguments.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([1.0], [0.0, 0.0], 0.1), r"q must have shape \(2,\) for \(q1, q2\), not \(1,\)"),
+        (([1.0, 0.0], [0.0, 0.0, 0.0], 0.1), r"p must have shape"),
+        (([[1.0, 0.0]], [0.0, 0.0], 0.1), r"not \(1, 2\)"),
+        (([1.0, np.nan], [0.0, 0.0], 0.1), r"q\[1\] \(q2\) is nan"),
+        (([1.0, 0.0], [np.inf, 0.0], 0.1), r"p\[0\] \(q1\) is inf"),
+        (("ab", [0.0, 0.0], 0.1), "q must be real numbers"),
+        (([1j, 0.0], [0.0, 0.0], 0.1), "real"),
+        (([1.0, 0.0], [0.0, 1.0], 0.0), "the step h is 0"),
+        (([1.0, 0.0], [0.0, 1.0], np.nan), "the step h is nan"),
+        (([1.0, 0.0], [0.0, 1.0], np.inf), "the step h is inf"),
+        (([1.0, 0.0], [0.0, 1.0], "small"), "step h"),
+        (([1.0, 0.0], [0.0, 1.0], None), "step h"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"muu": 1.0}), "no parameter 'muu' among mu; did you mean 'mu'"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": np.inf}), "the parameter mu is inf"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, [1.0, 2.0]), r"there are 1 parameters \(mu\), not 2"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": "heavy"}), "mu"),
+        (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, ["heavy"]), "parameters"),
+    ],
+)
+def test_a_wrong_argument_is_named(kepler, arguments, words):
+    with pytest.raises(StateError, match=words):
+        kepler.step(*arguments)
+    q, p, h, *rest = arguments
+    with pytest.raises(StateError, match=words):
+        kepler.integrate(q, p, h=h, steps=1, parameters=rest[1] if rest else None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"steps": -1}, "steps must be at least 0, not -1"),
+        ({"steps": 2.5}, "steps must be a whole number, not 2.5"),
+        ({"steps": True}, "whole number"),
+        ({"steps": 3, "every": 0}, "every must be at least 1"),
+        ({"steps": 3, "t": np.nan}, "t is nan"),
+    ],
+)
+def test_wrong_counts_and_times_are_named(kepler, arguments, words):
+    with pytest.raises(StateError, match=words):
+        kepler.integrate(*STATE, h=0.1, **arguments)
+
+
+@pytest.mark.parametrize("t", [np.nan, np.inf, "late"])
+def test_a_time_that_is_no_number_is_named(kepler, t):
+    with pytest.raises(StateError, match=r"\bt\b"):
+        kepler.step(*STATE, 0.1, t)
+    with pytest.raises(StateError, match=r"\bt\b"):
+        kepler.integrate(*STATE, h=0.1, steps=1, t=t)
+
+
+@pytest.mark.parametrize("steps", [-1, 2.5, True])
+def test_a_run_asks_for_a_whole_number_of_steps(kepler, steps):
+    with pytest.raises(StateError, match="steps must be"):
+        kepler.start(*STATE, h=0.1).record(steps)
+
+
+def test_energies_need_one_time_or_one_for_each_state(kepler):
+    with pytest.raises(StateError, match="time"):
+        kepler.energy(np.ones((3, 2)), np.ones((3, 2)), [0.0, 1.0])
+
+
+def test_impossible_options_are_refused():
+    with pytest.raises(StateError, match="max_iterations must be a whole number"):
+        SolverOptions(max_iterations=2.5)
+    with pytest.raises(StateError, match="tolerance must be positive"):
+        SolverOptions(tolerance=0.0)
+    with pytest.raises(StateError, match="max_iterations must be at least 1"):
+        SolverOptions(max_iterations=0)
+
+
+def test_parameters_may_be_given_by_name_or_in_order(compiled, sample):
+    stepper, state = compiled("pumped-cart-pole", SVI(3)), sample("pumped-cart-pole").state
+    values = stepper.defaults
+    values[stepper.parameters.index("k")] = 0.7
+    assert np.array_equal(stepper.step(*state, 0.1, 0.2, {"k": 0.7}), stepper.step(*state, 0.1, 0.2, values))
+    assert not np.array_equal(stepper.step(*state, 0.1, 0.2), stepper.step(*state, 0.1, 0.2, values))
+
+
+def test_defaults_cannot_be_changed_through_the_stepper(kepler):
+    kepler.defaults[:] = 7.0
+    assert kepler.defaults == [1.0]
+
+
+# Steps that fail.
+
+
+def test_a_step_beyond_the_domain_fails_and_says_so(compiled):
+    """Leapfrog falls into the centre, where the potential is infinite."""
+    stepper = compiled("kepler", StoermerVerlet())
+    with pytest.raises(StepFailedError, match=r"not finite.*undefined there") as caught:
+        stepper.step([0.0, 0.0], [1.0, 0.0], 0.1)
+    assert (caught.value.status, caught.value.step, caught.value.t) == ("not finite", 0, 0.0)
+    assert caught.value.trajectory is None
+
+
+def test_a_step_without_solution_fails_with_advice(compiled):
+    """Of q'' = q^2, the midpoint rule asks for a root of h^2 x^2 / 2 - 2 x + 2 q + h v: there is none for this h."""
+    with pytest.raises(StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
+        compiled("runaway", SVI(1)).step([1.0], [1.0], 2.0, 1.5)
+    assert caught.value.status in ("not converged", "singular")
+    assert caught.value.residual > 0.0
+    assert caught.value.trajectory is None
+
+
+def falling(compiled):
+    """A free fall into the centre of attraction, which every method with steps of this size must fail to survive."""
+    return compiled("kepler", SVI(4)), ([1.0, 0.0], [-0.5, 1e-9])
+
+
+def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step(compiled):
+    stepper, state = falling(compiled)
+    run = stepper.start(*state, h=0.05, options=SolverOptions(max_iterations=8))
+    with pytest.raises(StepFailedError) as caught:
+        run.record(400, every=2)
+    error, kept = caught.value, caught.value.trajectory
+    assert 5 < error.step < 400
+    assert error.step == run.steps
+    assert error.t == run.t == pytest.approx(0.05 * error.step)
+    assert len(kept) == error.step // 2 + 1
+    again = stepper.integrate(*state, h=0.05, steps=error.step, every=2)
+    assert np.array_equal(kept.q, again.q)
+    before = run.save()
+    with pytest.raises(StepFailedError) as repeated:
+        run.record(1)
+    assert repeated.value.step == error.step
+    assert len(repeated.value.trajectory) == 1
+    assert run.save() == before
+
+
+def test_a_failed_run_can_go_on_with_better_options(compiled):
+    state = compiled("kepler", SVI(4)), STATE
+    run = state[0].start(*STATE, h=0.3, options=SolverOptions(max_iterations=1))
+    with pytest.raises(StepFailedError, match=r"not converged.*more iterations"):
+        run.record(3)
+    assert state[0].restore(run.save()).record(3).q[-1] == pytest.approx(
+        state[0].integrate(*STATE, h=0.3, steps=3).q[-1], abs=1e-14
+    )
+
+
+# Convergence.
+
+
+def test_the_relative_rule_does_not_depend_on_units(compiled):
+    """Lengths in units 2^30 times smaller, time unchanged: the same bits, but for the exponent."""
+    stepper, scale = compiled("kepler", SVI(3)), 2.0**30
+    q, p = stepper.integrate(*STATE, h=0.1, steps=20).q, stepper.integrate(*STATE, h=0.1, steps=20).p
+    large = stepper.integrate(
+        np.multiply(scale, STATE[0]), np.multiply(scale, STATE[1]), h=0.1, steps=20, parameters={"mu": scale**3}
+    )
+    assert np.abs(large.q / scale - q).max() < 1e-14
+    assert np.abs(large.p / scale - p).max() < 1e-14
+
+
+def test_a_looser_tolerance_saves_iterations_and_costs_digits(kepler):
+    tight = kepler.integrate(*STATE, h=0.2, steps=50)
+    loose = kepler.integrate(*STATE, h=0.2, steps=50, options=SolverOptions(tolerance=1e-4))
+    assert loose.iterations.sum() < tight.iterations.sum()
+    assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
+
+
+def test_the_absolute_rule_compares_the_update_itself(kepler):
+    """Lengths in units 2^30 times smaller make the same update 2^30 times larger, and a given bound harder to meet."""
+    scale = 2.0**30
+    large = {"q": np.multiply(scale, STATE[0]), "p": np.multiply(scale, STATE[1]), "parameters": {"mu": scale**3}}
+
+    def iterations(options, q=STATE[0], p=STATE[1], parameters=None):
+        return kepler.integrate(q, p, h=0.1, steps=20, parameters=parameters, options=options).iterations.sum()
+
+    relative, absolute = (SolverOptions(tolerance=1e-6, absolute=absolute) for absolute in (False, True))
+    assert iterations(relative) == iterations(relative, **large)
+    assert iterations(absolute) < iterations(absolute, **large)
+    exact = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"])
+    for bound in (1e3, 1e-3):
+        options = SolverOptions(tolerance=bound, absolute=True)
+        found = kepler.step(large["q"], large["p"], 0.1, 0.0, large["parameters"], options=options)
+        assert np.abs(np.array(found) - exact).max() < bound
+
+
+# Legendre transforms and energy.
+
+
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
+def test_momentum_and_velocity_are_inverse_and_the_oracles(sample, compiled, name):
+    case, stepper = sample(name), compiled(name, SVI(3))
+    q, p = case.state
+    v = stepper.velocity(q, p, 0.7)
+    assert stepper.momentum(q, v, 0.7) == pytest.approx(p, abs=1e-14)
+    expected = case.mechanics.velocity(oracle.mp.mpf(0.7), oracle.numbers(q), oracle.numbers(p))
+    assert v == pytest.approx(expected.astype(float), abs=1e-14)
+
+
+def test_there_is_no_velocity_beyond_the_range_of_the_momenta(compiled, sample):
+    """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
+    stepper = compiled("relativistic-particle", SVI(3))
+    v = stepper.velocity([0.0], [3.0])
+    assert v == pytest.approx(3.0 / np.sqrt(10.0), abs=1e-12)
+    with pytest.raises(StateError, match="is nan"):
+        stepper.velocity([0.0], [np.nan])
+    with pytest.raises(StateError, match=r"momentum at q = .*cannot be computed"):
+        stepper.momentum([0.0], [1.5])
+
+
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
+def test_energy_is_p_v_minus_l(sample, compiled, name):
+    case, stepper = sample(name), compiled(name, SVI(3))
+    q, p = case.state
+    v = stepper.velocity(q, p, 0.7)
+    L = case.mechanics.lagrangian([oracle.mp.mpf(0.7)], oracle.numbers([q]), oracle.numbers([v]))[0]
+    assert stepper.energy(q, p, 0.7) == pytest.approx(p @ v - float(L), abs=1e-14)
+    assert isinstance(stepper.energy(q, p, 0.7), float)
+
+
+def test_energies_of_many_states_are_those_of_each(sample, compiled):
+    stepper = compiled("pumped-cart-pole", SVI(3))
+    run = stepper.integrate(*sample("pumped-cart-pole").state, h=0.1, steps=9)
+    each = [stepper.energy(q, p, t) for q, p, t in zip(run.q, run.p, run.t, strict=True)]
+    assert np.array_equal(run.energy(), each)
+    at_one_time = [stepper.energy(q, p, 0.3) for q, p in zip(run.q, run.p, strict=True)]
+    assert np.array_equal(stepper.energy(run.q, run.p, 0.3), at_one_time)
+    assert stepper.energy(run.q[::2], run.p[::2], run.t[::2]) == pytest.approx(each[::2], abs=0.0)
+
+
+def test_states_of_the_wrong_shape_have_no_energy(kepler):
+    with pytest.raises(StateError, match=r"states must have shape \(n, 2\)"):
+        kepler.energy([[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0]])
+
+
+def test_an_energy_that_does_not_exist_is_an_error(compiled):
+    with pytest.raises(StateError, match="energy of a state cannot be computed"):
+        compiled("kepler", SVI(3)).energy([0.0, 0.0], [1.0, 0.0])
+
+
+# The discrete Lagrangian.
+
+
+@each_action
+@pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
+def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sample, compiled, name, method):
+    stepper, (q0, p0) = compiled(name, method), sample(name).state
+    q1, p1 = stepper.step(q0, p0, 0.1, 0.3)
+    minus = stepper.discrete_legendre_minus(q0, q1, 0.1, 0.3)
+    plus = stepper.discrete_legendre_plus(q0, q1, 0.1, 0.3)
+    # A change of q1 by round-off changes the momenta by (mass / h) times as much.
+    assert np.array_equal(minus[0], q0)
+    assert np.array_equal(plus[0], q1)
+    assert minus[1] == pytest.approx(p0, abs=1e-13)
+    assert plus[1] == pytest.approx(p1, abs=1e-13)
+
+
+@each_action
+def test_momenta_are_slopes_of_the_discrete_lagrangian(sample, compiled, method):
+    name = "pumped-cart-pole"
+    stepper, (q0, p0) = compiled(name, method), sample(name).state
+    q1, p1 = stepper.step(q0, p0, 0.1, 0.3)
+    width = 1e-3
+    for i, unit in enumerate(np.eye(2) * width):
+        # Fourth-order differences: truncation width^4 / h^4 times 1e-3, round-off 1e-16 / width.
+        first = [stepper.discrete_lagrangian(q0 + k * unit, q1, 0.1, 0.3) for k in (-2, -1, 1, 2)]
+        second = [stepper.discrete_lagrangian(q0, q1 + k * unit, 0.1, 0.3) for k in (-2, -1, 1, 2)]
+        weights = np.array([1, -8, 8, -1]) / (12 * width)
+        assert -weights @ first == pytest.approx(p0[i], abs=1e-9)
+        assert weights @ second == pytest.approx(p1[i], abs=1e-9)
+
+
+def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sample, compiled):
+    """The nodal curve of the oracle, whose end values give L_d by (25)."""
+    case, (c, w) = sample("pumped-cart-pole"), oracle.rule("gauss-legendre:3")
+    q, p = map(oracle.numbers, case.state)
+    nodes, h, t = oracle.points("lobatto", 3), oracle.mp.mpf(0.1), oracle.mp.mpf(0.3)
+    q1, _ = oracle.svi(case.mechanics, t, q, p, h, nodes=nodes, c=c, w=w)
+    stepper = compiled("pumped-cart-pole", SVI(2, "gauss-legendre:3"))
+
+    def along(middle):
+        return oracle.action(case.mechanics, t, np.vstack([q[None], middle, q1[None]]), h, nodes, c, w)
+
+    def slope(middle):
+        return oracle.central(lambda x: along(x[None]), middle, "1e-12")
+
+    middle = oracle.newton(slope, (q + q1) / 2, digits=20, width="1e-9")[None]
+    found = stepper.discrete_lagrangian(q.astype(float), q1.astype(float), 0.1, 0.3)
+    assert found == pytest.approx(float(along(middle)), abs=1e-14)
+
+
+@each_action
+def test_the_discrete_lagrangian_approximates_the_action_of_the_trajectory(compiled, method):
+    """The oscillator released from rest, whose action over one step is known: -sin(2 h) / 4."""
+    stepper, h = compiled("harmonic-oscillator", method), 0.1
+    q1, action = np.cos(h), -np.sin(2 * h) / 4
+    assert stepper.discrete_lagrangian([1.0], [q1], h) == pytest.approx(action, abs=h ** (method.order + 1) / 10)
+
+
+@each_action
+def test_the_two_point_form_walks_the_same_positions(sample, compiled, method):
+    stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
+    run = stepper.integrate(*state, h=0.1, steps=2, t=0.3)
+    following = stepper.step_positions(run.q[0], run.q[1], 0.1, 0.3)
+    assert following == pytest.approx(run.q[2], abs=1e-13)
+
+
+def test_methods_without_a_discrete_lagrangian_say_so(compiled):
+    for method in (SpectralCollocation(2), RadauIIA(2), ExplicitEuler(), SCVI(3, variational=False)):
+        stepper = compiled("kepler", method)
+        for call in (stepper.discrete_lagrangian, stepper.discrete_legendre_minus, stepper.step_positions):
+            with pytest.raises(MethodError, match="has no discrete Lagrangian"):
+                call([1.0, 0.0], [1.0, 0.1], 0.1)
+
+
+# Threads and copies.
+
+
+def test_threads_may_share_a_stepper(kepler):
+    expected = kepler.integrate(*STATE, h=0.05, steps=4000)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: kepler.integrate(*STATE, h=0.05, steps=4000), range(8)))
+    assert all(same(run, expected) for run in found)
+
+
+def test_threads_with_different_parameters_do_not_meet(kepler):
+    values = [0.8 + 0.05 * k for k in range(8)]
+
+    def final(mu):
+        return kepler.integrate(*STATE, h=0.05, steps=2000, parameters={"mu": mu}).q[-1]
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(final, values))
+    assert np.array_equal(found, [final(mu) for mu in values])
+
+
+def test_a_pickled_stepper_is_the_same_stepper(kepler):
+    copy = pickle.loads(pickle.dumps(kepler))
+    assert (copy.title, copy.coordinates, copy.parameters) == (kepler.title, ("q1", "q2"), ("mu",))
+    assert np.array_equal(copy.step(*STATE, 0.1), kepler.step(*STATE, 0.1))
+
+
+def test_a_stepper_shows_system_and_method(kepler):
+    assert "Kepler" in repr(kepler)
+    assert "degree 3" in repr(kepler)
+    assert kepler.dimension == 2
+
+
+@pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
+@pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
+def test_the_fixed_point_starts_from_rest(name, method):
+    """The first sweep from rest has no velocity to measure changes by."""
+    chosen = problem(name)
+    rest = np.zeros(chosen.system.dimension)
+    ends = [
+        compile_stepper(chosen.system, method, solver=solver).step(chosen.q, rest, 0.05)
+        for solver in ("fixed-point", "newton")
+    ]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-14, atol=1e-16)

@@ -1,0 +1,163 @@
+"""Cardinal functions: exactness on polynomials in rational arithmetic, known matrices, and stability at degree 30."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.basis import (
+    cardinal_integrals,
+    cardinal_slopes,
+    cardinal_values,
+    differentiation_matrix,
+    extrapolation,
+    matrix_product,
+    transpose,
+)
+from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.quadrature import gauss_legendre
+
+FIFTY_DIGITS = mp.mpf("1e-50")
+
+rationals = st.fractions(min_value=-3, max_value=3, max_denominator=20)
+point_sets = st.lists(rationals, min_size=1, max_size=7, unique=True)
+
+
+def apply(matrix: Matrix, values: Vector) -> Vector:
+    return tuple(mp.fdot(row, values) for row in matrix)
+
+
+def number(value: Fraction) -> object:
+    return mp.mpf(value.numerator) / value.denominator
+
+
+def polynomial(coefficients: list[Fraction], x: Fraction) -> Fraction:
+    return sum((c * x**k for k, c in enumerate(coefficients)), Fraction(0))
+
+
+def slope(coefficients: list[Fraction], x: Fraction) -> Fraction:
+    return sum((k * c * x ** (k - 1) for k, c in enumerate(coefficients) if k), Fraction(0))
+
+
+def integral(coefficients: list[Fraction], start: Fraction, end: Fraction) -> Fraction:
+    return sum((c * (end ** (k + 1) - start ** (k + 1)) / (k + 1) for k, c in enumerate(coefficients)), Fraction(0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(points=point_sets, at=st.lists(rationals, min_size=1, max_size=4), start=rationals, data=st.data())
+def test_tables_reproduce_polynomials_on_any_points(
+    points: list[Fraction], at: list[Fraction], start: Fraction, data: st.DataObject
+) -> None:
+    coefficients = data.draw(st.lists(rationals, min_size=1, max_size=len(points)))
+    values = tuple(number(polynomial(coefficients, x)) for x in points)
+    for table, exact in [
+        (cardinal_values(points, at), [polynomial(coefficients, t) for t in at]),
+        (cardinal_slopes(points, at), [slope(coefficients, t) for t in at]),
+        (cardinal_integrals(points, at, start), [integral(coefficients, start, t) for t in at]),
+        (differentiation_matrix(points), [slope(coefficients, x) for x in points]),
+        (extrapolation(points, start), [polynomial(coefficients, x + start) for x in points]),
+    ]:
+        scale = 1 + max(abs(entry) for row in table for entry in row) * max(map(abs, values))
+        for ours, theirs in zip(apply(table, values), exact, strict=True):
+            assert abs(ours - number(theirs)) < FIFTY_DIGITS * scale
+
+
+@settings(max_examples=30, deadline=None)
+@given(points=st.lists(rationals, min_size=2, max_size=7, unique=True), shift=rationals, data=st.data())
+def test_least_squares_extrapolation_is_the_normal_equations(
+    points: list[Fraction], shift: Fraction, data: st.DataObject
+) -> None:
+    import sympy as sp
+
+    degree = data.draw(st.integers(min_value=0, max_value=len(points) - 1))
+    here = sp.Matrix([[sp.Rational(x) ** k for k in range(degree + 1)] for x in points])
+    there = sp.Matrix([[sp.Rational(x + shift) ** k for k in range(degree + 1)] for x in points])
+    exact = there * (here.T * here).inv() * here.T
+    ours = extrapolation(points, shift, degree)
+    size = len(points)
+    assert all(
+        abs(ours[i][j] - mp.mpf(exact[i, j].p) / exact[i, j].q) < FIFTY_DIGITS for i in range(size) for j in range(size)
+    )
+
+
+def chebyshev_matrix_of_the_paper(N: int) -> np.ndarray:
+    x = np.cos(np.arange(N + 1) * np.pi / N)
+    c = np.r_[2, np.ones(N - 1), 2]
+    D = np.zeros((N + 1, N + 1))
+    for i in range(N + 1):
+        for j in range(N + 1):
+            if i != j:
+                D[i, j] = c[i] / c[j] * (-1) ** (i + j) / (x[i] - x[j])
+            elif 0 < i < N:
+                D[i, i] = -x[i] / (2 * (1 - x[i] ** 2))
+    D[0, 0], D[N, N] = (2 * N**2 + 1) / 6, -(2 * N**2 + 1) / 6
+    return D
+
+
+@pytest.mark.parametrize("N", [1, 2, 5, 12])
+def test_the_differentiation_matrix_is_equation_11_on_descending_points(N: int) -> None:
+    ours = np.array(differentiation_matrix(chebyshev_lobatto(N).points), float)
+    np.testing.assert_allclose(ours[::-1, ::-1], chebyshev_matrix_of_the_paper(N), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("nodes", [chebyshev_lobatto(30), legendre_lobatto(30), equispaced(30)], ids=lambda n: n.name)
+def test_degree_thirty_keeps_fifty_digits(nodes: object) -> None:
+    points = nodes.points
+    at = gauss_legendre(31).points
+    values, slopes = cardinal_values(points, at), cardinal_slopes(points, at)
+    for power in (0, 1, 17, 30):
+        f = tuple(x**power for x in points)
+        scale = max(abs(entry) for row in slopes for entry in row)
+        for x, ours, derivative in zip(at, apply(values, f), apply(slopes, f), strict=True):
+            assert abs(ours - x**power) < FIFTY_DIGITS
+            assert abs(derivative - (power * x ** (power - 1) if power else 0)) < FIFTY_DIGITS * scale
+        total = apply(cardinal_integrals(points, (1,), -1), f)[0]
+        assert abs(total - (mp.mpf(2) / (power + 1) if power % 2 == 0 else 0)) < FIFTY_DIGITS
+
+
+@pytest.mark.parametrize("degree", [4, 30])
+def test_extrapolation_of_full_degree_is_interpolation(degree: int) -> None:
+    points = equispaced(degree).points
+    interpolation, least_squares = extrapolation(points, 2), extrapolation(points, 2, degree)
+    scale = max(abs(entry) for row in interpolation for entry in row)
+    for left, right in zip(interpolation, least_squares, strict=True):
+        assert all(abs(a - b) < FIFTY_DIGITS * scale for a, b in zip(left, right, strict=True))
+
+
+def test_values_at_the_points_are_the_unit_matrix_and_rows_sum_to_one() -> None:
+    points = chebyshev_lobatto(6).points
+    assert cardinal_values(points, points) == tuple(tuple(mp.mpf(i == j) for j in range(7)) for i in range(7))
+    assert all(abs(mp.fsum(row) - 1) < FIFTY_DIGITS for row in cardinal_values(points, (-2, mp.mpf("0.3"), 5)))
+
+
+def test_slopes_agree_with_numerical_differentiation() -> None:
+    points = (0, Fraction(1, 3), Fraction(4, 5), 2)
+    at = mp.mpf("0.37")
+    numerical = [mp.diff(lambda t, j=j: cardinal_values(points, (t,))[0][j], at, h=mp.mpf("1e-20")) for j in range(4)]
+    assert all(abs(a - b) < mp.mpf("1e-30") for a, b in zip(cardinal_slopes(points, (at,))[0], numerical, strict=True))
+
+
+def test_products_and_transposes() -> None:
+    left: Matrix = ((mp.mpf(1), mp.mpf(2)), (mp.mpf(3), mp.mpf(4)), (mp.mpf(5), mp.mpf(6)))
+    np.testing.assert_array_equal(np.array(matrix_product(transpose(left), left), float), [[35, 44], [44, 56]])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: cardinal_values((0, 1, 0), (0,)), "point 2 .* occurs twice"),
+        (lambda: differentiation_matrix(()), "at least one point"),
+        (lambda: extrapolation((0, 1), 1, 2), "degree 2 does not fit 2 points"),
+        (lambda: extrapolation((0, 1), 1, 0.5), "must be an integer"),
+        (lambda: extrapolation((0, 1), 1, -1), "at least 0"),
+    ],
+)
+def test_impossible_requests_are_refused(call: object, message: str) -> None:
+    with pytest.raises(MethodError, match=message):
+        call()

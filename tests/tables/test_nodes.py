@@ -1,0 +1,188 @@
+"""Nodes: their values against NumPy, SciPy and radicals, their symmetry, and the errors of wrong arguments."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.special
+import sympy as sp
+from mpmath import MPContext
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.nodes import (
+    NODE_FAMILIES,
+    Nodes,
+    chebyshev_gauss,
+    chebyshev_lobatto,
+    equispaced,
+    exact_points,
+    legendre_gauss,
+    legendre_lobatto,
+    nodes_by_name,
+    radau_left,
+    radau_right,
+    to_number,
+)
+from scvi_codegen.tables.precision import mp
+
+DEGREES = [1, 2, 3, 4, 5, 8, 13, 30, 47]
+FIFTY_DIGITS = mp.mpf("1e-50")
+
+
+def floats(nodes: Nodes) -> np.ndarray:
+    return np.array([float(point) for point in nodes.points])
+
+
+@pytest.mark.parametrize("name", NODE_FAMILIES)
+@pytest.mark.parametrize("degree", DEGREES)
+def test_every_family_gives_ascending_points_under_its_name(name: str, degree: int) -> None:
+    nodes = nodes_by_name(name, degree)
+    assert (nodes.name, nodes.degree, len(nodes.points)) == (name, degree, degree + 1)
+    assert all(left < right for left, right in zip(nodes.points, nodes.points[1:], strict=False))
+    assert nodes.contains_ends == (name in ("chebyshev-lobatto", "legendre-lobatto", "equispaced"))
+    assert nodes.symmetric == (not name.startswith("radau"))
+    assert nodes_by_name(name, degree) is nodes
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_points_agree_with_numpy_and_scipy(degree: int) -> None:
+    count = degree + 1
+    for nodes, expected in [
+        (chebyshev_lobatto(degree), -np.cos(np.arange(count) * np.pi / degree)),
+        (chebyshev_gauss(degree), scipy.special.roots_chebyt(count)[0]),
+        (legendre_gauss(degree), np.polynomial.legendre.leggauss(count)[0]),
+        (equispaced(degree), np.linspace(-1, 1, count)),
+        (radau_left(degree), np.r_[-1, scipy.special.roots_jacobi(degree, 0, 1)[0]]),
+        (radau_right(degree), np.r_[scipy.special.roots_jacobi(degree, 1, 0)[0], 1]),
+    ]:
+        np.testing.assert_allclose(floats(nodes), expected, rtol=0, atol=3e-15)
+
+
+@pytest.mark.parametrize("degree", [2, 3, 7, 12])
+def test_lobatto_points_agree_with_the_jacobi_roots_of_scipy(degree: int) -> None:
+    inside = scipy.special.roots_jacobi(degree - 1, 1, 1)[0]
+    np.testing.assert_allclose(floats(legendre_lobatto(degree)), np.r_[-1, inside, 1], rtol=0, atol=3e-15)
+
+
+@pytest.mark.parametrize("degree", [9, 30])
+def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degree: int) -> None:
+    other = MPContext()
+    other.dps = 90
+    count = degree + 1
+
+    def legendre_slope(x: object) -> object:
+        return (x * other.legendre(degree, x) - other.legendre(degree - 1, x)) * degree
+
+    polynomials = [
+        (legendre_gauss(degree), lambda x: other.legendre(count, x)),
+        (legendre_lobatto(degree), legendre_slope),
+        (radau_left(degree), lambda x: other.legendre(count, x) + other.legendre(degree, x)),
+        (radau_right(degree), lambda x: other.legendre(count, x) - other.legendre(degree, x)),
+    ]
+    width = other.mpf("1e-51")
+    for nodes, polynomial in polynomials:
+        for point in map(other.mpf, nodes.points):
+            if abs(point) < 1:
+                assert polynomial(point - width) * polynomial(point + width) < 0
+
+
+def test_known_digits_of_lobatto_and_gauss_points() -> None:
+    golden = legendre_gauss(9).points[-1]
+    assert abs(golden - mp.mpf("0.97390652851717172007796401208445205342826994669238211923121")) < FIFTY_DIGITS
+    assert abs(legendre_lobatto(4).points[3] - mp.sqrt(mp.mpf(3) / 7)) < FIFTY_DIGITS
+
+
+@pytest.mark.parametrize(
+    ("name", "degrees"),
+    [
+        ("chebyshev-lobatto", [1, 2, 3, 4, 5, 6, 8]),
+        ("legendre-lobatto", [1, 2, 3, 4, 5]),
+        ("equispaced", [1, 2, 7, 30]),
+        ("legendre-gauss", [1, 2, 3, 4]),
+        ("chebyshev-gauss", [1, 2, 3, 4, 5]),
+        ("radau-left", [1, 2]),
+        ("radau-right", [1, 2]),
+    ],
+)
+def test_closed_forms_are_radicals_of_the_same_value(name: str, degrees: list[int]) -> None:
+    for degree in degrees:
+        nodes = nodes_by_name(name, degree)
+        exact = exact_points(nodes)
+        assert exact is not None
+        for expression, point in zip(exact, nodes.points, strict=True):
+            assert expression.is_algebraic
+            assert not expression.has(sp.Float, sp.cos, sp.sin)
+            assert abs(mp.mpf(str(sp.N(expression, 60))) - point) < FIFTY_DIGITS
+
+
+def test_no_closed_form_where_there_is_no_short_one_or_where_the_user_made_the_nodes() -> None:
+    assert exact_points(chebyshev_lobatto(7)) is None
+    assert exact_points(legendre_lobatto(6)) is None
+    assert exact_points(legendre_gauss(5)) is None
+    assert exact_points(radau_left(3)) is None
+    assert exact_points(Nodes(name="equispaced", degree=2, points=(-1, 0.25, 1))) is None
+    assert exact_points(Nodes(name="mine", degree=1, points=(-1, 1))) is None
+
+
+def test_numbers_of_many_kinds_are_converted() -> None:
+    third = Fraction(1, 3)
+    nodes = Nodes(name="mine", degree=4, points=(-1, "-0.1", np.float64(0.25), third, sp.sqrt(2) / 2))
+    assert nodes.points[1] == -mp.mpf(1) / 10
+    assert abs(nodes.points[3] - mp.mpf(1) / 3) < FIFTY_DIGITS
+    assert abs(nodes.points[4] ** 2 - mp.mpf(1) / 2) < FIFTY_DIGITS
+    assert not nodes.symmetric
+    assert not nodes.contains_ends
+    assert to_number(0.1) == mp.mpf(0.1) != mp.mpf("0.1")
+
+
+@pytest.mark.parametrize("value", ["x", 1j, None, [1], sp.Symbol("x"), sp.I, float("nan"), float("inf")])
+def test_what_is_not_a_finite_real_number_is_refused(value: object) -> None:
+    with pytest.raises(MethodError, match="give a"):
+        to_number(value)
+
+
+@pytest.mark.parametrize("name", NODE_FAMILIES)
+@pytest.mark.parametrize(("degree", "message"), [(0, "at least 1, got 0"), (2.0, "got 2.0"), (True, "got True")])
+def test_a_degree_that_is_no_positive_integer_is_refused(name: str, degree: object, message: str) -> None:
+    nodes_by_name(name, 2)
+    nodes_by_name(name, 1)
+    with pytest.raises(MethodError, match=message):
+        nodes_by_name(name, degree)  # type: ignore[arg-type]  # the wrong type is the point
+
+
+def test_an_unknown_family_names_the_closest_and_all_others() -> None:
+    with pytest.raises(MethodError, match=r"did you mean 'chebyshev-lobatto'.*legendre-gauss"):
+        nodes_by_name("chebyshev_lobato", 3)
+
+
+@pytest.mark.parametrize(
+    ("degree", "points", "message"),
+    [
+        (2, (-1, 1), "needs 3 nodes, got 2"),
+        (2, (-1, 0, 0), "node 2 is 0.0, not above"),
+        (2, (-1, 1, 0), "node 2 is 0.0, not above"),
+        (1, (0, 2), "outside"),
+        (0, (0,), "at least 1"),
+    ],
+)
+def test_bad_points_are_refused(degree: int, points: tuple[float, ...], message: str) -> None:
+    with pytest.raises(MethodError, match=message):
+        Nodes(name="mine", degree=degree, points=points)
+
+
+def test_the_users_precision_neither_matters_nor_changes() -> None:
+    import mpmath
+
+    with mpmath.workdps(5):
+        nodes = legendre_gauss(21)
+        assert mpmath.mp.dps == 5
+    assert abs(mp.legendre(22, nodes.points[0])) < mp.mpf("1e-55")
+
+
+def test_importing_the_tables_does_not_import_sympy() -> None:
+    code = "import sys; from scvi_codegen.tables import basis, quadrature, nodes; sys.exit('sympy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

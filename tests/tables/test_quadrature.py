@@ -1,0 +1,189 @@
+"""Quadrature rules: points and weights against NumPy and SciPy, orders by exact moments, closed forms, errors."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+import scipy.special
+import sympy as sp
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_lobatto
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.quadrature import (
+    Quadrature,
+    clenshaw_curtis,
+    exact_rule,
+    fejer,
+    gauss_legendre,
+    gauss_lobatto,
+    gauss_radau,
+    quadrature_by_name,
+)
+
+FIFTY_DIGITS = mp.mpf("1e-50")
+NEEDS_TWO = ("gauss-lobatto", "clenshaw-curtis")
+ORDERS = {
+    "gauss-legendre": lambda n: 2 * n,
+    "gauss-lobatto": lambda n: 2 * n - 2,
+    "gauss-radau-left": lambda n: 2 * n - 1,
+    "gauss-radau-right": lambda n: 2 * n - 1,
+    "clenshaw-curtis": lambda n: n + n % 2,
+    "fejer": lambda n: n + n % 2,
+}
+
+
+def rules(counts: list[int]) -> list[Quadrature]:
+    names = [f"{family}:{n}" for family in ORDERS for n in counts if n > 1 or family not in NEEDS_TWO]
+    return [quadrature_by_name(name) for name in names]
+
+
+def moment_error(rule: Quadrature, power: int) -> mpmath.mpf:
+    exact = mp.mpf(2) / (power + 1) if power % 2 == 0 else mp.zero
+    return abs(mp.fsum(w * x**power for x, w in zip(rule.points, rule.weights, strict=True)) - exact)
+
+
+@pytest.mark.parametrize("rule", rules([1, 2, 3, 4, 5, 6, 9, 16, 31]), ids=lambda rule: rule.name)
+def test_the_order_is_the_first_power_that_is_not_integrated(rule: Quadrature) -> None:
+    family, _, count = rule.name.partition(":")
+    assert rule.order == ORDERS[family](int(count))
+    assert all(moment_error(rule, power) < mp.mpf("1e-55") for power in range(rule.order))
+    assert moment_error(rule, rule.order) > mp.mpf("1e-25")
+
+
+@pytest.mark.parametrize("rule", rules([1, 2, 3, 7, 20]), ids=lambda rule: rule.name)
+def test_names_read_back_and_the_unit_interval_is_the_same_rule(rule: Quadrature) -> None:
+    assert quadrature_by_name(rule.name) is rule
+    assert len(rule) == len(rule.points) == len(rule.weights) == int(rule.name.partition(":")[2])
+    assert all(weight > 0 for weight in rule.weights)
+    assert abs(mp.fsum(rule.unit_weights) - 1) < FIFTY_DIGITS
+    assert all(
+        0 <= c <= 1 and abs(2 * c - 1 - x) < FIFTY_DIGITS for c, x in zip(rule.abscissae, rule.points, strict=True)
+    )
+    assert rule.symmetric == ("radau" not in rule.name)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 21, 64])
+def test_gauss_rules_agree_with_numpy_and_scipy(n: int) -> None:
+    jacobi = scipy.special.roots_jacobi
+    x, w = jacobi(n - 1, 0, 1) if n > 1 else (np.empty(0), np.empty(0))
+    expected = [
+        (gauss_legendre(n), np.polynomial.legendre.leggauss(n)),
+        (gauss_radau(n), (np.r_[-1, x], np.r_[2 / n**2, w / (1 + x)])),
+        (gauss_radau(n, "right"), (np.r_[-x[::-1], 1], np.r_[(w / (1 + x))[::-1], 2 / n**2])),
+    ]
+    if n > 2:
+        x, w = jacobi(n - 2, 1, 1)
+        end = 2 / (n * (n - 1))
+        expected.append((gauss_lobatto(n), (np.r_[-1, x, 1], np.r_[end, w / (1 - x**2), end])))
+    for rule, (points, weights) in expected:
+        np.testing.assert_allclose(np.array(rule.points, float), points, rtol=0, atol=3e-15)
+        np.testing.assert_allclose(np.array(rule.weights, float), weights, rtol=5e-12, atol=0)
+
+
+@pytest.mark.parametrize("n", [2, 3, 8, 17])
+def test_chebyshev_rules_are_interpolatory(n: int) -> None:
+    for rule in (clenshaw_curtis(n), fejer(n)):
+        x = np.array(rule.points, float)
+        moments = [(2 / (1 - k * k) if k % 2 == 0 else 0.0) for k in range(n)]
+        expected = np.linalg.solve(np.polynomial.chebyshev.chebvander(x, n - 1).T, moments)
+        np.testing.assert_allclose(np.array(rule.weights, float), expected, rtol=1e-13)
+
+
+def test_known_fifty_digits() -> None:
+    rule = gauss_legendre(10)
+    assert abs(rule.weights[0] - mp.mpf("0.066671344308688137593568809893331792857864834320158")) < FIFTY_DIGITS
+    assert abs(rule.points[0] + mp.mpf("0.97390652851717172007796401208445205342826994669238")) < FIFTY_DIGITS
+
+
+@pytest.mark.parametrize("rule", rules([30]), ids=lambda rule: rule.name)
+def test_smooth_integrands_agree_with_adaptive_quadrature(rule: Quadrature) -> None:
+    ours = mp.fsum(w * mp.exp(x) for x, w in zip(rule.points, rule.weights, strict=True))
+    digits = "1e-50" if "gauss" in rule.name else "1e-30"
+    assert abs(ours - mp.quad(mp.exp, [-1, 1])) < mp.mpf(digits)
+
+
+def test_rules_share_their_points_with_the_nodes() -> None:
+    assert clenshaw_curtis(7).points == chebyshev_lobatto(6).points
+    assert gauss_lobatto(7).points == legendre_lobatto(6).points
+
+
+@pytest.mark.parametrize("rule", rules([1, 2, 3, 4, 5, 6, 7]), ids=lambda rule: rule.name)
+def test_closed_forms_have_the_value_of_the_rule(rule: Quadrature) -> None:
+    family = rule.name.partition(":")[0]
+    longest = {"gauss-legendre": 5, "gauss-lobatto": 6, "gauss-radau-left": 3, "gauss-radau-right": 3}.get(family, 6)
+    exact = exact_rule(rule)
+    if len(rule) > longest:
+        assert exact is None or family == "clenshaw-curtis"
+        return
+    assert exact is not None
+    for expressions, numbers in zip(exact, (rule.points, rule.weights), strict=True):
+        for expression, number in zip(expressions, numbers, strict=True):
+            assert not expression.has(sp.Float, sp.cos, sp.sin)
+            assert abs(mp.mpf(str(sp.N(expression, 60))) - number) < FIFTY_DIGITS
+
+
+def test_a_rule_of_the_users_has_no_closed_form() -> None:
+    third = Fraction(1, 3)
+    assert exact_rule(Quadrature(name="Simpson", points=(-1, 0, 1), weights=(third, 4 * third, third))) is None
+    assert exact_rule(Quadrature(name="gauss-legendre:1", points=(0.5,), weights=(2,))) is None
+    assert exact_rule(Quadrature(name="gauss-legendre:3", points=(0,), weights=(2,))) is None
+
+
+def test_the_order_of_a_users_rule_is_computed() -> None:
+    third = Fraction(1, 3)
+    simpson = Quadrature(name="Simpson", points=(-1, 0, 1), weights=(third, 4 * third, third))
+    assert (simpson.order, simpson.symmetric) == (4, True)
+    x, w = np.polynomial.legendre.leggauss(12)
+    assert Quadrature(name="from NumPy", points=tuple(x), weights=tuple(w)).order == 24
+    exact = Quadrature(name="radicals", points=(-sp.sqrt(3) / 3, sp.sqrt(3) / 3), weights=(1, 1))
+    assert (exact.points, exact.weights, exact.order) == (gauss_legendre(2).points, gauss_legendre(2).weights, 4)
+    assert Quadrature(name="modest", points=(-1, 0, 1), weights=(third, 4 * third, third), order=2).order == 2
+    assert not Quadrature(name="lopsided", points=(-1, 1), weights=(0.5, 1.5)).symmetric
+
+
+@pytest.mark.parametrize(
+    ("points", "weights", "order", "message"),
+    [
+        ((0,), (1, 1), 0, "1 points and 2 weights"),
+        ((), (), 0, "at least one point"),
+        ((0, -1), (1, 1), 0, "not above the one before"),
+        ((0, 2), (1, 1), 0, "outside"),
+        ((0, 1), (0.5, 0.5), 0, "sum 1.0; scale them to sum 2"),
+        ((-1, 1), (1, 1), 4, "has order 2, not 4"),
+        ((-1, 1), (1, 1), 1.5, "must be an integer"),
+        ((-1, 1), (1, "one"), 0, "not a real number"),
+    ],
+)
+def test_what_is_no_quadrature_is_refused(points: tuple, weights: tuple, order: int, message: str) -> None:
+    with pytest.raises(MethodError, match=message):
+        Quadrature(name="mine", points=points, weights=weights, order=order)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("gauss-legendre", "lacks its number of points; write 'gauss-legendre' as 'gauss-legendre:3'"),
+        ("gauss-legendre:x", "lacks its number"),
+        ("gauss-legendre:-1", "lacks its number"),
+        ("gauss-legendre:0", "at least 1, got 0"),
+        ("gauss-lobatto:1", "at least 2, got 1"),
+        ("clenshaw-curtis:1", "at least 2, got 1"),
+        ("gauss-legandre:3", "did you mean 'gauss-legendre'.*fejer"),
+        ("", "unknown quadrature"),
+    ],
+)
+def test_names_that_mean_nothing_are_refused(name: str, message: str) -> None:
+    with pytest.raises(MethodError, match=message):
+        quadrature_by_name(name)
+
+
+def test_counts_and_sides_are_checked_even_after_a_cached_call() -> None:
+    gauss_radau(2)
+    with pytest.raises(MethodError, match=r"got 2\.0"):
+        gauss_radau(2.0)  # type: ignore[arg-type]  # the wrong type is the point
+    with pytest.raises(MethodError, match="'left' or 'right', got 'middle'"):
+        gauss_radau(2, "middle")  # type: ignore[arg-type]  # the wrong value is the point

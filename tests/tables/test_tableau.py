@@ -1,0 +1,331 @@
+"""Tableaux: the paper's tables 1 to 4, orders by two independent paths, stability against eigenvalues, closed forms."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.special
+import sympy as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial as NumpyPolynomial
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables import nodes
+from scvi_codegen.tables.precision import Matrix, mp
+from scvi_codegen.tables.tableau import (
+    TABLEAU_FAMILIES,
+    Tableau,
+    chebyshev_gauss,
+    chebyshev_lobatto,
+    collocation_tableau,
+    exact_tableau,
+    explicit_euler,
+    gauss,
+    is_nonnegative,
+    lobatto_iiia,
+    lobatto_iiib,
+    radau_ia,
+    radau_iia,
+    tableau_by_name,
+)
+
+FIFTY_DIGITS = mp.mpf("1e-50")
+HALF = Fraction(1, 2)
+ORDERS = {
+    "gauss": lambda s: 2 * s,
+    "radau-iia": lambda s: 2 * s - 1,
+    "radau-ia": lambda s: 2 * s - 1,
+    "lobatto-iiia": lambda s: 2 * s - 2,
+    "lobatto-iiib": lambda s: 2 * s - 2,
+    "chebyshev-gauss": lambda s: s + s % 2,
+    "chebyshev-lobatto": lambda s: s + s % 2,
+}
+
+
+def members(counts: list[int]) -> list[Tableau]:
+    return [
+        tableau_by_name(f"{name}:{s}") for name in TABLEAU_FAMILIES for s in counts if s > 1 or "obatto" not in name
+    ]
+
+
+def floats(tableau: Tableau) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return np.array(tableau.A, float), np.array(tableau.b, float), np.array(tableau.c, float)
+
+
+def assert_exact(tableau: Tableau, A: list[list[sp.Expr]], b: list[sp.Expr], c: list[sp.Expr]) -> None:
+    exact = exact_tableau(tableau)
+    assert exact is not None
+    for ours, numbers, paper in zip(
+        (*exact[0], *exact[1:]), (*tableau.A, tableau.b, tableau.c), (*A, b, c), strict=True
+    ):
+        for expression, number, expected in zip(ours, numbers, paper, strict=True):
+            assert not expression.has(sp.Float)
+            assert sp.expand(expression - expected) == 0
+            assert abs(number - mp.mpf(str(sp.N(expected, 60)))) < FIFTY_DIGITS
+
+
+def test_table_1_gauss_of_order_4() -> None:
+    r, quarter = sp.sqrt(3) / 6, sp.Rational(1, 4)
+    half = 2 * quarter
+    assert_exact(gauss(2), [[quarter, quarter - r], [quarter + r, quarter]], [half, half], [half - r, half + r])
+
+
+def test_table_2_gauss_of_order_6() -> None:
+    r, Q = sp.sqrt(15), sp.Rational
+    A = [
+        [Q(5, 36), Q(2, 9) - r / 15, Q(5, 36) - r / 30],
+        [Q(5, 36) + r / 24, Q(2, 9), Q(5, 36) - r / 24],
+        [Q(5, 36) + r / 30, Q(2, 9) + r / 15, Q(5, 36)],
+    ]
+    assert_exact(gauss(3), A, [Q(5, 18), Q(4, 9), Q(5, 18)], [Q(1, 2) - r / 10, Q(1, 2), Q(1, 2) + r / 10])
+
+
+def test_table_3_gauss_of_order_8_with_its_entry_34_corrected() -> None:
+    Q, r = sp.Rational, sp.sqrt(30)
+    w1, v1 = Q(1, 8) - r / 144, Q(1, 8) + r / 144
+    w2, v2 = Q(1, 2) * sp.sqrt((15 + 2 * r) / 35), Q(1, 2) * sp.sqrt((15 - 2 * r) / 35)
+    w3, v3 = w2 * (Q(1, 6) + r / 24), v2 * (Q(1, 6) - r / 24)
+    w4, v4 = w2 * (Q(1, 21) + 5 * r / 168), v2 * (Q(1, 21) - 5 * r / 168)
+    w5, v5 = w2 - 2 * w3, v2 - 2 * v3
+    A = [
+        [w1, v1 - w3 + v4, v1 - w3 - v4, w1 - w5],
+        [w1 - v3 + w4, v1, v1 - v5, w1 - v3 - w4],
+        [w1 + v3 + w4, v1 + v5, v1, w1 + v3 - w4],
+        [w1 + w5, v1 + w3 + v4, v1 + w3 - v4, w1],
+    ]
+    assert_exact(
+        gauss(4), A, [2 * w1, 2 * v1, 2 * v1, 2 * w1], [Q(1, 2) - w2, Q(1, 2) - v2, Q(1, 2) + v2, Q(1, 2) + w2]
+    )
+    misprinted = w1 + v3 + w4
+    assert abs(gauss(4).A[2][3] - mp.mpf(str(sp.N(misprinted, 60)))) > mp.mpf("0.1")
+
+
+@pytest.mark.parametrize("s", [2, 3, 4, 5])
+@pytest.mark.parametrize(
+    ("family", "a_stable", "symmetric", "symplectic", "superconvergent"),
+    [
+        (gauss, True, True, True, True),
+        (chebyshev_gauss, True, True, False, False),
+        (chebyshev_lobatto, True, True, False, False),
+        (radau_iia, True, False, False, False),
+        (radau_ia, True, False, False, False),
+        (lobatto_iiia, True, True, False, False),
+    ],
+)
+def test_table_4(
+    family: object, s: int, a_stable: bool, symmetric: bool, symplectic: bool, superconvergent: bool
+) -> None:
+    tableau = family(s)
+    assert tableau.is_a_stable == a_stable
+    assert tableau.is_symmetric == symmetric
+    assert tableau.is_symplectic == symplectic
+    assert (tableau.order == 2 * s) == superconvergent
+
+
+@pytest.mark.parametrize("tableau", members([1, 2, 3, 4, 5, 6, 9]), ids=lambda tableau: tableau.name)
+def test_orders_names_and_a_stability_of_every_family(tableau: Tableau) -> None:
+    family, _, count = tableau.name.partition(":")
+    assert tableau.stages == int(count)
+    assert tableau.order == ORDERS[family](int(count))
+    assert tableau_by_name(tableau.name) == tableau
+    assert tableau.is_a_stable
+
+
+@pytest.mark.parametrize("tableau", [*members([1, 2, 3, 4]), explicit_euler()], ids=lambda tableau: tableau.name)
+def test_the_order_is_that_of_the_error_of_one_step_on_a_nonlinear_equation(tableau: Tableau) -> None:
+    """y' = -y^2 + t, solved by mpmath's Taylor series; the defect of one step falls like h^(order + 1)."""
+
+    def f(t: object, y: object) -> object:
+        return t - y * y
+
+    exact = mp.odefun(f, 0, mp.mpf("0.7"), tol=mp.mpf("1e-45"))
+
+    def defect(h: object) -> object:
+        y0, slopes = mp.mpf("0.7"), [mp.zero] * tableau.stages
+        for _ in range(60):
+            stages = [y0 + h * mp.fdot(row, slopes) for row in tableau.A]
+            slopes = [f(c * h, y) for c, y in zip(tableau.c, stages, strict=True)]
+        return abs(y0 + h * mp.fdot(tableau.b, slopes) - exact(h))
+
+    h = mp.mpf("1e-4")
+    slope = mp.log(defect(2 * h) / defect(h)) / mp.log(2)
+    assert abs(slope - (tableau.order + 1)) < 0.05
+
+
+def test_textbook_tableaux() -> None:
+    third, r = sp.Rational(1, 3), sp.sqrt(6)
+    A = [
+        [(88 - 7 * r) / 360, (296 - 169 * r) / 1800, (-2 + 3 * r) / 225],
+        [(296 + 169 * r) / 1800, (88 + 7 * r) / 360, (-2 - 3 * r) / 225],
+        [(16 - r) / 36, (16 + r) / 36, third / 3],
+    ]
+    assert_exact(radau_iia(3), A, A[-1], [(4 - r) / 10, (4 + r) / 10, sp.Integer(1)])
+    quarter = sp.Rational(1, 4)
+    ia = [[quarter, -quarter], [quarter, 5 * third / 4]]
+    assert_exact(radau_ia(2), ia, [quarter, 3 * quarter], [sp.Integer(0), 2 * third])
+    sixth, zero, one = third / 2, sp.Integer(0), sp.Integer(1)
+    simpson, times = [sixth, 4 * sixth, sixth], [zero, one / 2, one]
+    iiib = [[sixth, -sixth, zero], [sixth, third, zero], [sixth, 5 * sixth, zero]]
+    assert_exact(lobatto_iiib(3), iiib, simpson, times)
+    iiia = [[zero, zero, zero], [5 * third / 8, third, -third / 8], simpson]
+    assert_exact(lobatto_iiia(3), iiia, simpson, times)
+    assert_exact(explicit_euler(), [[zero]], [one], [zero])
+    assert chebyshev_lobatto(3).A == lobatto_iiia(3).A
+
+
+@pytest.mark.parametrize("tableau", members([1, 2, 3, 4, 5, 6, 7, 8]), ids=lambda tableau: tableau.name)
+def test_closed_forms_have_the_value_of_the_tableau(tableau: Tableau) -> None:
+    family = tableau.name.partition(":")[0]
+    most = {"gauss": 4, "lobatto-iiia": 5, "lobatto-iiib": 5, "chebyshev-lobatto": 7}.get(family, 3)
+    exact = exact_tableau(tableau)
+    assert (exact is not None) == (tableau.stages <= most)
+    if exact is not None:
+        for ours, numbers in zip((*exact[0], *exact[1:]), (*tableau.A, tableau.b, tableau.c), strict=True):
+            for expression, number in zip(ours, numbers, strict=True):
+                assert not expression.has(sp.Float, sp.sin, sp.cos)
+                assert abs(mp.mpf(str(sp.N(expression, 60))) - number) < FIFTY_DIGITS
+
+
+def test_a_tableau_of_the_users_has_no_closed_form() -> None:
+    assert exact_tableau(Tableau(name="gauss:1", A=((1,),), b=(1,), c=(1,))) is None
+    assert exact_tableau(Tableau(name="lobatto-iiia:1", A=((1,),), b=(1,), c=(1,))) is None
+    assert exact_tableau(collocation_tableau((0, HALF))) is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.fractions(min_value=0, max_value=1, max_denominator=50), min_size=1, max_size=6, unique=True))
+def test_collocation_is_equation_23_in_rational_arithmetic(abscissae: list[Fraction]) -> None:
+    c = sorted(abscissae)
+    t = sp.Symbol("t")
+    tableau = collocation_tableau(c)
+    for j, here in enumerate(c):
+        factors = [(t - sp.Rational(x)) / (sp.Rational(here) - sp.Rational(x)) for x in c if x != here]
+        primitive = sp.integrate(sp.expand(sp.prod(factors)), t)
+        column = [*(row[j] for row in tableau.A), tableau.b[j]]
+        for ours, end in zip(column, [*c, 1], strict=True):
+            exact = primitive.subs(t, sp.Rational(end))
+            assert abs(ours - mp.mpf(exact.p) / exact.q) < mp.mpf("1e-45")
+    assert tableau.order >= len(c)
+
+
+@pytest.mark.parametrize("s", [2, 3, 5])
+def test_lobatto_iiia_and_iiib_are_a_symplectic_pair(s: int) -> None:
+    first, second = lobatto_iiia(s), lobatto_iiib(s)
+    for i in range(s):
+        for j in range(s):
+            b = first.b
+            assert abs(b[i] * second.A[i][j] + b[j] * first.A[j][i] - b[i] * b[j]) < FIFTY_DIGITS
+    assert second.is_symmetric
+    assert not second.is_symplectic
+
+
+@pytest.mark.parametrize("s", [1, 2, 3, 5, 8, 12])
+def test_the_stability_function_of_gauss_is_the_diagonal_pade_approximant(s: int) -> None:
+    P, Q = gauss(s).stability_function()
+    taylor = [1 / mp.factorial(k) for k in range(2 * s + 1)]
+    p, q = mp.pade(taylor, s, s)
+    for ours, expected in ((P, p), (Q, q)):
+        assert all(abs(a / b - 1) < mp.mpf("1e-35") for a, b in zip(ours, expected, strict=True))
+
+
+def test_the_stability_function_of_radau_loses_its_leading_coefficient() -> None:
+    for tableau in (radau_iia(3), radau_ia(3)):
+        P, Q = tableau.stability_function()
+        assert (len(P), len(Q)) == (3, 4)
+        np.testing.assert_allclose(np.array(P, float), [1, 2 / 5, 1 / 20], rtol=1e-15)
+        np.testing.assert_allclose(np.array(Q, float), [1, -3 / 5, 3 / 20, -1 / 60], rtol=1e-15)
+
+
+@pytest.mark.parametrize("degree", range(1, 12))
+def test_collocation_without_the_left_end_is_a_stable_where_eigenvalues_say_so(degree: int) -> None:
+    """SC of the paper, Chebyshev-Lobatto without node 0: not A-stable from degree 3 on."""
+    c = [(1 + x) / 2 for x in nodes.chebyshev_lobatto(degree).points[1:]]
+    tableau = collocation_tableau(c)
+    A, b, _ = floats(tableau)
+    y = 1j * np.geomspace(0.1, 100, 4000)
+    systems = np.eye(degree) - y[:, None, None] * A
+    R = 1 + y * (np.linalg.solve(systems, np.ones((len(y), degree, 1)))[..., 0] @ b)
+    poles_right = np.all(np.linalg.eigvals(A).real > 0)
+    sampled = bool(poles_right and np.all(np.abs(R) <= 1 + 1e-9))
+    assert tableau.is_a_stable == sampled == (degree <= 2)
+
+
+def tableau_of(A: Matrix, b: tuple[object, ...]) -> Tableau:
+    return Tableau(name="mine", A=A, b=b, c=tuple(sum(row) for row in A))
+
+
+def test_a_pole_that_cancels_does_not_spoil_a_stability() -> None:
+    assert tableau_of(((HALF, 0), (0, -1)), (1, 0)).is_a_stable
+    assert tableau_of(((HALF, 0, 0), (0, -1, 0), (0, 0, -1)), (1, 0, 0)).is_a_stable
+    assert not tableau_of(((HALF, 0), (0, -1)), (HALF, HALF)).is_a_stable
+    assert not tableau_of(((-HALF,),), (1,)).is_a_stable
+
+
+def test_explicit_methods_are_not_a_stable() -> None:
+    euler = explicit_euler()
+    assert (euler.order, euler.is_a_stable, euler.is_symmetric, euler.is_symplectic) == (1, False, False, False)
+    assert euler.stability_function() == ((1, 1), (1,))
+    classical = tableau_of(((0, 0, 0, 0), (HALF, 0, 0, 0), (0, HALF, 0, 0), (0, 0, 1, 0)), ("1/6", "1/3", "1/3", "1/6"))
+    P, Q = classical.stability_function()
+    np.testing.assert_allclose(np.array(P, float), [1, 1, 1 / 2, 1 / 6, 1 / 24], rtol=1e-15)
+    assert Q == (1,)
+    assert not classical.is_a_stable
+
+
+@pytest.mark.parametrize(
+    "theta", [Fraction(2, 5), Fraction(499999, 1000000), HALF, Fraction(500001, 1000000), Fraction(1)]
+)
+def test_the_theta_method_is_a_stable_from_one_half_on(theta: Fraction) -> None:
+    assert tableau_of(((theta,),), (1,)).is_a_stable == (theta >= HALF)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    roots=st.lists(
+        st.tuples(st.integers(-4, 4), st.integers(1, 3)), min_size=1, max_size=3, unique_by=lambda pair: pair[0]
+    ),
+    sign=st.sampled_from([1, -1]),
+)
+def test_nonnegativity_sees_the_multiplicity_of_roots(roots: list[tuple[int, int]], sign: int) -> None:
+    polynomial = NumpyPolynomial([sign])
+    for root, multiplicity in roots:
+        polynomial *= NumpyPolynomial([-root, 1]) ** multiplicity
+    expected = all(polynomial(k + 0.5) >= 0 for k in range(6))
+    assert is_nonnegative([mp.mpf(int(c)) for c in polynomial.coef]) == expected
+
+
+@pytest.mark.parametrize("s", [3, 5])
+def test_radau_iia_agrees_with_the_abscissae_of_scipy(s: int) -> None:
+    inside = scipy.special.roots_jacobi(s - 1, 1, 0)[0]
+    _, _, c = floats(radau_iia(s))
+    np.testing.assert_allclose(c, (1 + np.r_[inside, 1]) / 2, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Tableau(name="mine", A=((0, 0),), b=(1,), c=(0,)), r"rows of lengths \[2\]"),
+        (lambda: Tableau(name="mine", A=(), b=(), c=()), "give s rows"),
+        (lambda: Tableau(name="mine", A=((0,),), b=(1,), c=("x",)), "not a real number"),
+        (lambda: collocation_tableau((0.5, 0.25)), "abscissa 1 is 0.25, not above"),
+        (lambda: collocation_tableau((0.5, 0.5)), "not above"),
+        (lambda: collocation_tableau(()), "at least one point"),
+        (lambda: lobatto_iiia(1), "at least 2, got 1"),
+        (lambda: chebyshev_lobatto(1), "at least 2, got 1"),
+        (lambda: gauss(0), "at least 1, got 0"),
+        (lambda: gauss(2.0), r"got 2\.0"),
+        (lambda: tableau_by_name("radau-iib:3"), "did you mean 'radau-iia'"),
+        (lambda: tableau_by_name("gauss"), "lacks its number"),
+    ],
+)
+def test_impossible_requests_are_refused(call: object, message: str) -> None:
+    gauss(2)
+    with pytest.raises(MethodError, match=message):
+        call()
+
+
+def test_the_euler_method_has_a_name_too() -> None:
+    assert tableau_by_name("explicit-euler") is explicit_euler()

@@ -1,0 +1,173 @@
+"""Hostile input: texts from a seeded generator and from a corpus, and a guard under which they are read.
+
+Everything is drawn from one ``random.Random``, so that a failing input is found again by its number alone.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Any, TypeVar
+
+CORPUS = Path(__file__).parents[1] / "corpus"
+SECONDS = 2.0
+"""Of processor time for one input, in which nothing else on the machine has a part."""
+
+Result = TypeVar("Result")
+
+
+class TookTooLongError(BaseException):
+    """Not an ``Exception``, so that nothing under test mistakes it for one of its own."""
+
+
+class RanCodeError(BaseException):
+    """Something was compiled, executed, written or started."""
+
+
+FORBIDDEN = (
+    *(
+        "compile",
+        "exec",
+        "subprocess.",
+        "socket.",
+        "shutil.",
+        "ctypes.",
+        "code.",
+        "webbrowser.",
+        "urllib.",
+        "tempfile.",
+    ),
+    *(
+        f"os.{name}"
+        for name in ("system", "exec", "posix_spawn", "spawn", "fork", "startfile", "kill", "putenv", "chdir")
+    ),
+    *(f"os.{name}" for name in ("remove", "rename", "mkdir", "rmdir", "link", "symlink", "chmod", "truncate")),
+)
+_watching: list[str] = []
+
+
+def _watch(event: str, arguments: tuple[Any, ...]) -> None:
+    if not _watching:
+        return
+    if event == "exec" and getattr(arguments[0], "co_name", "") == "<module>":
+        return  # SymPy imports some of its parts when they are first needed
+    if event == "compile" and str(arguments[1]).endswith(".py"):
+        return  # the same, where they are not yet compiled
+    if event == "compile" and str(arguments[0]).startswith("b'lambda _cls,"):
+        return  # a named tuple in one of them
+    writes = event == "open" and isinstance(arguments[1], str) and not set(arguments[1]).isdisjoint("wax+")
+    if writes or event.startswith(FORBIDDEN):
+        _watching.append(f"{event}{arguments!r:.200}")
+
+
+sys.addaudithook(_watch)
+
+
+@contextmanager
+def guarded(seconds: float = SECONDS, *, may_compile: bool = False) -> Iterator[None]:
+    """Refuse code that is run, files that are written, processes that are started, and more than some seconds.
+
+    SymPy's polynomials and Jinja's templates compile code of their own: behind the front end that may be.
+    """
+
+    def ring(*_: object) -> None:
+        raise TookTooLongError
+
+    before = signal.signal(signal.SIGVTALRM, ring)
+    _watching.append("")
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
+        events = _watching[1:]
+        _watching.clear()
+    if may_compile:
+        events = [event for event in events if not event.startswith(("compile(", "exec("))]
+    if events:
+        raise RanCodeError(events[0])
+
+
+@cache
+def seeds(name: str) -> tuple[str, ...]:
+    """Texts of ``corpus/<name>``: the files of a folder, or the lines of a file in Python's notation."""
+    path = CORPUS / name
+    if path.is_dir():
+        return tuple(file.read_bytes().decode("utf-8", "surrogateescape") for file in sorted(path.iterdir()))
+    return tuple(line.encode().decode("unicode_escape") for line in path.read_text("utf-8").splitlines())
+
+
+NUMBERS = """
+    0 1 2 3 64 65 0.1 .5 3. 1e-3 1e300 1e-300 1e308 1e309 1e-324 1e999 9999999999999999999 0.30000000000000004 1e0
+    00 1_0 0x10 1j 1e 1e+ 10000 1e5 1e-9999999 4503599627370497
+""".split()  # noqa: SIM905  (a paragraph of words reads better)
+NAMES = "x y z x x y t pi q q_dot p m sin exp e E I oo nan inf zoo S N Q".split()  # noqa: SIM905
+FUNCTIONS = """
+    sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log sqrt sqrt sin cos abs Abs eval __import__
+    lambdify Integer Symbol sign gamma
+""".split()  # noqa: SIM905
+OPERATORS = ["+", "-", "*", "/", "**", "+", "*", " - ", " + "]
+POISON = [
+    "__import__('os').system('x')", "().__class__", "x.__class__", "lambda x: x", "eval('1')",
+    "open('f','w')", "'a'*9**9",
+    "{0}", "[x]", "x;y", "x=1", "*/", "/*", "\\", "\n#include <x>", "`ls`", "$(ls)", "%s%n", "\x00", "\ud800", "\u202e",
+    "٣", "ｘ", "x̂", "'''", '"""', "\r", "\t", "**", "((((((((", "))))))))", "--------", "1" * 400, "x" * 300,
+]  # fmt: skip
+
+
+def formula(random: Random, depth: int = 0) -> str:
+    """A text of the grammar, or nearly."""
+    kind = random.random()
+    if depth > 5 or kind < 0.30:
+        return random.choice(NUMBERS if random.random() < 0.4 else NAMES)
+    if kind < 0.65:
+        parts = [formula(random, depth + 1) for _ in range(random.choice((2, 2, 2, 3, 5)))]
+        return "".join(part + random.choice(OPERATORS) for part in parts[:-1]) + parts[-1]
+    if kind < 0.80:
+        return f"({formula(random, depth + 1)})"
+    if kind < 0.97:
+        arguments = ", ".join(formula(random, depth + 1) for _ in range(2 if random.random() < 0.1 else 1))
+        return f"{random.choice(FUNCTIONS)}({arguments})"
+    return random.choice(POISON)
+
+
+def mutated(random: Random, text: str, others: tuple[str, ...]) -> str:
+    """The text with a few characters or pieces taken out, doubled, changed or put in."""
+    for _ in range(random.choice((1, 1, 2, 4))):
+        start = random.randrange(len(text) + 1)
+        end = min(len(text), start + random.choice((0, 1, 1, 2, 8, 40)))
+        other = random.choice(others)
+        piece = random.randrange(len(other) + 1)
+        new = random.choice(
+            (
+                "",
+                text[start:end] * random.choice((2, 2, 30)),
+                random.choice(POISON),
+                random.choice(NUMBERS),
+                chr(
+                    random.choice(
+                        (0, 10, 34, 39, 46, 91, 93, 123, 125, 127, 233, 0x3B8, 0x2028, random.randrange(0xD800))
+                    )
+                ),
+                other[piece : piece + random.choice((3, 10, 60))],
+            )
+        )
+        text = text[:start] + new + text[end:]
+    return text[:4000]
+
+
+def quietly(
+    call: Callable[..., Result], *arguments: Any, expected: type[Exception], seconds: float = SECONDS
+) -> Result | None:
+    """What the call returns under the guard, ``None`` where it raises the expected error; others go through."""
+    with guarded(seconds):
+        try:
+            return call(*arguments)
+        except expected:
+            return None

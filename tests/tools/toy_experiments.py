@@ -1,0 +1,152 @@
+"""A small catalogue for the tests of the runner and of the report: everything a result can hold, and all that fails."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import sympy
+
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.methods import SVI
+from scvi_codegen.models.problems import problem
+from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, draw_powers, panels
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Check,
+    Experiment,
+    Formula,
+    Listing,
+    Paragraph,
+    Picture,
+    Result,
+    Table,
+    Verdict,
+    holds,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LONG_LINE = "double energy = 0.5*(v[0]*v[0] + v[1]*v[1]) - mu/sqrt(q[0]*q[0] + q[1]*q[1]);  /* kept on one line */"
+
+
+def draw_curves(t: np.ndarray, svi: np.ndarray, sc: np.ndarray, figure: Figure) -> None:
+    left, middle, right = panels(figure, 1, 3)
+    draw_error(left, t, svi, "SVI")
+    draw_error(left, t, sc, "SC")
+    left.set(xlabel="t", title="energy error")
+    left.legend()
+    draw_orbit(middle, np.cos(t), np.sin(t), "exact")
+    middle.plot([0.0], [0.0], "o", color="k", markerfacecolor="w", label="hollow")
+    middle.set(xlabel="$q_1$", ylabel="$q_2$")
+    draw_powers(right, np.geomspace(0.01, 1.0, 5), [(1.0, 3)])
+
+
+def figure_4(results: Mapping[str, Result]) -> Result:
+    t = np.linspace(0.0, 50.0, 2000)
+    svi, sc = 1e-9 * (1.1 + np.sin(t)), 1e-9 * np.exp(0.3 * t)
+    largest = float(svi.max()), float(sc.max())
+    return Result(
+        name="figure-4",
+        title="Energy errors of <SVI> & SC",
+        setting=(
+            "Harmonic oscillator, h = 1e-1, T = 50.",
+            "The caption does not say how many Gauss points; s were taken.",
+        ),
+        checks=(
+            Check(
+                claim="SVI keeps the energy better than SC.",
+                measured=f"The largest errors are {largest[0]:.2e} and {largest[1]:.2e}, that is h^2 < 1 & -1 > -2.",
+                verdict=holds(largest[0] < largest[1]),
+                bears_on=("accuracy",),
+            ),
+            Check(claim="SC is stable.", measured="It is not.", verdict=Verdict.FAILS),
+        ),
+        tables=(
+            Table(
+                columns=("method", "largest error", "steps"), rows=(("SVI", largest[0], 500), ("SC", largest[1], None))
+            ),
+            Table(
+                name="series", columns=("t", "SVI"), rows=tuple(zip(t.tolist(), svi.tolist(), strict=True)), shown=False
+            ),
+        ),
+        picture=Picture(draw=partial(draw_curves, t, svi, sc)),
+    )
+
+
+def section(results: Mapping[str, Result]) -> Result:
+    equations = derive(problem("planar-pendulum").system, SVI(2), radicals=True).equations
+    table = sympy.Matrix(8, 8, lambda i, j: sympy.sqrt(i + 2) / (j + 3))
+    return Result(
+        name="section-3.1",
+        title="Section 3.1: the equations of one step",
+        setting=(),
+        body=(
+            Paragraph("They are solved for Q^1 and Q^2 <the positions>."),
+            *(Formula(equation.residual, sympy.S.Zero, equation.number) for equation in equations),
+            Formula(table, sympy.Symbol("D"), "11"),
+            Formula(sympy.Eq(sympy.Symbol("theta_1_dot"), sympy.Symbol("p_k") / sympy.Symbol("m"))),
+            Listing(LONG_LINE),
+        ),
+    )
+
+
+def table_8(results: Mapping[str, Result]) -> Result:
+    columns = tuple(
+        f"{name} of {method}" for method in ("SVI", "SC", "SRK") for name in ("iterations", "error", "time")
+    )
+    row = (8, 1.25e-11, 0.5, None, None, None, 1520, 0.25, 1e-3)
+    verdict = results["figure-4"].verdict
+    return Result(
+        name="table-8",
+        title="Iterations",
+        setting=("One setting.",),
+        checks=(Check(claim="As in Fig. 4.", measured="See figure-4, not figure-40.", verdict=verdict),),
+        tables=(Table(columns=columns, rows=(row, row), formats={"time of SVI": ".2f"}),),
+    )
+
+
+def shown(results: Mapping[str, Result]) -> Result:
+    return Result(name="table-9", title="Numbers alone", setting=("None.",))
+
+
+def broken(results: Mapping[str, Result]) -> Result:
+    raise ValueError("no such\nluck")
+
+
+def crash(results: Mapping[str, Result]) -> Result:
+    os._exit(7)
+
+
+def unportable(results: Mapping[str, Result]) -> Result:
+    return Result(name="unportable", title="", setting=(), picture=Picture(draw=lambda figure: None))
+
+
+def misnamed(results: Mapping[str, Result]) -> Result:
+    return Result(name="another", title="", setting=())
+
+
+def slow(results: Mapping[str, Result]) -> Result:
+    time.sleep(60.0)
+    raise AssertionError("it was not interrupted")
+
+
+_ALL = (
+    Experiment(name="section-3.1", title="Section 3.1", run=section),
+    Experiment(name="figure-4", title="Energy errors", run=figure_4),
+    Experiment(name="table-8", title="Iterations", run=table_8, needs=("figure-4",)),
+    Experiment(name="table-9", title="Numbers alone", run=shown),
+    Experiment(name="broken", title="Fails", run=broken),
+    Experiment(name="after-broken", title="Cannot run", run=shown, needs=("figure-4", "broken")),
+    Experiment(name="last", title="Cannot run either", run=shown, needs=("after-broken",)),
+    Experiment(name="crash", title="Ends its process", run=crash),
+    Experiment(name="unportable", title="Cannot travel", run=unportable),
+    Experiment(name="misnamed", title="Calls itself something else", run=misnamed),
+    Experiment(name="slow", title="Takes a minute", run=slow),
+)
+EXPERIMENTS = {experiment.name: experiment for experiment in _ALL}
+GOOD = ("section-3.1", "figure-4", "table-8", "table-9")

@@ -1,0 +1,179 @@
+"""The certificate: whole integrators pass it, and no fault of the generator does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from certified_cases import CASES
+from click.testing import CliRunner
+from faults import Mutation
+from mutations import MUTATIONS
+from sabotage import certified
+from samples import QUICK_FLAGS
+
+from scvi_codegen import SVI, Certificate, verify
+from scvi_codegen.cli import main
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.derivation.equations import derive
+from scvi_codegen.errors import StateError
+from scvi_codegen.exact.motion import motion_of
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.methods import Gauss, SpectralCollocation
+from scvi_codegen.models.model_file import Model, save_model
+from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.problems import problem
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.verification.certificate import BrokenError, Check, Finding, Outcome, checked
+
+QUICK = ("numbers printed with 8 digits", "a slope five per cent off", "half of the discrete action", "L_vq v lost")
+
+
+def caught(mutation: Mutation) -> tuple[Check, ...]:
+    return certified(mutation.case, mutation.apply, edits_text=mutation.edits_text).broken
+
+
+@pytest.mark.parametrize("mutation", [one for one in MUTATIONS if one.name in QUICK], ids=lambda one: one.name)
+def test_a_fault_is_caught(mutation: Mutation) -> None:
+    assert caught(mutation)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda one: one.name)
+def test_every_fault_is_caught(mutation: Mutation, record_property) -> None:
+    found = caught(mutation)
+    record_property("caught by", ", ".join(check.name for check in found))
+    assert found
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_sabotaged_passes_whole(name: str) -> None:
+    certificate = certified(CASES[name])
+    assert certificate.passed, certificate.to_text()
+    assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.KEPT}
+
+
+# What a certificate says.
+
+
+def pendulum_certificate(**changes: object) -> Certificate:
+    system = problem("planar-pendulum").system
+    return verify(system, SVI(2), [0.7], [0.9], h=0.2, flags=QUICK_FLAGS, **changes)
+
+
+def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
+    certificate = pendulum_certificate()
+    assert certificate.passed
+    assert not certificate.not_measured
+    assert {"stage equations", "Newton's matrix", "symplecticity", "reversal", "order", "largest step"} <= {
+        check.name for check in certificate.checks
+    }
+    certificate.save(tmp_path / "certificate.json")
+    read = json.loads((tmp_path / "certificate.json").read_text())
+    assert read["passed"] is True
+    assert len(read["checks"]) == len(certificate.checks)
+    assert read["checksum"] == certificate.checksum
+    assert "every promise measured is kept" in certificate.to_text()
+
+
+def test_a_state_is_found_where_none_is_given() -> None:
+    certificate = verify(problem("planar-pendulum").system, Gauss(2), flags=QUICK_FLAGS, solver="newton")
+    assert certificate.passed
+    assert certificate.h > 0
+    with pytest.raises(StateError, match="both q and p"):
+        verify(problem("planar-pendulum").system, Gauss(2), [0.1], flags=QUICK_FLAGS)
+
+
+def test_another_integrator_than_the_one_promised_is_not_certified() -> None:
+    system = problem("planar-pendulum").system
+    other = compile_stepper(system, SpectralCollocation(2), flags=QUICK_FLAGS)
+    names = {check.name for check in pendulum_certificate(stepper=other).broken}
+    assert {"stage equations", "symplecticity", "reversal"} <= names
+
+
+@pytest.mark.parametrize(
+    ("measure", "outcome"),
+    [
+        (lambda: Finding(1.0, 2.0), Outcome.KEPT),
+        (lambda: Finding(3.0, 2.0), Outcome.BROKEN),
+        (lambda: Finding(3.0, 2.0, at_least=True), Outcome.KEPT),
+        (lambda: Finding(float("nan"), 2.0), Outcome.BROKEN),
+        (lambda: Finding(float("nan"), 2.0, at_least=True), Outcome.BROKEN),
+        (lambda: broken(BrokenError("it fails")), Outcome.BROKEN),
+        (lambda: broken(StateError("it is singular")), Outcome.NOT_MEASURED),
+        (lambda: broken(ZeroDivisionError("by zero")), Outcome.NOT_MEASURED),
+    ],
+)
+def test_what_cannot_be_measured_is_never_called_kept(measure, outcome) -> None:
+    (check,) = checked("name", "promise", measure)
+    assert check.outcome is outcome
+    assert check.outcome is not Outcome.NOT_MEASURED or check.remark
+
+
+def broken(error: Exception) -> Finding:
+    raise error
+
+
+# What it measures with.
+
+
+def test_the_exact_motion_is_exact() -> None:
+    oscillator = problem("harmonic-oscillator").system
+    q, p = motion_of(oscillator).flow([1.0], [0.0], 2)
+    assert abs(q[0] - mp.cos(2)) < mp.mpf("1e-43")
+    assert abs(p[0] + mp.sin(2)) < mp.mpf("1e-43")
+
+
+@pytest.mark.parametrize("name", ["relativistic-particle", "double-pendulum"])
+def test_velocities_are_found_where_newton_would_leave_the_domain(name: str) -> None:
+    motion = motion_of(problem(name).system)
+    size = motion.system.dimension
+    q, v = np.array([mp.mpf("0.3")] * size), np.array([mp.mpf("0.9")] * size)
+    found = motion.velocity(q, motion.momentum(q, v, mp.zero), mp.zero)
+    assert max(abs(found - v)) < mp.mpf("1e-40")
+
+
+def test_the_derived_step_is_that_of_the_closed_form() -> None:
+    """Its unknowns satisfy the equations that ``derive`` writes out."""
+    system, method = problem("planar-pendulum").system, SVI(2)
+    solved, derived = derived_step(system, method)([0.7], [0.4], 0.2), derive(system, method)
+    values = {entry.symbol: entry.value for entry in derived.entries} | dict(
+        zip(derived.unknowns, solved.unknowns, strict=True)
+    )
+    values |= {derived.state[0][0]: mp.mpf(0.7), derived.state[1][0]: mp.mpf(0.4), derived.step: mp.mpf(0.2)}
+    values |= {name: mp.mpf(value) for name, value in system.constants.items()}
+    for equation in derived.equations:
+        assert abs(evaluate(equation.residual, values)) < mp.mpf("1e-45")
+    assert abs(evaluate(derived.end_momentum[0].residual, values) - solved.p[0]) < mp.mpf("1e-45")
+
+
+# The command line.
+
+
+def command(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(main, ["verify", *words])
+    return result.exit_code, result.output
+
+
+def test_verify_a_model_file_and_what_was_generated_from_it(tmp_path: Path) -> None:
+    entry = problem("planar-pendulum")
+    model = Model(system=entry.system, method=SVI(2), q=(0.7,), velocity=(0.1,), h=0.2, steps=10)
+    save_model(model, tmp_path / "pendulum.toml")
+    code, output = command(str(tmp_path / "pendulum.toml"))
+    assert code == 0, output
+    assert json.loads((tmp_path / "pendulum.certificate.json").read_text())["passed"] is True
+
+    folder = generate_package(model, tmp_path / "pendulum_svi")
+    source = folder / "pendulum_svi.c"
+    text = source.read_text()
+    source.write_text(text.replace("value[0] = -", "value[0] = -1.001*", 1))
+    assert source.read_text() != text
+    code, output = command(str(folder))
+    assert code == 1
+    assert "broken: " in output
+    assert json.loads((folder / "certificate.json").read_text())["passed"] is False
+    assert command(str(folder), "--degree", "3")[0] == 2
