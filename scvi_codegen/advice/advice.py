@@ -25,7 +25,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Advice", "Evidence", "advise"]

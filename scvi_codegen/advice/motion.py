@@ -16,7 +16,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI, Method
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.events import EventLike
 from scvi_codegen.runtime.stepper import Stepper

@@ -24,7 +24,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["run_paper_tables"]

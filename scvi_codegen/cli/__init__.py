@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from scvi_codegen.cli.recording import RecordedOutcome
     from scvi_codegen.cli.running import Outcome
     from scvi_codegen.models.model_file import Model
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.rendering.text import Embedded
 
 __all__ = ["main"]
@@ -186,7 +186,7 @@ def run(
     _check_outputs(output, plot, ensemble)
     _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
 
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}

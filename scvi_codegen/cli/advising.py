@@ -12,7 +12,7 @@ from scvi_codegen.cli.running import duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model_file import Model
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 
 __all__ = ["advised_model"]
 

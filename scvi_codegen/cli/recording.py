@@ -15,7 +15,7 @@ import click
 if TYPE_CHECKING:
     from scvi_codegen.errors import StepFailedError
     from scvi_codegen.models.model_file import Model
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.results.recording import RecordedRun
     from scvi_codegen.runtime.run import Run
 

@@ -18,7 +18,7 @@ from scvi_codegen.cli.conservation import energy_report, momentum_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.models.model_file import Model
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import Trajectory
 

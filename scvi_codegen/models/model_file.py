@@ -54,7 +54,7 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import Problem, problem
 
 if TYPE_CHECKING:
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.run import Run
     from scvi_codegen.runtime.stepper import Array, Stepper
 

@@ -3,58 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_count, checked_number
+from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["STATUS", "Binding", "SolverOptions", "checked_options", "step_failure"]
-
-STATUS = {1: "not converged", 2: "singular", 3: "not finite"}
-ADVICE = {
-    "not converged": "try a smaller step, or more iterations",
-    "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
-    "not finite": "the Lagrangian is undefined there, or the step is far too large",
-}
-MOST_ITERATIONS = 10**6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolverOptions:
-    """When the iteration on the stage equations has converged.
-
-    Attributes:
-        tolerance: size of the last update relative to the state (default: round-off), or absolute.
-        max_iterations: after which a step fails.
-        absolute: compare the update itself, the paper's rule max(|dQ|, |dP|) < TOL.
-    """
-
-    tolerance: float = 2.0**-52
-    max_iterations: int = 50
-    absolute: bool = False
-
-    def __post_init__(self) -> None:
-        if not checked_number(self.tolerance, "the tolerance") > 0.0:
-            raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
-        if not isinstance(self.absolute, bool):
-            raise StateError(f"absolute must be True or False, not {self.absolute!r}")
-        checked_count(self.max_iterations, "max_iterations", least=1)
-        if self.max_iterations > MOST_ITERATIONS:
-            raise StateError(f"max_iterations must be at most {MOST_ITERATIONS}, not {self.max_iterations}")
-
-
-def checked_options(options: SolverOptions | None) -> SolverOptions | None:
-    """The options, or StateError for something else."""
-    if options is not None and not isinstance(options, SolverOptions):
-        raise StateError(f"options must be SolverOptions(...), not {options!r}")
-    return options
+__all__ = ["Binding"]
 
 
 class Binding:
@@ -97,15 +55,3 @@ class Binding:
             f"{self._interface.prefix}_options *",
             [options.tolerance, options.max_iterations, int(options.absolute)],
         )
-
-
-def step_failure(
-    status: int, report: Any, *, step: int, h: float, trajectory: Trajectory | None = None
-) -> StepFailedError:
-    """The exception for a failed step: which, when, how far the iteration was, what to try."""
-    word = STATUS[status]
-    message = (
-        f"step {step} at t = {report.t:.17g} with h = {h:g} failed: {word} "
-        f"(last update {report.change:.3g}, {report.iterations} iterations in all); {ADVICE[word]}"
-    )
-    return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change, trajectory=trajectory)

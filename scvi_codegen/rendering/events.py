@@ -27,8 +27,9 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.errors import EventError, SystemDefinitionError
 from scvi_codegen.formulas.grammar import closest, evaluated, parse_expression, unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
-from scvi_codegen.ir.program import Kernel
-from scvi_codegen.lowering.program import lower_kernel, lower_matrix, lower_vector
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EventSearch, render_events
 from scvi_codegen.tables.precision import mp

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
-from scvi_codegen.ir.program import Constant, Expression, Kernel, Load, Operation, Sweep
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.ir.sweeps import Sweep
 
 __all__ = [
     "constants",

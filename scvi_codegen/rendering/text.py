@@ -9,20 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from itertools import chain
 from typing import Literal, TypeAlias, get_args
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-from scvi_codegen.files.templates import template_folder
-from scvi_codegen.ir.program import CoupledSweep, Family, Kernel, Program, SeparableSweep, Sweep
+from scvi_codegen.ir.families import Family
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
+from scvi_codegen.rendering.environment import template_environment
 from scvi_codegen.rendering.printer import (
     constants,
     lane_functions,
-    print_lane_statements,
-    print_number,
-    print_statements,
     scalar_functions,
 )
 from scvi_codegen.rendering.single_precision import SINGLE_UNIT, check_single, to_single
@@ -50,24 +47,39 @@ DEFAULT_TOLERANCE = 2.0**-52
 """Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
 
 MAX_ITERATIONS = 50
+
 ROUNDOFF_LEVEL = 1e-11
+
 SINGLE_ROUNDOFF_LEVEL = 1e-4
+
 KEEP_CHANGE = 1e-2
+
 KEEP_RATE = 0.1
+
 GOOD_GUESS = 1e-3
 """Relative error below which the next guess is continued from two steps, not one."""
+
 MOST_TRIALS = 200
+
 SMALL_PART = 0.03
+
 STEEPNESS = 8.0
+
 BISECTIONS = 30
 """Halvings of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60."""
+
 POINT_SOURCES = ("u", "t")
+
 TRAJECTORY_SOURCES = ("u", "parameters")
+
 ENSEMBLE_LANES = 8
+
 INVERSE_ROOT = "inverse_root_"
+
 LARGEST_INLINED = 150
 """Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies
 3 per cent, a chain of 64 masses 20."""
+
 VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
@@ -138,7 +150,7 @@ def render_embedded(program: Program, precision: Embedded) -> Source:
 
 
 def _render(prefix: str, context: Mapping[str, object]) -> Source:
-    environment = _environment()
+    environment = template_environment()
     return Source(
         prefix=prefix,
         header=environment.get_template("stepper.h.jinja").render(context),
@@ -163,7 +175,7 @@ def render_ensemble(program: Program) -> Source | None:
         "lane_meaning": "trajectories",
         **_vector_context(sweep, TRAJECTORY_SOURCES),
     }
-    environment = _environment()
+    environment = template_environment()
     return Source(
         prefix=prefix,
         header=environment.get_template("ensemble.h.jinja").render(context),
@@ -191,7 +203,7 @@ def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
         "bisections": BISECTIONS,
         "inverse_roots": [k for k in needed if f" {INVERSE_ROOT}{k}(double" not in source.code],
     }
-    environment = _environment()
+    environment = template_environment()
     return (
         environment.get_template("parts/events_declarations.h.jinja").render(context),
         environment.get_template("parts/events.c.jinja").render(context),
@@ -201,7 +213,7 @@ def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
     """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     context = {"interface": interface, "prefix": interface.prefix, "start": start}
-    environment = _environment()
+    environment = template_environment()
     texts = {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
     if precision == "single":
         check_single((*start.q, *start.p, *start.parameters, start.t, start.h))
@@ -333,69 +345,3 @@ def _binomial_series(k: int) -> list[float]:
     for j in range(1, 5):
         coefficients.append(coefficients[-1] * (k / 2 + j - 1) / j)
     return coefficients[1:]
-
-
-def _signature(kernel: Kernel) -> str:
-    """C parameters of a kernel: only what it uses."""
-    parts = ["const double *u"] if kernel.uses_arguments else []
-    parts += ["double t"] if kernel.uses_time else []
-    parts += ["const double *parameters"] if kernel.uses_parameters else []
-    parts += ["double *value"]
-    parts += ["double *slope"] if len(kernel.results) > kernel.values else []
-    return ", ".join(parts)
-
-
-def _lane_signature(kernel: Kernel, sources: tuple[str, ...]) -> str:
-    """The same with vectors in place of numbers."""
-    signature = _signature(kernel).replace("const double *u", "const lanes *u").replace("double *value", "lanes *value")
-    signature = signature.replace("double *slope", "lanes *slope")
-    if "t" in sources:
-        return signature.replace("double t", "lanes t")
-    return signature.replace("const double *parameters", "const lanes *parameters")
-
-
-def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:
-    """The same parameters in a call."""
-    parts = [u] if kernel.uses_arguments else []
-    parts += [t] if kernel.uses_time else []
-    parts += [parameters] if kernel.uses_parameters else []
-    parts += [value]
-    parts += [slope] if slope is not None else []
-    return ", ".join(parts)
-
-
-def _power_of_h(k: int) -> str:
-    """C text of h^k as a factor."""
-    product = "*".join(["h"] * abs(k))
-    if k == 0:
-        return "1.0"
-    return product if k > 0 else f"1.0/({product})"
-
-
-def _counts(kernel: Kernel) -> str:
-    return ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
-
-
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(template_folder()),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,
-    )
-    environment.globals["power_of_h"] = _power_of_h
-    environment.filters |= {
-        "number": print_number,
-        "signature": _signature,
-        "call_arguments": _call_arguments,
-        "counts": _counts,
-        "pairs": lambda entries: ", ".join(f"{{{i}, {j}}}" for i, j in entries),
-        "transposed": lambda rows: tuple(zip(*rows, strict=True)),
-        "lane_signature": _lane_signature,
-        "statements": print_statements,
-        "lane_statements": print_lane_statements,
-    }
-    return environment

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.native.binding import step_failure
+from scvi_codegen.native.options import step_failure
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.trajectory import Trajectory

@@ -19,7 +19,7 @@ from scvi_codegen.native.arguments import checked_count
 from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters, EnsembleTrajectory
 
 if TYPE_CHECKING:
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["integrate_ensemble"]

@@ -25,11 +25,11 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_count, checked_number, checked_step, empty_array, real_array
-from scvi_codegen.native.binding import checked_options
+from scvi_codegen.native.options import checked_options
 from scvi_codegen.runtime.trajectory import relative_changes
 
 if TYPE_CHECKING:
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.run import Run
     from scvi_codegen.runtime.stepper import Stepper
 

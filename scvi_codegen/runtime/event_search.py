@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, StateError
-from scvi_codegen.native.binding import step_failure
+from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.dense_output import grid_tolerance
 from scvi_codegen.runtime.events import Crossings
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.native.arguments import checked_count, empty_array
-from scvi_codegen.native.binding import SolverOptions, step_failure
+from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.trajectory import Trajectory

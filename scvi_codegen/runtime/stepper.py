@@ -20,7 +20,8 @@ from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
-from scvi_codegen.native.binding import STATUS, Binding, SolverOptions, step_failure
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.dense_output import checked_times, states_at, times_of_run
 from scvi_codegen.runtime.event_search import crossings_of

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from scvi_codegen.native.binding import SolverOptions
+    from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.events import Crossings, Event, EventLike
     from scvi_codegen.runtime.stepper import Stepper
 

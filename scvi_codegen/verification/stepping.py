@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.exact.motion import Numbers, numbers
 from scvi_codegen.exact.step import SolvedStep, compiled_equations
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked

@@ -14,7 +14,7 @@ from scvi_codegen.exact.motion import Motion, motion_of
 from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.linearisation import Linearised, linearised
 

@@ -9,7 +9,7 @@ from typing import Any
 import sympy
 from sabotage import Case, Make, Sabotage, changed_result
 
-from scvi_codegen.ir.program import Operation
+from scvi_codegen.ir.kernel import Operation
 from scvi_codegen.lowering.solvers import choice
 from scvi_codegen.methods import SVI, RungeKutta, shooting
 from scvi_codegen.tables.precision import mp

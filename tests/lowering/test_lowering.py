@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, jacobian
-from scvi_codegen.ir.program import Constant, Expression, Kernel, Load, Operation
-from scvi_codegen.lowering.program import DEEPEST_EXPRESSION, lower, lower_kernel
+from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import PROBLEMS, double_pendulum, duffing, fput_chain, kepler, problem
 from scvi_codegen.native.building import find_compiler

@@ -16,7 +16,7 @@ from samples import sample_named, stepper_for
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import generate_source
 from scvi_codegen.errors import MethodError, PackageError
-from scvi_codegen.lowering.program import FUNCTIONS
+from scvi_codegen.ir.arithmetic import FUNCTIONS
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method

@@ -21,7 +21,7 @@ from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
 from scvi_codegen.models.model_file import Model, dump_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory

@@ -24,7 +24,7 @@ from scvi_codegen.methods import (
     StoermerVerlet,
 )
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.events import Event
 from scvi_codegen.runtime.stepper import Stepper
 

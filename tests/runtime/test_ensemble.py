@@ -27,7 +27,7 @@ from scvi_codegen.methods import SCVI, SVI, Gauss, Method, RadauIIA, StoermerVer
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model_file import Model
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble, EnsembleTrajectory, integrate_ensemble
 from scvi_codegen.runtime.stepper import Stepper
 

@@ -13,7 +13,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 
 METHODS = (
     SVI(3),

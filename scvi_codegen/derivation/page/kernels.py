@@ -10,7 +10,9 @@ from sympy import Symbol
 
 from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines, operations
 from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section, Table
-from scvi_codegen.ir.program import Kernel, Program, SeparableSweep
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.sweeps import SeparableSweep
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.outline import Function

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sympy import Symbol
 
-from scvi_codegen.lowering.program import argument_name
+from scvi_codegen.lowering.families import argument_name
 from scvi_codegen.mechanics.forms import constitutive, euler_lagrange, force, momentum
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter

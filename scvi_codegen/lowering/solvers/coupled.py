@@ -12,8 +12,9 @@ the rounded map still has a generating function: its energy error does not drift
 from __future__ import annotations
 
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.program import CoupledSweep, Kernel
-from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.sweeps import CoupledSweep
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
 from scvi_codegen.mechanics.forms import force, momentum

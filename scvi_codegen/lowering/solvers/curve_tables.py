@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.program import NodeTables, PointTables
-from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.sweeps import NodeTables, PointTables
 from scvi_codegen.lowering.solvers.padding import guess_tables, pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import force, momentum
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -8,8 +8,8 @@ variational method still has a generating function.
 
 from __future__ import annotations
 
-from scvi_codegen.ir.program import HamiltonianSweep
-from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.sweeps import HamiltonianSweep
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables

@@ -6,8 +6,8 @@ Lagrangian, they are inside, and they never delay convergence.
 
 from __future__ import annotations
 
-from scvi_codegen.ir.program import GuessTables, LaneTable, SplitMatrix, SplitVector
-from scvi_codegen.lowering.program import lower_matrix, lower_vector
+from scvi_codegen.ir.rounding import lower_matrix, lower_vector
+from scvi_codegen.ir.sweeps import GuessTables, LaneTable, SplitMatrix, SplitVector
 from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 

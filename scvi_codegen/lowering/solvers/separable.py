@@ -12,8 +12,9 @@ the last evaluation of the points and in the increments.
 from __future__ import annotations
 
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.program import Kernel, SeparableSweep
-from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.sweeps import SeparableSweep
 from scvi_codegen.lowering.solvers.padding import (
     MOST_LANES,
     guess_tables,

@@ -10,8 +10,9 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.ir.program import Kernel, ShootingSweep
-from scvi_codegen.lowering.program import lower_kernel
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.sweeps import ShootingSweep
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import (

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.program import Splitting
-from scvi_codegen.lowering.program import lower_kernel, lower_vector
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.rounding import lower_vector
+from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.mechanics.forms import force, is_separable, mass_entries
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.system import MechanicalSystem

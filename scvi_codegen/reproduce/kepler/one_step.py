@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, exact_flow, perihelion
 from scvi_codegen.reproduce.laboratory.experiment import Check, Verdict, holds
 from scvi_codegen.reproduce.laboratory.running import stepper_of

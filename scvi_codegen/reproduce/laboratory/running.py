@@ -13,8 +13,8 @@ from functools import lru_cache
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.binding import SolverOptions
 from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
 

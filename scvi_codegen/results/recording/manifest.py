@@ -10,7 +10,7 @@ from typing import Any
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
-from scvi_codegen.native.binding import SolverOptions
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.version import __version__

@@ -1,0 +1,87 @@
+"""Families of points in loops: what is gathered, which kernel is evaluated, where its results are scattered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    pass
+from scvi_codegen.ir.kernel import Kernel
+
+__all__ = ["Family", "GatherLoop", "ScatterLoop", "SlopeBlock"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatherLoop:
+    """m arguments: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][i]``."""
+
+    name: str
+    offset: int
+    from_state: bool
+    power: int
+    table: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScatterLoop:
+    """m results: ``rows[r][i] += weight_n h^power table[n][r] value[offset + i]``; the last column belongs to p1."""
+
+    name: str
+    offset: int
+    power: int
+    table: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlopeBlock:
+    """Non-zero slopes of one scatter against one gather: ``slope[first + e]`` is d value[i_e] / d u[j_e]."""
+
+    scatter: int
+    gather: int
+    first: int
+    entries: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """Points of one kind with the loops around their kernel.
+
+    Attributes:
+        arguments: what the gathers give, m each.
+        value, slope: the kernel, and the kernel with its derivatives.
+        action: what is summed to the discrete Lagrangian with h^(1 + action_power), or ``None``.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    abscissae: tuple[float, ...]
+    weights: tuple[float, ...]
+    gathers: tuple[GatherLoop, ...]
+    scatters: tuple[ScatterLoop, ...]
+    value: Kernel
+    slope: Kernel
+    blocks: tuple[SlopeBlock, ...]
+    action: Kernel | None
+    action_power: int
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return len(self.abscissae)
+
+    @property
+    def uses_time(self) -> bool:
+        """Whether the kernel depends on time explicitly (its slopes then can only do so, too)."""
+        return self.value.uses_time or self.slope.uses_time
+
+    @property
+    def uses_step(self) -> bool:
+        """Whether h occurs around the kernel."""
+        powers = [loop.power for loop in self.gathers] + [loop.power for loop in self.scatters]
+        return self.uses_time or any(powers)
+
+    @property
+    def scratch(self) -> int:
+        """Arguments, values and slopes at all points."""
+        return self.points * (self.slope.arguments + len(self.slope.results))

@@ -1,0 +1,140 @@
+"""A kernel: straight-line arithmetic over its arguments, time and parameters.
+
+``u[i]`` are its arguments, ``t`` the time and ``parameters[i]`` the parameters: temporaries, each used more than once,
+then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary functions on
+binary64 numbers; there are no branches, loops or integers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    import sympy
+
+__all__ = ["Constant", "Expression", "Kernel", "Load", "Operation"]
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A binary64 number."""
+
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """``u[index]``, ``parameters[index]``, ``t`` (index -1) or temporary ``w[index]``, by ``source``."""
+
+    source: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """``operator`` applied to operands; anything but ``+ - * / neg`` is a call of that C function."""
+
+    operator: str
+    operands: tuple[Expression, ...]
+
+
+Expression: TypeAlias = Constant | Load | Operation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kernel:
+    """Straight-line code: ``temporaries[k]`` defines ``w[k]``; ``results`` are stored as soon as they can be.
+
+    Attributes:
+        name: C identifier.
+        arguments: length of ``u``.
+        temporaries, results: expressions.
+        values: how many of the results are values; the rest are slopes.
+        symbols: what ``u`` holds, in the symbols of the formulas.
+        formulas: what the results were before their common parts were found.
+    """
+
+    name: str
+    arguments: int
+    temporaries: tuple[Expression, ...]
+    results: tuple[Expression, ...]
+    values: int
+    symbols: tuple[sympy.Symbol, ...] = field(default=(), repr=False, compare=False)
+    formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def uses_arguments(self) -> bool:
+        """Whether any ``u[i]`` occurs."""
+        return self._uses("u")
+
+    @property
+    def uses_time(self) -> bool:
+        """Whether ``t`` occurs."""
+        return self._uses("t")
+
+    @property
+    def uses_parameters(self) -> bool:
+        """Whether any ``parameters[i]`` occurs."""
+        return self._uses("parameters")
+
+    def _uses(self, source: str) -> bool:
+        return any(_occurs(source, expression) for expression in (*self.temporaries, *self.results))
+
+    def operation_counts(self) -> dict[str, int]:
+        """Operations by name, in alphabetical order."""
+        counts: dict[str, int] = {}
+        for expression in (*self.temporaries, *self.results):
+            _count(expression, counts)
+        return dict(sorted(counts.items()))
+
+    def statements(self) -> Iterator[tuple[str, int, Expression]]:
+        """("w", "value" or "slope", index, expression): each result right after the last temporary that it needs."""
+        due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
+        for k, expression in enumerate(self.results):
+            due[1 + _last_temporary(expression)].append(k)
+        for k, ready in enumerate(due):
+            if k > 0:
+                yield "w", k - 1, self.temporaries[k - 1]
+            for number in ready:
+                slope = number >= self.values
+                yield "slope" if slope else "value", number - slope * self.values, self.results[number]
+
+    def __str__(self) -> str:
+        """The kernel as readable text, one assignment a line."""
+        lines = [f"kernel {self.name}(u[{self.arguments}], t, parameters)"]
+        for kind, k, expression in self.statements():
+            target = f"w{k}" if kind == "w" else f"{kind}[{k}]"
+            lines.append(f"  {target} = {_text(expression)}")
+        return "\n".join(lines)
+
+
+def _last_temporary(expression: Expression) -> int:
+    """The largest index of a temporary in an expression, -1 without one."""
+    if isinstance(expression, Load):
+        return expression.index if expression.source == "w" else -1
+    if isinstance(expression, Operation):
+        return max((_last_temporary(operand) for operand in expression.operands), default=-1)
+    return -1
+
+
+def _occurs(source: str, expression: Expression) -> bool:
+    if isinstance(expression, Load):
+        return expression.source == source
+    return isinstance(expression, Operation) and any(_occurs(source, operand) for operand in expression.operands)
+
+
+def _count(expression: Expression, counts: dict[str, int]) -> None:
+    if isinstance(expression, Operation):
+        counts[expression.operator] = counts.get(expression.operator, 0) + 1
+        for operand in expression.operands:
+            _count(operand, counts)
+
+
+def _text(expression: Expression) -> str:
+    if isinstance(expression, Constant):
+        return repr(expression.value)
+    if isinstance(expression, Load):
+        return "t" if expression.source == "t" else f"{expression.source}{expression.index}"
+    return f"({expression.operator} {' '.join(_text(operand) for operand in expression.operands)})"

@@ -1,0 +1,100 @@
+"""Families of points: kernels with their slopes, gathers and scatters as loops over rounded tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sympy
+
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.families import Family, GatherLoop, ScatterLoop, SlopeBlock
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.rounding import lower_matrix, lower_vector
+from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import Gather, PointFamily
+
+__all__ = ["argument_name", "lowered_family"]
+
+
+def _is_regular(system: MechanicalSystem) -> bool:
+    """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist."""
+    return not isinstance(system, HamiltonianSystem) or system.is_regular
+
+
+def lowered_family(system: MechanicalSystem, family: PointFamily) -> Family:
+    """A family of points in loops: its kernel with slopes, and rounded tables."""
+    common: dict[str, Any] = {
+        "arguments": family.arguments,
+        "time": system.time,
+        "parameters": system.parameters,
+    }
+    slopes, blocks = _slope_blocks(family)
+    return Family(
+        name=family.name,
+        arguments=tuple(argument_name(system, gather) for gather in family.gathers),
+        abscissae=lower_vector(family.abscissae),
+        weights=lower_vector(family.weights),
+        gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
+        scatters=tuple(_scatter_loop(family, s) for s in range(len(family.scatters))),
+        value=lower_kernel(f"{family.name}_value", values=family.results, **common),
+        slope=lower_kernel(f"{family.name}_slope", values=family.results, slopes=slopes, **common),
+        blocks=blocks,
+        action=_action(family, common) if family.in_action and _is_regular(system) else None,
+        action_power=family.scalar_power,
+    )
+
+
+def _action(family: PointFamily, common: dict[str, Any]) -> Kernel:
+    """The scalar of a family; that of the values is called after the function it is."""
+    name = "lagrangian" if family.name == "quadrature" else f"{family.name}_action"
+    return lower_kernel(name, values=(family.scalar,), **common)
+
+
+def argument_name(system: MechanicalSystem, gather: Gather) -> str:
+    """What a gather gives, as the formulas call it."""
+    names = {
+        system.coordinates: "q",
+        system.velocities: "v",
+        **dict(zip(curve_rates(system, 3), ("a", "j", "s"), strict=True)),
+        multipliers(system): "lambda",
+        system.auxiliaries: "p",
+        auxiliary_multipliers(system): "nu",
+    }
+    return names[gather.arguments]
+
+
+def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:
+    """Non-zero slopes, grouped by scatter and gather."""
+    slopes: list[sympy.Expr] = []
+    blocks = []
+    for s, scatter in enumerate(family.scatters):
+        for g, gather in enumerate(family.gathers):
+            entries = jacobian(scatter.results, gather.arguments)
+            if entries:
+                blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=tuple(entries)))
+                slopes.extend(entries.values())
+    return tuple(slopes), tuple(blocks)
+
+
+def _gather_loop(family: PointFamily, index: int) -> GatherLoop:
+    gather = family.gathers[index]
+    return GatherLoop(
+        name=f"{family.name}_gather_{index}",
+        offset=sum(len(other.arguments) for other in family.gathers[:index]),
+        from_state=bool(gather.table.entries[0][0]),
+        power=gather.power + 1,
+        table=lower_matrix(tuple(line[1:] for line in gather.table.entries)),
+    )
+
+
+def _scatter_loop(family: PointFamily, index: int) -> ScatterLoop:
+    scatter = family.scatters[index]
+    return ScatterLoop(
+        name=f"{family.name}_scatter_{index}",
+        offset=sum(len(other.results) for other in family.scatters[:index]),
+        power=scatter.power,
+        table=lower_matrix(scatter.table.entries),
+    )
