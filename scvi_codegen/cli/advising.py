@@ -8,7 +8,7 @@ from dataclasses import replace
 import click
 
 from scvi_codegen.advice.advice import Advice, Evidence, advise
-from scvi_codegen.cli.running import duration
+from scvi_codegen.cli.wording import duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model_file import Model

@@ -6,17 +6,18 @@ import math
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 
-if TYPE_CHECKING:
-    from scvi_codegen.methods import Method
-    from scvi_codegen.models.model_file import Model
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
+from scvi_codegen.models.model_file import Model, load_model
+from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = ["Choices", "model_arguments", "read_model"]
+__all__ = ["SOLVER_OPTION", "Choices", "model_arguments", "read_model"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -130,6 +131,15 @@ STATE_OPTIONS = (
 )
 
 
+SOLVER_OPTION = _option(
+    "--solver",
+    type=click.Choice(["auto", "fixed-point", "newton", "explicit"]),
+    default="auto",
+    show_default=True,
+    help="Of the stage equations; auto: explicit or fixed point where there is one, Newton where that fails.",
+)
+
+
 def model_arguments(command: Command, *, required: bool = True) -> Command:
     """Give a command the argument MODEL and the options of :class:`Choices`."""
     for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
@@ -144,8 +154,6 @@ def read_model(name: str, choices: Choices) -> Model:
         click.UsageError: if choices exclude each other.
         ScviCodegenError: as reading and building the model do.
     """
-    from dataclasses import replace
-
     if choices.p is not None and choices.velocity is not None:
         raise click.UsageError("--p and --velocity exclude each other")
     if choices.span is not None and choices.steps is not None:
@@ -165,9 +173,6 @@ def read_model(name: str, choices: Choices) -> Model:
 
 
 def _named_model(name: str) -> Model:
-    from scvi_codegen.errors import SystemDefinitionError
-    from scvi_codegen.models.model_file import Model, load_model
-    from scvi_codegen.models.problems import PROBLEMS, problem
 
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
@@ -182,8 +187,6 @@ def _named_model(name: str) -> Model:
 
 def _chosen_method(method: Method, choices: Choices) -> Method:
     """The method of the model with what the command line changes of it."""
-    from scvi_codegen.methods import ARGUMENTS, method_from_specification
-
     fields = ("degree", "stages", "order", "quadrature", "nodes", "space", "form", "variational", "abscissae")
     given = {field: getattr(choices, field) for field in fields if getattr(choices, field) is not None}
     if choices.method is None and not given:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scvi_codegen.cli.conservation import momentum_report
-from scvi_codegen.cli.running import counted, duration, interruptions, progress_bar
+from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.ensemble_file import EnsembleStates

@@ -8,16 +8,21 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import numpy as np
 
-if TYPE_CHECKING:
-    from scvi_codegen.errors import StepFailedError
-    from scvi_codegen.models.model_file import Model
-    from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.results.recording import RecordedRun
-    from scvi_codegen.runtime.run import Run
+from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.running import conserved, final_state
+from scvi_codegen.cli.wording import counted, duration
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import ModelFileError, StepFailedError
+from scvi_codegen.files import export
+from scvi_codegen.models.model_file import Model, dump_model, parse_model
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
+from scvi_codegen.runtime.run import Run
 
 __all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "is_folder", "standing"]
 
@@ -34,16 +39,13 @@ def is_folder(output: str) -> bool:
 
 def check_format(output: str, *, ensemble: bool) -> None:
     """Find out whether there is such a kind of file, and its library."""
-    from scvi_codegen.files.export import WRITERS
-    from scvi_codegen.files.export import check_format as check
-
-    known = (".npz", ".csv") if ensemble else tuple(WRITERS)
+    known = (".npz", ".csv") if ensemble else tuple(export.WRITERS)
     if Path(output).suffix.lower() not in known:
         what = f"an ensemble is written as {' or '.join(known)}"
         if not ensemble:
             what = f"a trajectory is written as {', '.join(known)} or into a folder {SUFFIX}"
         raise click.BadParameter(f"{what}, not as '{output}'", param_hint="'-o'")
-    check(output)
+    export.check_format(output)
 
 
 def check_resumed(context: click.Context) -> None:
@@ -79,8 +81,6 @@ class RecordedOutcome:
 
     def summary(self) -> str:
         """The run in a few lines."""
-        from scvi_codegen.cli.running import duration, final_state
-
         steps = self.run.steps - self.first
         lines = [standing(self.recorded)]
         if steps:
@@ -90,16 +90,11 @@ class RecordedOutcome:
 
     def _conserved(self) -> list[str]:
         """What was conserved, if there is a model to tell what should be."""
-        from numpy import errstate
-
-        from scvi_codegen.cli.running import conserved
-        from scvi_codegen.models.model_file import parse_model
-
         text = self.recorded.manifest.model
         if text is None or not self.run.steps:
             return []
         stride = -(-len(self.recorded) // LOOKED_AT)
-        with errstate(all="ignore"):
+        with np.errstate(all="ignore"):
             lines = list(conserved(parse_model(text), self.recorded[::stride]))
         return [f"in one of {stride} states kept:", *lines] if stride > 1 else lines
 
@@ -134,11 +129,6 @@ class Recording:
 
     def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions) -> RecordedOutcome:
         """Run a model into a folder, as far as it goes. Raises as :func:`record_run`."""
-        from scvi_codegen.compiler import compile_stepper
-        from scvi_codegen.errors import ModelFileError
-        from scvi_codegen.models.model_file import dump_model
-        from scvi_codegen.results.recording import record_run
-
         text = None
         with suppress(ModelFileError):
             text = dump_model(model)
@@ -150,8 +140,6 @@ class Recording:
 
     def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
         """Go on with the run in a folder. Raises as :func:`resume_run`."""
-        from scvi_codegen.results.recording import load_run, resume_run
-
         if steps is not None and span is not None:
             raise click.UsageError("--span and --steps exclude each other")
         recorded = load_run(folder)
@@ -162,10 +150,6 @@ class Recording:
 
     def _watched(self, act: Any, *arguments: Any, first: int, steps: int, **settings: Any) -> RecordedOutcome:
         """With a progress bar, ended by Ctrl-C or SIGTERM at a state that is written."""
-        from scvi_codegen.cli.running import interruptions, progress_bar
-        from scvi_codegen.errors import StepFailedError
-        from scvi_codegen.results.recording import load_run
-
         pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
         settings |= {name: value for name, value in pace.items() if value is not None}
         folder, failure, began, shown = arguments[-1], None, time.perf_counter(), first
@@ -193,8 +177,6 @@ class Recording:
 
 def standing(recorded: RecordedRun) -> str:
     """What runs in a folder and how far it is, in two lines."""
-    from scvi_codegen.cli.running import counted
-
     manifest = recorded.manifest
     t = manifest.t + recorded.steps * manifest.h
     far = "all" if recorded.finished else f"of {manifest.steps}"

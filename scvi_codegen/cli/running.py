@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from types import FrameType
 
-import click
 import numpy as np
 
 from scvi_codegen.cli.conservation import energy_report, momentum_report
+from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.models.model_file import Model
@@ -25,12 +21,8 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = [
     "Outcome",
     "conserved",
-    "counted",
-    "duration",
     "final_state",
     "integrate_model",
-    "interruptions",
-    "progress_bar",
     "summary",
 ]
 
@@ -114,17 +106,12 @@ def summary(model: Model, outcome: Outcome) -> str:
     return "\n".join([*lines, *final_state(run)])
 
 
-def counted(count: int, what: str) -> str:
-    """A number with its noun, in the plural if need be."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
 def _speed(outcome: Outcome, every: int) -> str:
     text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
-    counted = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
-    if not counted:
+    watched = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
+    if not watched:
         return text
-    return f"{text}, {int(outcome.trajectory.iterations.sum()) / counted:.2f} iterations a step"
+    return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"
 
 
 def conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
@@ -147,14 +134,6 @@ def final_state(run: Run) -> Iterator[str]:
         yield f"  and {len(names) - SHOWN_COORDINATES} coordinates more"
 
 
-def duration(seconds: float) -> str:
-    """A time in a unit that suits it."""
-    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
-        if seconds >= scale:
-            return f"{seconds / scale:.3g} {unit}"
-    return f"{seconds / 1e-9:.3g} ns"
-
-
 def _joined(pieces: list[Trajectory]) -> Trajectory:
     """One trajectory; each piece but the first begins with a state that is there already, or was not to be kept."""
     first, *rest = pieces
@@ -165,36 +144,3 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
         p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
         iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
     )
-
-
-@contextlib.contextmanager
-def interruptions() -> Iterator[list[int]]:
-    """Note the first SIGINT or SIGTERM instead of dying of it; a second one acts as always."""
-    caught: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield caught  # only the main thread may handle signals
-        return
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = {int(number): signal.getsignal(number) for number in signals}
-
-    def note(number: int, frame: FrameType | None) -> None:
-        caught.append(number)
-        signal.signal(number, before[number])
-
-    try:
-        for number in signals:
-            signal.signal(number, note)
-        yield caught
-    finally:
-        for number in signals:
-            signal.signal(number, before[number])
-
-
-@contextlib.contextmanager
-def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr if that is a terminal; the function given adds steps done."""
-    if not sys.stderr.isatty() or steps == 0:
-        yield lambda count: None
-        return
-    with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:
-        yield bar.update

@@ -9,15 +9,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from scvi_codegen.cli import main
+from scvi_codegen.cli import ABOUT, main
 from scvi_codegen.cli.choices import Choices, read_model
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
@@ -73,7 +75,7 @@ class TestHelp:
             assert "Example" in output_of(command, "-h") or command == "methods"
 
     def test_every_example_of_the_help_is_accepted(self):
-        texts = [output_of("--help"), *(output_of(command, "--help") for command in main.commands)]
+        texts = [output_of("--help"), *(output_of(command, "--help") for command in ABOUT)]
         Path("mine.toml").write_text(output_of("systems", "kepler"))
         found = [match[1] for text in texts for match in re.finditer(r"^ +scvi-codegen (\w.*)$", text, re.MULTILINE)]
         lines = dict.fromkeys(found)  # in order: some go on with what others wrote
@@ -90,13 +92,24 @@ class TestHelp:
 
         assert output_of("--version") == f"scvi-codegen, version {__version__}\n"
 
-    def test_help_does_not_wait_for_sympy_or_numpy(self):
+    @pytest.mark.parametrize(("word", "printed"), [("--help", "Usage"), ("--version", "version")])
+    def test_the_overview_does_not_wait_for_sympy_or_numpy(self, word, printed):
         script = (
             "import sys; sys.modules['sympy'] = sys.modules['numpy'] = sys.modules['mpmath'] = None\n"
-            "from scvi_codegen.cli import main; main(['--help'])"
+            f"from scvi_codegen.cli import main; main(['{word}'])"
         )
         result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-        assert "Usage" in result.stdout
+        assert printed in result.stdout
+
+    @pytest.mark.parametrize("name", ABOUT)
+    def test_each_command_that_is_listed_is_there(self, name):
+        command = main.get_command(click.Context(main), name)
+        assert command.name == name
+        assert command.params
+
+    def test_a_shell_completes_commands(self):
+        context = click.Context(main)
+        assert [item.value for item in main.shell_complete(context, "re")] == ["reproduce"]
 
     def test_a_mistyped_command_is_a_usage_error(self):
         assert "No such command" in error_of("rum", "kepler")
@@ -252,6 +265,23 @@ class TestRun:
         assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")
         assert Path("orbit.svg").read_text().startswith("<?xml")
 
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    def test_an_interrupted_run_keeps_what_was_computed(self, number, monkeypatch):
+        @contextmanager
+        def third_portion(steps: int) -> Iterator[Callable[[int], None]]:
+            done = []
+            yield lambda count: signal.raise_signal(number) if done.append(count) or len(done) == 3 else None
+
+        monkeypatch.setattr("scvi_codegen.cli.running.progress_bar", third_portion)
+        result = invoke("run", "kepler", "--steps", "1000000", "-o", "orbit.npz")
+        assert result.exit_code == 130
+        assert "Error: interrupted at t = " in result.stderr
+        t = arrays("orbit.npz")["t"]
+        assert f"the {len(t)} states up to there were kept: orbit.npz" in result.stderr
+        assert 3 < len(t) < 1000
+        assert np.allclose(np.diff(t), 0.25)
+        assert "relative energy error" in result.stdout
+
     def test_a_failing_step_keeps_what_was_computed(self):
         # Falls into the centre of attraction along a line that a step of Newton's method cannot pass.
         words = "--method gauss --stages 1 --velocity 0,0 --step 0.01 --max-iterations 3 -o fall.npz"
@@ -290,21 +320,25 @@ class TestRun:
 
 @pytest.mark.skipif(COMMAND is None, reason="the command is not installed beside this Python")
 class TestInstalledCommand:
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-    def test_an_interrupted_run_keeps_what_was_computed(self, number):
-        output_of("run", "kepler", "--steps", "1")  # compiled and in the cache
-        words = [COMMAND, "run", "kepler", "--steps", "1000000000", "--every", "100", "-o", "orbit.npz"]
-        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        time.sleep(3.0)
-        process.send_signal(number)
-        stdout, stderr = process.communicate(timeout=20)
+    def test_ctrl_c_while_it_compiles_is_one_line(self, tmp_path, monkeypatch):
+        compiler = tmp_path / "slow-cc"
+        compiler.write_text("#!/bin/sh\ntouch started\nexec sleep 60\n")
+        compiler.chmod(0o755)
+        monkeypatch.setenv("CC", f"{compiler} {tmp_path}")  # two words: its file is not its version
+        monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
+        process = subprocess.Popen(
+            [COMMAND, "verify", "kepler", "--degree", "2"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        while not (tmp_path / "started").exists() and not list(tmp_path.rglob(".building-*/**/started")):
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.communicate(timeout=30) == ("", "Error: interrupted\n")
         assert process.returncode == 130
-        assert "Error: interrupted at t = " in stderr
-        t = arrays("orbit.npz")["t"]
-        assert f"the {len(t)} states up to there were kept: orbit.npz" in stderr
-        assert len(t) > 2
-        assert np.allclose(np.diff(t), 25.0)
-        assert "relative energy error" in stdout
 
     def test_statuses_reach_the_shell_and_messages_stderr(self):
         for words, status in ((["run", "kepler", "--steps", "5"], 0), (["run", "keplr"], 2), (["--help"], 0)):

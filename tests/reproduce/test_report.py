@@ -21,7 +21,7 @@ from html_page import Page
 from toy_experiments import EXPERIMENTS, GOOD
 
 from scvi_codegen.cli import main
-from scvi_codegen.cli.reproducing import Reproduction, experiments_table
+from scvi_codegen.cli.commands.reproduce import Reproduction, experiments_table
 from scvi_codegen.display.page.typesetting import cell, prose
 from scvi_codegen.errors import StateError
 from scvi_codegen.reproduce.laboratory.experiment import Picture, Result
@@ -317,7 +317,7 @@ class TestCommand:
 
     def test_after_ctrl_c_it_ends_with_130(self, monkeypatch):
         interrupted = Reproduction(interrupted=True)
-        monkeypatch.setattr("scvi_codegen.cli.reproducing.reproduce_experiments", lambda *words: interrupted)
+        monkeypatch.setattr("scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words: interrupted)
         done = invoke("slow")
         assert done.exit_code == 130
         assert "interrupted" in done.stderr
@@ -325,7 +325,7 @@ class TestCommand:
 
 INTERRUPTED = """
 from pathlib import Path
-from scvi_codegen.cli.reproducing import reproduce_experiments
+from scvi_codegen.cli.commands.reproduce import reproduce_experiments
 done = reproduce_experiments(["table-9", "slow"], Path("made"), None, 2, module="toy_experiments")
 print("interrupted" if done.interrupted else "not interrupted", [path.name for path in done.files])
 """

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import click
 
-from scvi_codegen.cli.running import counted
+from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
+from scvi_codegen.cli.wording import counted
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
 from scvi_codegen.reproduce.report import report_html, tally
@@ -18,11 +19,54 @@ from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_exp
 from scvi_codegen.reproduce.writing import write_result
 from scvi_codegen.results.plotting import check_plot_path
 
-__all__ = ["EVERYTHING", "Reproduction", "experiments_table", "reproduce_experiments"]
+__all__ = ["reproduce"]
 
 EVERYTHING = "all"
 SHOWN_NAMES = 40
 """Characters of the names beside the progress bar."""
+
+
+@click.command()
+@click.argument("names", nargs=-1, metavar="[WHAT ...]")
+@click.option(
+    "-o", "--output", default="reproduced", show_default=True, type=click.Path(), metavar="DIR", help="Folder of files."
+)
+@click.option("--html", type=click.Path(), metavar="FILE", help="All results on one page that needs no network.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Experiments at a time [as many as processors].")
+@click.option("--list", "listing", is_flag=True, help="Print the names, and run nothing.")
+def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int | None, listing: bool) -> None:
+    """Run figures, tables and claims of the paper again, and judge them by what is measured (needs matplotlib).
+
+    WHAT is 'all' or names of experiments ('--list' prints them); what they need is run too. Each result is written to
+    the folder when it is there: NAME.txt with the verdicts, NAME.svg and NAME.png, NAME.csv with all numbers, and
+    NAME.html where there are formulas.
+
+    That a claim of the paper does not hold is a finding, not a failure: the exit status is 0 when everything ran, 1 if
+    an experiment failed to run, 130 after Ctrl-C, which leaves what was written.
+
+    \b
+    Examples:
+      scvi-codegen reproduce --list
+      scvi-codegen reproduce all --html paper.html
+      scvi-codegen reproduce figure-4 figure-5 -o figures --jobs 1
+    """
+    if listing:
+        click.echo(experiments_table(names or (EVERYTHING,)))
+        return
+    if not names:
+        raise click.UsageError("say what to reproduce: 'all', or names that 'scvi-codegen reproduce --list' prints")
+    folder = Path(output)
+    if folder.exists() and not folder.is_dir():
+        raise click.BadParameter(f"'{folder}' is not a folder", param_hint="'-o'")
+    if html is not None:
+        check_writable(Path(html), "'--html'")
+    done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs)
+    if done.files:
+        click.echo(f"\n{done.summary()}")
+    if done.interrupted:
+        raise CommandFailure("interrupted; what was written before is kept", INTERRUPTED)
+    if done.failures:
+        raise CommandFailure(done.failed(), FAILURE)
 
 
 @dataclass(kw_only=True)

@@ -1,15 +1,15 @@
-"""``scvi-codegen systems`` and ``scvi-codegen methods``: the catalogues as tables."""
+"""``scvi-codegen methods``: the methods and their properties, or a tableau."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import click
 
+from scvi_codegen.cli.wording import table
 from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification
-from scvi_codegen.models.problems import PROBLEMS
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.tableau import exact_tableau, tableau_by_name
 
-__all__ = ["methods_table", "systems_table", "tableau_text"]
+__all__ = ["methods"]
 
 EXAMPLES: dict[str, dict[str, int | list[float]]] = {
     "svi": {"degree": 4},
@@ -22,16 +22,11 @@ EXAMPLE_STAGES = 3
 LONGEST_EXACT = 24
 
 
-def systems_table() -> str:
-    """A line for each problem: name, coordinates, what it is, parameters."""
-    rows = [("name", "m", "description", "parameters")]
-    for name, build in PROBLEMS.items():
-        entry = build()
-        parameters = ", ".join(
-            f"{symbol}={value:g}" for symbol, value in zip(entry.system.parameters, entry.system.defaults, strict=True)
-        )
-        rows.append((name, str(entry.system.dimension), entry.title, parameters))
-    return _table(rows)
+@click.command()
+@click.option("--tableau", metavar="NAME:S", help="Print a Butcher tableau instead, as in gauss:3.")
+def methods(tableau: str | None) -> None:
+    """List the methods with their arguments, and order, symplecticity and symmetry of an example of each."""
+    click.echo(methods_table() if tableau is None else tableau_text(tableau))
 
 
 def methods_table() -> str:
@@ -43,7 +38,7 @@ def methods_table() -> str:
         if "variational" in ARGUMENTS[name]:
             printed = method_from_specification({"method": name, **EXAMPLES[name], "variational": False})
             rows.append(("", "", printed.name, *_properties(printed)))
-    return _table(rows)
+    return table(rows)
 
 
 def tableau_text(name: str) -> str:
@@ -89,10 +84,3 @@ def _yes_or_not(holds: bool) -> str:
 
 def _decimal(value: object) -> str:
     return str(mp.nstr(value, 17))
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )

@@ -1,0 +1,47 @@
+"""``scvi-codegen bench``: this project and others in turn, at equal error."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from scvi_codegen.benchmark import PEERS, Plan, benchmark
+from scvi_codegen.cli.frame import INTERRUPTED, CommandFailure, check_writable
+
+__all__ = ["bench"]
+
+
+@click.command()
+@click.argument("sections", nargs=-1, metavar="[SECTION ...]")
+@click.option("--peers", metavar="NAME,..", help="Only these of heyoka, rebound, cyrk, jitcode, scipy; none: ''.")
+@click.option("--json", "json_path", type=click.Path(), metavar="FILE", help="All measurements as JSON.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
+@click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
+@click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
+def bench(
+    sections: tuple[str, ...], peers: str | None, json_path: str | None, plot: str | None, repeats: int, quick: bool
+) -> None:
+    """Time this project and the installed peers in turn, and compare them at equal error.
+
+    SECTION is a problem (planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system,
+    double-pendulum, relativistic-particle, fput-chain:8, :64, :256), 64 trajectories of one at once
+    (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), drift (the energy over ten million
+    steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C) or start-up; by default all.
+    Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
+
+    \b
+    Examples:
+      scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
+      scvi-codegen bench drift hand-written --json measured.json
+    """
+    for path, hint in ((json_path, "'--json'"), (plot, "'--plot'")):
+        if path is not None:
+            check_writable(Path(path), hint)
+    names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
+    plan, say = Plan(peers=names, repeats=repeats, quick=quick), partial(click.echo, err=True)
+    report = benchmark(sections, plan, json_path=json_path, plot_path=plot, say=say)
+    click.echo(report.text())
+    if report.interrupted:
+        raise CommandFailure(f"interrupted in '{report.interrupted}'; what was measured before is above", INTERRUPTED)

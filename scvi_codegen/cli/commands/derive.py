@@ -1,0 +1,46 @@
+"""``scvi-codegen derive``: the equations of one step, or the page from L to C."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scvi_codegen.cli.choices import Choices, model_arguments, read_model
+from scvi_codegen.cli.frame import check_writable, emit
+from scvi_codegen.derivation import derivation_html
+from scvi_codegen.derivation.equations import derive as derive_equations
+
+__all__ = ["derive"]
+
+
+@click.command()
+@model_arguments
+@click.option("--latex", is_flag=True, help="LaTeX instead of text.")
+@click.option("--radicals", is_flag=True, help="Table entries as rationals and radicals where they are short.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write here instead of to the screen.")
+@click.option(
+    "--html", type=click.Path(), metavar="FILE", help="Write a page: everything from L to the C, side by side."
+)
+def derive(model_name: str, latex: bool, radicals: bool, output: str | None, html: str | None, **choices: Any) -> None:
+    """Print the equations of one step of MODEL: unknowns, stage equations, end state.
+
+    With --html everything between the Lagrangian and the C goes to a page that needs no network: equations of motion,
+    trial curve, tables, equations with the paper's numbers, Jacobian, operation counts, C beside its formulas.
+
+    \b
+    Examples:
+      scvi-codegen derive planar-pendulum --method svi --degree 1 --quadrature gauss-lobatto:2 --radicals
+      scvi-codegen derive kepler --html kepler.html
+    """
+    if html is not None:
+        if latex or radicals or output is not None:
+            raise click.UsageError("--html writes a page of its own: leave out --latex, --radicals and -o")
+        check_writable(Path(html), "'--html'")
+    model = read_model(model_name, Choices(**choices))
+    if html is not None:
+        emit(derivation_html(model.system, model.method), html)
+        return
+    equations = derive_equations(model.system, model.method, radicals=radicals)
+    emit(equations.to_latex() if latex else equations.to_text(), output)

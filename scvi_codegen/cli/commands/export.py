@@ -1,0 +1,36 @@
+"""``scvi-codegen export``: one file of a run in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from scvi_codegen.cli.frame import check_writable
+from scvi_codegen.cli.recording import check_format, standing
+from scvi_codegen.results.recording import load_run
+
+__all__ = ["export"]
+
+
+@click.command()
+@click.argument("folder", type=click.Path())
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory: .npz, .csv, .h5 (HDF5) or .zarr.")
+def export(folder: str, output: str | None) -> None:
+    """Write the states of the run in FOLDER to one file, or say what is in it.
+
+    The run may be under way: what is in the folder is written. Memory does not depend on its length. HDF5 and Zarr need
+    'scvi-codegen[data]'; xarray.open_dataset and xarray.open_zarr read them.
+
+    \b
+    Example:
+      scvi-codegen export long.run -o long.csv
+    """
+    if output is not None:
+        check_format(output, ensemble=False)
+        check_writable(Path(output), "'-o'")
+    recorded = load_run(folder)
+    click.echo(standing(recorded))
+    if output is not None:
+        recorded.save(output)
+        click.echo(f"wrote {output}")

@@ -1,0 +1,43 @@
+"""``scvi-codegen generate``: C, a Makefile and a Python package in a folder."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.models.package import generate_package
+from scvi_codegen.rendering.text import Embedded
+
+__all__ = ["generate"]
+
+
+@click.command()
+@model_arguments
+@click.option(
+    "-o", "--output", type=click.Path(), required=True, metavar="DIR", help="Folder; its name is the C prefix."
+)
+@SOLVER_OPTION
+@click.option("--force", is_flag=True, help="Overwrite files of the same names that were edited or are not ours.")
+@click.option(
+    "--embedded",
+    type=click.Choice(["double", "single"]),
+    help="C for a microcontroller, in this precision, without a Python package.",
+)
+def generate(model_name: str, output: str, solver: str, force: bool, embedded: Embedded | None, **choices: Any) -> None:
+    """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
+
+    With --embedded the C is small: Newton's iteration alone, or an explicit method, iterations bounded by a macro.
+
+    \b
+    Example:
+      scvi-codegen generate planar-pendulum -o pendulum_svi
+      make -C pendulum_svi run
+      python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
+    """
+    model = read_model(model_name, Choices(**choices))
+    folder = generate_package(model, output, solver=solver, force=force, embedded=embedded)
+    click.echo(f"{model.system.name}: {model.method.title}")
+    python = "" if embedded else f", or 'import {folder.resolve().name}'"
+    click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}")

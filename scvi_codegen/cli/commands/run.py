@@ -1,0 +1,207 @@
+"""``scvi-codegen run``: integrate a model, or many, in memory or into a folder, and sum up what was conserved."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scvi_codegen.cli.advising import advised_model
+from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
+from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
+from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
+from scvi_codegen.cli.running import Outcome, integrate_model, summary
+from scvi_codegen.models.ensemble_file import load_ensemble
+from scvi_codegen.models.model_file import Model
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.results.plotting import check_plot_path, plot_trajectory
+
+__all__ = ["run"]
+
+
+@click.command()
+@partial(model_arguments, required=False)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="PATH",
+    help="Trajectory: .npz, .csv, .h5 or .zarr; or a folder, NAME.run or NAME/, for a run of any length.",
+)
+@click.option("--resume", type=click.Path(), metavar="FOLDER", help="Go on with the run in a folder, without MODEL.")
+@click.option(
+    "--checkpoint",
+    type=float,
+    metavar="SECONDS",
+    help="Into a folder what is computed is written at least so often [10].",
+)
+@click.option("--checkpoint-steps", type=int, metavar="N", help="And every so many steps.")
+@click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to keep in the folder.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Picture, .png or .svg (needs matplotlib).")
+@click.option(
+    "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
+)
+@click.option(
+    "--tolerance",
+    type=float,
+    metavar="X",
+    help="Choose the step for this error of the positions at the end, relative to their size.",
+)
+@SOLVER_OPTION
+@click.option(
+    "--solver-tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
+)
+@click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
+def run(
+    model_name: str | None,
+    output: str | None,
+    resume: str | None,
+    checkpoint: float | None,
+    checkpoint_steps: int | None,
+    certificate: str | None,
+    plot: str | None,
+    ensemble: str | None,
+    tolerance: float | None,
+    solver: str,
+    solver_tolerance: float | None,
+    max_iterations: int | None,
+    **choices: Any,
+) -> None:
+    """Integrate MODEL and print what was conserved and where it ended.
+
+    A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
+    asked for.
+
+    With --tolerance the step is chosen by short pilot runs, for the error wanted at the end; advice and evidence are
+    printed. With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
+
+    \b
+      [grid]
+      q1 = { from = 0.5, to = 1.5, count = 11 }
+      q2_dot = [0.9, 1.0, 1.1]
+      mu = 2.0
+
+    A table is a CSV file with the names in its first line. Names are those of coordinates, velocities (q1_dot) or
+    momenta (p_q1), and parameters; MODEL gives the others. An .npz file has arrays q and p of shape (states,
+    trajectories, coordinates); a .csv file has a line a state.
+
+    Into a folder (-o long.run) the states are written as they are computed, with all that the run needs to go on. It
+    may be killed at any time; --resume continues it bit for bit, with --steps or --span further than it was meant to
+    go. The memory in use does not grow. 'scvi-codegen export' makes one file of it.
+
+    \b
+    Examples:
+      scvi-codegen run outer-solar-system --plot orbits.png
+      scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
+      scvi-codegen run kepler --tolerance 1e-9
+    """
+    recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
+    if resume is not None:
+        check_resumed(click.get_current_context())
+        _finish_recording(recording.resume(resume, steps=choices["steps"], span=choices["span"]))
+        return
+    if model_name is None:
+        raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
+    recorded = output is not None and is_folder(output)
+    recording.check(recorded)
+    _check_outputs(output, plot, ensemble)
+    _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance, folder=output if recorded else None)
+    model = read_model(model_name, Choices(**choices))
+    given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
+    chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    options = SolverOptions(**chosen)
+    if ensemble is not None:
+        _run_ensemble(model, ensemble, output, solver, options)
+        return
+    if tolerance is not None:
+        model = advised_model(model, tolerance, solver=solver, options=options)
+    if output is not None and recorded:
+        _finish_recording(recording.record(model, output, solver=solver, options=options))
+        return
+    _run_one(model, output, plot, solver, options)
+
+
+def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
+    """Find out before a long run whether its results can be written."""
+    if output is not None and not (ensemble is None and is_folder(output)):
+        check_format(output, ensemble=ensemble is not None)
+        check_writable(Path(output), "'-o'")
+    if plot is not None:
+        check_writable(Path(plot), "'--plot'")
+    if plot is not None:
+        check_plot_path(plot)
+
+
+def _check_combination(
+    choices: dict[str, Any],
+    *,
+    plot: str | None,
+    ensemble: str | None,
+    tolerance: float | None,
+    folder: str | None,
+) -> None:
+    if folder is not None and plot is not None:
+        raise click.UsageError("--plot is for a trajectory in memory, not for a run in a folder")
+    if tolerance is not None:
+        for name in ("step", "steps"):
+            if choices[name] is not None:
+                raise click.UsageError(f"--tolerance chooses the step: leave out --{name} (--span is the length)")
+    for name, value in (("plot", plot), ("tolerance", tolerance)):
+        if ensemble is not None and value is not None:
+            raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
+
+
+def _run_one(model: Model, output: str | None, plot: str | None, solver: str, options: SolverOptions) -> None:
+    outcome = integrate_model(model, solver=solver, options=options)
+    click.echo(summary(model, outcome))
+    written = _write_outputs(outcome, output, plot)
+    if outcome.failure is not None:
+        raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
+    if outcome.interrupted:
+        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
+    for path in written:
+        click.echo(f"wrote {path}")
+
+
+def _finish_recording(outcome: RecordedOutcome) -> None:
+    """Say what came of a recorded run, and how to go on with it."""
+    click.echo(outcome.summary())
+    if outcome.failure is not None:
+        raise CommandFailure(f"{outcome.failure}\n{outcome.kept()}", FAILURE)
+    if outcome.interrupted:
+        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.kept()}", INTERRUPTED)
+    click.echo(f"wrote {outcome.recorded.folder}")
+
+
+def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions) -> None:
+    outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
+    click.echo(ensemble_summary(model, outcome))
+    kept = "the states computed were not written to a file (-o)"
+    if output is not None:
+        outcome.result.save(output)
+        kept = f"the states computed were kept: {output}"
+    if outcome.interrupted:
+        raise CommandFailure(
+            f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{kept}", INTERRUPTED
+        )
+    if not outcome.result.ok.any():
+        raise CommandFailure(f"every trajectory failed\n{kept}", FAILURE)
+    if output is not None:
+        click.echo(f"wrote {output}")
+
+
+def _write_outputs(outcome: Outcome, output: str | None, plot: str | None) -> list[str]:
+    if output is not None:
+        outcome.trajectory.save(output)
+    if plot is not None:
+        plot_trajectory(outcome.trajectory, plot)
+    return [path for path in (output, plot) if path is not None]
+
+
+def _kept(outcome: Outcome, written: list[str]) -> str:
+    count = len(outcome.trajectory)
+    states = "the initial state was" if count == 1 else f"the {count} states up to there were"
+    return f"{states} kept: {' and '.join(written)}" if written else f"{states} not written to a file (-o, --plot)"

@@ -1,0 +1,88 @@
+"""``scvi-codegen verify``: the certificate of a model, or of a generated folder as it stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scvi_codegen import verification
+from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import PackageError
+from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.package import load_package
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.verification import Certificate
+
+__all__ = ["verify"]
+
+MODEL_FILE, CERTIFICATE = "model.toml", "certificate.json"
+METHOD_CHOICES = tuple(
+    "method degree stages order nodes quadrature space form variational abscissae".split()  # noqa: SIM905  (a line of words)
+)
+
+
+@click.command()
+@model_arguments
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="The certificate as JSON.")
+@SOLVER_OPTION
+def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> None:
+    """Build the integrator of MODEL and measure what it promises; exit status 1 if a promise is broken.
+
+    MODEL may also be a folder written by 'generate': then the C code in it is what is measured. A step is held against
+    the paper's equations in 60 digits and these against the exact motion; order, symplecticity, reversal, momenta,
+    Newton's matrix and identities between methods are measured. The JSON goes into the folder or beside the model file.
+
+    \b
+    Examples:
+      scvi-codegen verify kepler --method scvi --degree 3
+      scvi-codegen verify mine.toml
+      scvi-codegen generate mine.toml -o mine_svi
+      scvi-codegen verify mine_svi
+    """
+    path = _certificate_path(model_name) if output is None else Path(output)
+    if path is not None:
+        check_writable(path, "'-o'")
+    certificate = _verified(model_name, Choices(**choices), solver=solver)
+    click.echo(certificate.to_text(), nl=False)
+    if path is not None:
+        certificate.save(path)
+        click.echo(f"wrote {path}", err=True)
+    if not certificate.passed:
+        raise CommandFailure(f"broken: {', '.join(check.name for check in certificate.broken)}", FAILURE)
+
+
+def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
+    """The certificate of a model file, an entry of the catalogue or a generated folder.
+
+    Raises:
+        click.UsageError: for a folder with another method or solver than it was generated with.
+        ScviCodegenError: as reading and building the model do.
+    """
+    folder = Path(name)
+    if not folder.is_dir():
+        model = read_model(name, choices)
+        return _certificate(model, compile_stepper(model.system, model.method, solver=solver), solver)
+    if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
+        raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
+    if not (folder / MODEL_FILE).is_file():
+        raise PackageError(f"{folder} has no {MODEL_FILE} to say what its C code promises: generate it from a model")
+    return _certificate(read_model(str(folder / MODEL_FILE), choices), load_package(folder), "auto")
+
+
+def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
+    p = model.momenta(stepper)
+    return verification.verify(
+        model.system, model.method, model.q, p, h=model.h, t=model.t, stepper=stepper, solver=solver
+    )
+
+
+def _certificate_path(name: str) -> Path | None:
+    """Beside the artefact: in a generated folder, beside a model file; ``None`` for a name of the catalogue."""
+    path = Path(name)
+    if path.is_dir():
+        return path / CERTIFICATE
+    return path.with_suffix(f".{CERTIFICATE}") if path.is_file() else None

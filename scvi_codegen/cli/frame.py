@@ -1,0 +1,124 @@
+"""What all commands share: the group that finds them, errors as one line and an exit status, files to be written."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from scvi_codegen.errors import BuildError, MethodWarning, RecordingError, ScviCodegenError, StepFailedError
+from scvi_codegen.files.atomic import write_atomically
+
+__all__ = ["FAILURE", "INTERRUPTED", "USAGE", "CommandFailure", "Commands", "check_writable", "emit"]
+
+FAILURE, USAGE, INTERRUPTED = 1, 2, 130
+"""Exit statuses: numerical failure or no compiler; faulty input; Ctrl-C."""
+
+
+class CommandFailure(click.ClickException):
+    """A message for people, and the exit status of the command."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+    @property
+    def exit_code(self) -> int:  # type: ignore[override]  # click's is a class variable
+        """The status."""
+        return self.status
+
+
+class Commands(click.Group):
+    """A command NAME is the function of that name in the module NAME of a folder, imported when it is called.
+
+    So a module imports what its command needs in plain words, and the overview waits for none of it. Whatever error a
+    user can meet becomes one message and an exit status.
+    """
+
+    def __init__(self, *words: Any, folder: str, about: Mapping[str, str], **settings: Any) -> None:
+        super().__init__(*words, **settings)
+        self.folder, self.about = folder, about
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in alphabetical order."""
+        return sorted(self.about)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of a name, imported here."""
+        if cmd_name not in self.about:
+            return None
+        command: click.Command = getattr(import_module(f"{self.folder}.{cmd_name}"), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The part of the overview that lists the commands."""
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(self.about.items()))
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """What a shell offers for the beginning of a name."""
+        names = [name for name in sorted(self.about) if name.startswith(incomplete)]
+        found = [CompletionItem(name, help=self.about[name]) for name in names]
+        return [*found, *click.Command.shell_complete(self, ctx, incomplete)]
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; errors become messages."""
+        try:
+            with _warnings_as_lines():
+                return super().invoke(ctx)
+        except (StepFailedError, BuildError, RecordingError) as error:
+            raise CommandFailure(str(error), FAILURE) from error
+        except ScviCodegenError as error:
+            raise CommandFailure(str(error), USAGE) from error
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise CommandFailure(str(error), FAILURE) from error
+        except MemoryError as error:
+            raise CommandFailure("there is not enough memory for that", FAILURE) from error
+        except KeyboardInterrupt as error:
+            raise CommandFailure("interrupted", INTERRUPTED) from error
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Show the warnings of this package as one line each, once."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            click.echo(f"Warning: {message}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", MethodWarning)
+        warnings.showwarning = show
+        yield
+
+
+def check_writable(path: Path, hint: str) -> None:
+    """Find out before long work whether its result can be written; ``hint`` names the option that wants it."""
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)
+    if not path.parent.is_dir():
+        raise click.BadParameter(f"there is no folder '{path.parent}'", param_hint=hint)
+    if not os.access(path.parent, os.W_OK):
+        raise click.BadParameter(f"the folder '{path.parent}' cannot be written", param_hint=hint)
+
+
+def emit(text: str, output: str | None) -> None:
+    """Print a text, or write it to a file whole or not at all."""
+    if output is None:
+        click.echo(text)
+        return
+    check_writable(Path(output), "'-o'")
+    data = (text.rstrip("\n") + "\n").encode()
+    write_atomically(output, lambda file: file.write(data))
+    click.echo(f"wrote {output}", err=True)

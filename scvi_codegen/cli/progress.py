@@ -1,0 +1,47 @@
+"""How far a run is, shown while it lasts, and the wish to end it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+import click
+
+__all__ = ["interruptions", "progress_bar"]
+
+
+@contextlib.contextmanager
+def interruptions() -> Iterator[list[int]]:
+    """Note the first SIGINT or SIGTERM instead of dying of it; a second one acts as always."""
+    caught: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield caught  # only the main thread may handle signals
+        return
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {int(number): signal.getsignal(number) for number in signals}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
+        signal.signal(number, before[number])
+
+    try:
+        for number in signals:
+            signal.signal(number, note)
+        yield caught
+    finally:
+        for number in signals:
+            signal.signal(number, before[number])
+
+
+@contextlib.contextmanager
+def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr if that is a terminal; the function given adds steps done."""
+    if not sys.stderr.isatty() or steps == 0:
+        yield lambda count: None
+        return
+    with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:
+        yield bar.update
