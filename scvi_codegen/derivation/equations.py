@@ -25,7 +25,7 @@ from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.display.mathml.names import latex_name
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.mechanics.forms import accelerations, euler_lagrange, force, momentum
+from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
@@ -485,7 +485,7 @@ def _position_matrix_form(
     operator = sympy.kronecker_product(A * A, identity)
     left = operator * _vec(Q) + sympy.kronecker_product(a0, v0.T) + sympy.kronecker_product(A * a0, q0.T)
     V = A * Q + a0 * q0
-    E = euler_lagrange(system)
+    E = forms_of(system).euler_lagrange
     residual = []
     for i in range(size):
         replaced = _at_node(derived, i, Q.row(i), V.row(i))
@@ -506,8 +506,8 @@ def _phase_space_matrix_form(
     P_rows, G_rows = [], []
     for i in range(size):
         replaced = _at_node(derived, i, Q.row(i), V.row(i))
-        P_rows.append([p.xreplace(replaced) for p in momentum(system)])
-        G_rows.append([f.xreplace(replaced) for f in force(system)])
+        P_rows.append([p.xreplace(replaced) for p in forms_of(system).momentum])
+        G_rows.append([f.xreplace(replaced) for f in forms_of(system).force])
     P, G = sympy.Matrix(P_rows), sympy.Matrix(G_rows)
     single = sympy.kronecker_product(A, identity)
     operator = sympy.diag(single, single)

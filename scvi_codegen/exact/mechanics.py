@@ -12,7 +12,7 @@ import sympy
 from scvi_codegen.exact.newton import Array, Floats, Solve, newton, solver
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.grammar import evaluate
-from scvi_codegen.mechanics.forms import accelerations, euler_lagrange, mass_entries, momentum
+from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -24,7 +24,7 @@ Entries: TypeAlias = Mapping[tuple[int, int], sympy.Expr]
 @lru_cache(maxsize=32)
 def _formulas(system: LagrangianSystem) -> tuple[tuple[sympy.Expr, ...], tuple[Entries, Entries, Entries]]:
     """E and its derivatives by position, velocity and acceleration."""
-    residual = euler_lagrange(system)
+    residual = forms_of(system).euler_lagrange
     by = (system.coordinates, system.velocities, accelerations(system))
     return residual, tuple(jacobian(residual, symbols) for symbols in by)  # type: ignore[return-value]
 
@@ -36,7 +36,8 @@ class Mechanics:
         self.system, self.dimension = system, system.dimension
         self.constants = {symbol: parameters[symbol.name] for symbol in system.parameters}
         self.E, self.slopes_of_E = _formulas(system)
-        self.p, self.mass = momentum(system), mass_entries(system)
+        forms = forms_of(system)
+        self.p, self.mass = forms.momentum, forms.mass
 
     def _point(self, q: Array, v: Array, t: Number, a: Array | None = None) -> dict[sympy.Symbol, Number]:
         system = self.system

@@ -54,6 +54,7 @@ class Kernel:
         values: how many of the results are values; the rest are slopes.
         symbols: what ``u`` holds, in the symbols of the formulas.
         formulas: what the results were before their common parts were found.
+        purpose: what it computes, one sentence for people.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Kernel:
     values: int
     symbols: tuple[sympy.Symbol, ...] = field(default=(), repr=False, compare=False)
     formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
+    purpose: str = field(default="", repr=False, compare=False)
 
     @property
     def uses_arguments(self) -> bool:

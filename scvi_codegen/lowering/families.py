@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import sympy
 
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.families import Family, GatherLoop, ScatterLoop, SlopeBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -26,31 +24,58 @@ def _is_regular(system: MechanicalSystem) -> bool:
 
 def lowered_family(system: MechanicalSystem, family: PointFamily) -> Family:
     """A family of points in loops: its kernel with slopes, and rounded tables."""
-    common: dict[str, Any] = {
-        "arguments": family.arguments,
-        "time": system.time,
-        "parameters": system.parameters,
-    }
     slopes, blocks = _slope_blocks(family)
+    names = tuple(argument_name(system, gather) for gather in family.gathers)
+    u = f"u = ({', '.join(names)})"
     return Family(
         name=family.name,
-        arguments=tuple(argument_name(system, gather) for gather in family.gathers),
+        arguments=names,
         abscissae=lower_vector(family.abscissae),
         weights=lower_vector(family.weights),
         gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
         scatters=tuple(_scatter_loop(family, s) for s in range(len(family.scatters))),
-        value=lower_kernel(f"{family.name}_value", values=family.results, **common),
-        slope=lower_kernel(f"{family.name}_slope", values=family.results, slopes=slopes, **common),
+        value=system_kernel(
+            system,
+            f"{family.name}_value",
+            family.results,
+            of=family.arguments,
+            purpose=f"{_results(family, names)} at {u}.",
+        ),
+        slope=system_kernel(
+            system,
+            f"{family.name}_slope",
+            family.results,
+            of=family.arguments,
+            slopes=slopes,
+            purpose=f"The same, and the non-zero derivatives with respect to {u}.",
+        ),
         blocks=blocks,
-        action=_action(family, common) if family.in_action and _is_regular(system) else None,
+        action=_action(system, family, u) if family.in_action and _is_regular(system) else None,
         action_power=family.scalar_power,
     )
 
 
-def _action(family: PointFamily, common: dict[str, Any]) -> Kernel:
+def _results(family: PointFamily, names: tuple[str, ...]) -> str:
+    """What the kernel of a family gives, in words."""
+    if family.name == "node":
+        return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
+    if family.scalar_power:
+        return f"Derivatives of d^{family.scalar_power}L/dt^{family.scalar_power}"
+    return " and ".join(f"L_{name}" for name in names) if len(family.scatters) == len(names) else "L_v"
+
+
+def _action(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel:
     """The scalar of a family; that of the values is called after the function it is."""
-    name = "lagrangian" if family.name == "quadrature" else f"{family.name}_action"
-    return lower_kernel(name, values=(family.scalar,), **common)
+    assert family.scalar is not None
+    k = family.scalar_power
+    rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"
+    return system_kernel(
+        system,
+        "lagrangian" if family.name == "quadrature" else f"{family.name}_action",
+        (family.scalar,),
+        of=family.arguments,
+        purpose=f"{rate if k else 'p . v - H' if system.auxiliaries else 'L'} at {u}.",
+    )
 
 
 def argument_name(system: MechanicalSystem, gather: Gather) -> str:

@@ -15,20 +15,18 @@ Nothing here changes a value but by rounding; ``tests/test_lowering.py`` reads k
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import sympy
 
-from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import MomentumMap, Program
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.ir.sweeps import Splitting, Sweep
 from scvi_codegen.lowering.families import lowered_family
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
-from scvi_codegen.mechanics.forms import legendre_map
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.exactness import is_exact
@@ -62,11 +60,7 @@ def lower(
     """
     check_regular(method, system)
     stages = with_auxiliaries(system, method.stage_system(system))
-    common: dict[str, Any] = {"time": system.time, "parameters": system.parameters}
-    state, transformed = legendre_map(system)
-    mass = jacobian(transformed, state[system.dimension :])
-    legendre = lower_kernel("legendre", arguments=state, values=transformed, slopes=tuple(mass.values()), **common)
-    energy = "hamiltonian" if system.auxiliaries else "lagrangian"
+    mass = forms_of(system).legendre_slopes
     families = tuple(lowered_family(system, family) for family in stages.families)
     met = [*mass, *_meetings(families if newton else ())]
     order = places(met, system.dimension)
@@ -87,29 +81,55 @@ def lower(
         momentum_blocks=tuple(block.momentum for block in stages.blocks),
         moving_blocks=tuple(int(block.moves) for block in stages.blocks),
         extrapolation=lower_matrix(_required_extrapolation(stages)),
-        legendre=legendre,
+        legendre=_legendre_kernel(system),
         mass_entries=tuple(mass),
-        energy=lower_kernel(energy, arguments=state, values=(system.formula,), **common),
+        energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(
             MomentumMap(name=_comment(each.name), formula=_comment(each.formula), exact=is_exact(each, method))
             for each in symmetries
         ),
-        momentum_kernel=_momentum_kernel(symmetries, common),
+        momentum_kernel=_momentum_kernel(system, symmetries),
         sweep=sweep,
         splitting=splitting,
         newton=newton,
     )
 
 
-def _momentum_kernel(symmetries: Sequence[Symmetry], common: dict[str, Any]) -> Kernel | None:
+def _legendre_kernel(system: MechanicalSystem) -> Kernel:
+    forms = forms_of(system)
+    return system_kernel(
+        system,
+        "legendre",
+        forms.legendre,
+        of=forms.legendre_arguments,
+        slopes=forms.legendre_slopes.values(),
+        purpose="H_p and H_pp at u = (q, p)."
+        if system.auxiliaries
+        else "Momenta L_v and mass matrix L_vv at u = (q, v).",
+    )
+
+
+def _energy_kernel(system: MechanicalSystem) -> Kernel:
+    """The function of the system, from which and the Legendre transform follows the energy."""
+    name, purpose = ("hamiltonian", "H at u = (q, p).") if system.auxiliaries else ("lagrangian", "L at u = (q, v).")
+    arguments = forms_of(system).legendre_arguments
+    return system_kernel(system, name, (system.formula,), of=arguments, purpose=purpose)
+
+
+def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -> Kernel | None:
     """Momentum maps, then the sums of the squares of their terms."""
     if not symmetries:
         return None
     maps = [symmetry.momentum_map for symmetry in symmetries]
     squares = [sympy.Add(*(term**2 for term in sympy.Add.make_args(J))) for J in maps]
-    arguments = (*symmetries[0].coordinates, *symmetries[0].momenta)
-    return lower_kernel("momentum_maps", arguments=arguments, values=(*maps, *squares), **common)
+    return system_kernel(
+        system,
+        "momentum_maps",
+        (*maps, *squares),
+        of=(*symmetries[0].coordinates, *symmetries[0].momenta),
+        purpose="What is conserved at u = (q, p), then the sums of the squares of the terms.",
+    )
 
 
 def _meetings(families: Sequence[Family]) -> list[tuple[int, int]]:

@@ -21,7 +21,7 @@ from fractions import Fraction
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import accelerations, euler_lagrange, momentum
+from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import (
     EXTRAPOLATION_DEGREE,
@@ -266,7 +266,7 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
 def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """(22) on (q, v): unknowns v0 and z_i = h a_i; v0 from p0 by the Legendre transform, p1 from v1."""
     b, size = tableau.b, len(tableau.b)
-    momenta = momentum(system)
+    momenta = forms_of(system).momentum
     ones, none = Table.constant(1, 1, 1), Table.constant(1, size)
     b_row = Table(entries=(b,), names=(tuple(f"b_{i}" for i in range(1, size + 1)),))
     end_row = Table.joined(ones, ones, Table.named("bA", matrix_product((b,), tableau.A)))
@@ -313,7 +313,7 @@ def residual_family(
         weights=(mp.one,) * len(abscissae),
         weight_names=("",) * len(abscissae),
         gathers=gathers,
-        scatters=(replace(residual, results=euler_lagrange(system)), *others),
+        scatters=(replace(residual, results=forms_of(system).euler_lagrange), *others),
     )
 
 
@@ -359,7 +359,7 @@ def acceleration_extrapolation(tableau: Tableau) -> Matrix:
 def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
     """(18) as printed: unknowns Q^1 .. Q^s and v0; v0 from p0, p1 from v1 = V_s by the Legendre transform."""
     size = nodes.degree
-    momenta = momentum(system)
+    momenta = forms_of(system).momentum
     none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
     family = residual_family(
         system,

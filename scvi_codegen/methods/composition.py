@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import force, is_separable, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method, Specification
@@ -115,7 +115,7 @@ class Composition(Method):
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns: the velocities V_k of the drifts; explicit, row after row."""
         twin = lagrangian_twin(system)
-        if twin is None or not is_separable(twin):
+        if twin is None or not forms_of(twin).separable:
             raise MethodError(
                 f"{self.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses; "
                 f"'{system.name}' is not: use an SVI"
@@ -156,7 +156,7 @@ def _kick_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
         ),
         scatters=(
             Scatter(
-                results=force(system),
+                results=forms_of(system).force,
                 table=Table.joined(Table.named("", before), Table.constant(size + 1, 1, 1)),
                 power=1,
             ),
@@ -181,7 +181,7 @@ def _drift_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
         ),
         scatters=(
             Scatter(
-                results=momentum(system),
+                results=forms_of(system).momentum,
                 table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)),
                 power=0,
             ),

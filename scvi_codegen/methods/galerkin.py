@@ -20,7 +20,7 @@ from fractions import Fraction
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError, MethodWarning
-from scvi_codegen.mechanics.forms import curve_rates, lagrangian_rates
+from scvi_codegen.mechanics.forms import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method, Specification, check_count, unit_sum
 from scvi_codegen.methods.stage_system import (
@@ -308,7 +308,7 @@ def galerkin_system(
     beta = unit_sum(end_position)
     tables = (velocity, *derivatives)
     gathers = _curve_gathers(system, dyadic(position), tables)
-    scalars = (system.lagrangian, *lagrangian_rates(system, len(derivatives)))
+    scalars = (system.lagrangian, *forms_of(system).rates(len(derivatives)))
     families = [
         ScalarFamily(
             name=f"derivative_{k}" if k else "quadrature",

@@ -10,7 +10,7 @@ import sympy
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import PointFamily, Scatter, StageSystem, dyadic
@@ -122,8 +122,8 @@ def lagrangian_scatters(
 ) -> PointFamily:
     """``family`` with L_q and L_v as kernel results, scattered as given (their ``results`` are filled in)."""
     filled = (
-        _with_results(force_scatter, force(system)),
-        _with_results(momentum_scatter, momentum(system)),
+        _with_results(force_scatter, forms_of(system).force),
+        _with_results(momentum_scatter, forms_of(system).momentum),
     )
     return PointFamily(
         name=family.name,

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import sympy
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.mechanics.forms import auxiliary_multipliers, constitutive
+from scvi_codegen.mechanics.forms import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
 from scvi_codegen.tables.basis import extrapolation, identity_matrix
@@ -90,7 +90,7 @@ def _stationary(
 ) -> tuple[sympy.Expr, ...]:
     """What vanishes: the gradient of the family's scalar by these symbols, v - H_p where there is none."""
     if family.scalar is None:
-        return constitutive(system)
+        return forms_of(system).constitutive
     slopes = gradient(family.scalar, symbols)
     return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(symbols)))
 

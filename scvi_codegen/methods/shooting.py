@@ -21,7 +21,7 @@ from typing import Any
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import multiplied_residual, multipliers
+from scvi_codegen.mechanics.forms import forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import (
     acceleration_extrapolation,
@@ -263,7 +263,7 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFami
         weights=(mp.one,) * size,
         weight_names=("",) * size,
         gathers=(rounded, velocity, acceleration, own),
-        scalar=multiplied_residual(system),
+        scalar=forms_of(system).multiplied_residual,
         power=1,
         in_action=False,
     )
@@ -354,7 +354,7 @@ def _shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) ->
         weights=(mp.one,) * size,
         weight_names=("",) * size,
         gathers=(*nodal_gathers(system, nodes, other_blocks=size), own),
-        scalar=multiplied_residual(system),
+        scalar=forms_of(system).multiplied_residual,
         power=-1,
         in_action=False,
     )

@@ -168,7 +168,7 @@ def _example(model: Model) -> ExampleRun:
 def _momenta(model: Model) -> tuple[float, ...]:
     """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
     from scvi_codegen.formulas.grammar import evaluate
-    from scvi_codegen.mechanics.forms import momentum
+    from scvi_codegen.mechanics.forms import forms_of
     from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
     from scvi_codegen.tables.precision import mp
 
@@ -179,7 +179,7 @@ def _momenta(model: Model) -> tuple[float, ...]:
     numbers = (*model.q, *(model.velocity or ()), model.t, *system.defaults)
     point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))
     try:
-        return tuple(float(evaluate(expression, point)) for expression in momentum(system))
+        return tuple(float(evaluate(expression, point)) for expression in forms_of(system).momentum)
     except ArithmeticError as error:
         raise StateError(f"the initial velocities have no momenta: {error}") from error
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, TypeAlias, get_args
 
-from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
@@ -168,7 +167,6 @@ def render_ensemble(program: Program) -> Source | None:
     context = {
         "program": program,
         "prefix": prefix,
-        "purpose": _purposes(program),
         "tolerance": DEFAULT_TOLERANCE,
         "max_iterations": MAX_ITERATIONS,
         "width": ENSEMBLE_LANES,
@@ -242,7 +240,6 @@ def _context(program: Program) -> dict[str, object]:
         "prefix": program.prefix,
         "kernels": program.kernels,
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, _scalar_kernels(program)))),
-        "purpose": _purposes(program),
         "legendre": program.legendre,
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
@@ -260,45 +257,6 @@ def _context(program: Program) -> dict[str, object]:
 
 def _scalar_kernels(program: Program) -> tuple[Kernel, ...]:
     return (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
-
-
-def _purposes(program: Program) -> dict[str, str]:
-    """One sentence a kernel, for the comment above it."""
-    purposes = {
-        "legendre": "Momenta L_v and mass matrix L_vv at u = (q, v).",
-        "lagrangian": "L at u = (q, v).",
-        "derivative_1_action": "dL/dt at u = (q, v, a).",
-        "derivative_2_action": "d^2L/dt^2 at u = (q, v, a, j).",
-        "derivative_3_action": "d^3L/dt^3 at u = (q, v, a, j, s).",
-        "hamiltonian": "H at u = (q, p).",
-        "momentum_maps": "What is conserved at u = (q, p), then the sums of the squares of the terms.",
-        "force_lanes": "L_q at all points.",
-        "velocity_lanes": "H_p at all points, u = (q, p).",
-        "node_lanes": "E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
-        "action_lanes": "L_q and L_v at all points, u = (q, v).",
-        "applied_force_lanes": "L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
-        "point_lanes": "L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
-    }
-    if program.hamiltonian:
-        purposes |= {
-            "force_lanes": "-H_q at all points, u = (q, p).",
-            "legendre": "H_p and H_pp at u = (q, p).",
-            "lagrangian": "p . v - H at u = (q, v, p).",
-        }
-    for family in program.families:
-        arguments = f"({', '.join(family.arguments)})"
-        purposes[family.value.name] = f"{_results(family)} at u = {arguments}."
-        purposes[family.slope.name] = f"The same, and the non-zero derivatives with respect to u = {arguments}."
-    return purposes
-
-
-def _results(family: Family) -> str:
-    if family.name == "node":
-        return "Derivatives of lambda . E" if "lambda" in family.arguments else "The Euler-Lagrange residual E"
-    if family.action_power:
-        return f"Derivatives of d^{family.action_power}L/dt^{family.action_power}"
-    slopes = " and ".join(f"L_{name}" for name in family.arguments)
-    return slopes if len(family.scatters) == len(family.gathers) else "L_v"
 
 
 def _lane_context(sweep: Sweep | None) -> dict[str, object]:

@@ -11,7 +11,7 @@ import numpy as np
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.motion import motion_of, numbers
 from scvi_codegen.exact.step import derived_step
-from scvi_codegen.mechanics.forms import is_separable
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -79,7 +79,7 @@ def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound:
 
 
 def _twins(system: MechanicalSystem, method: Method) -> Iterator[_Twin]:
-    separable = is_separable(system)
+    separable = forms_of(system).separable
     if isinstance(method, SVI):
         yield from _galerkin_twins(method, separable)
     elif isinstance(method, SCVI):

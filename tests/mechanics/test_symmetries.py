@@ -13,7 +13,7 @@ from sympy import Symbol
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.forms import euler_lagrange, force, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, check_symmetry, symmetries
@@ -267,9 +267,9 @@ def test_a_hamiltonian_has_the_symmetries_of_its_lagrangian():
 
 def rate(system: MechanicalSystem, symmetry: Symmetry) -> sympy.Expr:
     """dJ/dt along a motion, by SymPy's own derivatives: accelerations from the Euler-Lagrange equations, solved."""
-    at = dict(zip(symmetry.momenta, momentum(system), strict=True))
+    at = dict(zip(symmetry.momenta, forms_of(system).momentum, strict=True))
     J = symmetry.momentum_map
-    terms = [J.diff(p) * f for p, f in zip(symmetry.momenta, force(system), strict=True)]
+    terms = [J.diff(p) * f for p, f in zip(symmetry.momenta, forms_of(system).force, strict=True)]
     terms += [J.diff(q) * v for q, v in zip(system.coordinates, system.velocities, strict=True)]
     return sympy.simplify((sympy.Add(*terms) + J.diff(system.time)).subs(at))
 
@@ -278,7 +278,7 @@ def rate(system: MechanicalSystem, symmetry: Symmetry) -> sympy.Expr:
 def test_each_is_conserved_identically(system):
     for symmetry in symmetries(system):
         assert rate(system, symmetry) == 0
-        assert euler_lagrange(system)
+        assert forms_of(system).euler_lagrange
         products = [p * xi for p, xi in zip(symmetry.momenta, symmetry.direction, strict=True)]
         assert sympy.expand(sympy.Add(*products) - symmetry.gauge - symmetry.momentum_map) == 0
 

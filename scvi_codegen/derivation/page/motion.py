@@ -10,7 +10,7 @@ from sympy import Symbol
 from scvi_codegen.derivation.page.elision import formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, Table
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.mechanics.forms import euler_lagrange, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["motion_section", "system_section"]
@@ -44,13 +44,13 @@ def motion_section(system: MechanicalSystem) -> Section:
 
 def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
     yield Paragraph("The momenta, p = dL/dv:")
-    pairs = zip(system.coordinates, momentum(system), strict=True)
+    pairs = zip(system.coordinates, forms_of(system).momentum, strict=True)
     yield from formulas([Formula(value, Symbol(f"p_{q.name}")) for q, value in pairs], "momentum formula")
     yield Paragraph(
         "The Euler-Lagrange equations (2), d/dt dL/dv - dL/dq = 0, by the chain rule. They are linear in the "
         "accelerations; neither the derivation nor the C solves for these."
     )
-    yield from formulas([Formula(value, sympy.S.Zero, "2") for value in euler_lagrange(system)], "equation")
+    yield from formulas([Formula(value, sympy.S.Zero, "2") for value in forms_of(system).euler_lagrange], "equation")
 
 
 def _hamilton(system: MechanicalSystem) -> Iterator[Content]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sympy import Symbol
 
 from scvi_codegen.lowering.families import argument_name
-from scvi_codegen.mechanics.forms import constitutive, euler_lagrange, force, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter
 
@@ -37,12 +37,8 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Sym
 def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
     """What a scatter takes from the kernel at a point; of a scalar's gradient, scatters are parallel to gathers."""
     if family.scalar is None:
-        known = {
-            force(system): "L_q",
-            momentum(system): "L_v",
-            euler_lagrange(system): "E",
-            constitutive(system): "L_p",
-        }
+        forms = forms_of(system)
+        known = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
         return Symbol(f"{known[scatter.results]}_{place}")
     name = argument_name(system, family.gathers[family.scatters.index(scatter)])
     return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(family)}_{name}_{place}")

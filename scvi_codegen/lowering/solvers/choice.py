@@ -19,7 +19,7 @@ from scvi_codegen.lowering.solvers.hamiltonian import hamiltonian_sweep
 from scvi_codegen.lowering.solvers.separable import separable_sweep
 from scvi_codegen.lowering.solvers.shooting import shooting_sweep
 from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
-from scvi_codegen.mechanics.forms import is_separable
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -37,7 +37,7 @@ def sweep_of(system: MechanicalSystem, method: Method) -> Sweep | None:
     Lagrangian, if there is one. The step is the same (35f).
     """
     twin = lagrangian_twin(system)
-    if system.auxiliaries and not (twin and is_separable(twin)):
+    if system.auxiliaries and not (twin and forms_of(twin).separable):
         tables = velocity_tables(system, method)
         own = hamiltonian_sweep(system, tables) if tables else None
         if own is not None:
@@ -48,7 +48,7 @@ def sweep_of(system: MechanicalSystem, method: Method) -> Sweep | None:
 def _lagrangian_sweep(system: LagrangianSystem, method: Method) -> Sweep | None:
     if isinstance(method, SCVI) and method.degree > 1:
         return shooting_sweep(system, method) if method.variational else printed_sweep(system, method)
-    separable = is_separable(system)
+    separable = forms_of(system).separable
     if isinstance(method, RungeKutta | SpectralCollocation) and method.form == "position" and not separable:
         return position_sweep(system, method.tableau)
     tables = velocity_tables(system, method)

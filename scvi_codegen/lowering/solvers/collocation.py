@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import CollocationSweep, PrintedEnds
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector
-from scvi_codegen.mechanics.forms import applied_force, mass_entries
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values
@@ -30,13 +30,12 @@ def position_sweep(system: MechanicalSystem, tableau: Tableau) -> CollocationSwe
     lanes = lane_count(len(tableau.b))
     if lanes > MOST_LANES:
         return None
-    kernel, entries = _node_kernel(system)
     return CollocationSweep(
         lanes=lanes,
         nodes=node_tables(tableau, lanes),
         points=None,
-        kernel=kernel,
-        mass_entries=entries,
+        kernel=_node_kernel(system),
+        mass_entries=tuple(forms_of(system).lower_mass),
         ends=None,
     )
 
@@ -46,13 +45,12 @@ def printed_sweep(system: MechanicalSystem, method: SCVI) -> CollocationSweep | 
     lanes = lane_count(max(method.degree, len(method.rule)))
     if lanes > MOST_LANES:
         return None
-    kernel, entries = _node_kernel(system)
     return CollocationSweep(
         lanes=lanes,
         nodes=node_tables(method.tableau, lanes),
         points=point_tables(system, method.tableau, method.rule, lanes),
-        kernel=kernel,
-        mass_entries=entries,
+        kernel=_node_kernel(system),
+        mass_entries=tuple(forms_of(system).lower_mass),
         ends=_printed_ends(method, lanes),
     )
 
@@ -73,15 +71,13 @@ def _printed_ends(method: SCVI, lanes: int) -> PrintedEnds:
     )
 
 
-def _node_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+def _node_kernel(system: MechanicalSystem) -> Kernel:
     """L_q - L_vq v - L_vt and the lower triangle of the mass."""
-    mass = {key: entry for key, entry in mass_entries(system).items() if key[0] >= key[1]}
-    kernel = lower_kernel(
+    return system_kernel(
+        system,
         "applied_force_lanes",
-        arguments=(*system.coordinates, *system.velocities),
-        time=system.time,
-        parameters=system.parameters,
-        values=applied_force(system),
-        slopes=tuple(mass.values()),
+        forms_of(system).applied_force,
+        of=(*system.coordinates, *system.velocities),
+        slopes=forms_of(system).lower_mass.values(),
+        purpose="L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
     )
-    return kernel, tuple(mass)

@@ -11,13 +11,11 @@ the rounded map still has a generating function: its energy error does not drift
 
 from __future__ import annotations
 
-from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import CoupledSweep
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
-from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.basis import transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
@@ -35,7 +33,7 @@ def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSw
         return None
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
     guess = guess_tables(tables.blocks, lanes)
-    kernel, entries = _point_kernel(system)
+    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     return CoupledSweep(
         points=points,
         blocks=blocks,
@@ -50,9 +48,16 @@ def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSw
         velocity=pad_matrix(tables.velocity, lanes) if tables.velocity else (),
         projection=pad_matrix(tables.projection, lanes) if tables.projection else (),
         guess=guess,
-        kernel=kernel,
-        force=_force_kernel(system),
-        mass_entries=entries,
+        kernel=system_kernel(
+            system,
+            "point_lanes",
+            (*forms.force, *forms.momentum),
+            of=of,
+            slopes=forms.lower_mass.values(),
+            purpose="L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
+        ),
+        force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),
+        mass_entries=tuple(forms.lower_mass),
     )
 
 
@@ -72,28 +77,3 @@ def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vec
 def over(numbers: Vector, divisors: Vector) -> Vector:
     """Quotients, entry by entry."""
     return tuple(x / y for x, y in zip(numbers, divisors, strict=True))
-
-
-def _force_kernel(system: MechanicalSystem) -> Kernel:
-    return lower_kernel(
-        "force_lanes",
-        arguments=(*system.coordinates, *system.velocities),
-        time=system.time,
-        parameters=system.parameters,
-        values=force(system),
-    )
-
-
-def _point_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
-    """L_q, L_v and the lower triangle of the mass."""
-    momenta = momentum(system)
-    mass = {key: entry for key, entry in jacobian(momenta, system.velocities).items() if key[0] >= key[1]}
-    kernel = lower_kernel(
-        "point_lanes",
-        arguments=(*system.coordinates, *system.velocities),
-        time=system.time,
-        parameters=system.parameters,
-        values=(*force(system), *momenta),
-        slopes=tuple(mass.values()),
-    )
-    return kernel, tuple(mass)

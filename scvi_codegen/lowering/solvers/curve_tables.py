@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.sweeps import NodeTables, PointTables
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.padding import guess_tables, pad_matrix, pad_vector
-from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values
 from scvi_codegen.tables.precision import mp
@@ -30,15 +30,16 @@ def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
 
 def point_tables(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, lanes: int) -> PointTables:
     """The points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
+    forms = forms_of(system)
     return PointTables(
         abscissae=pad_vector(rule.abscissae, lanes, repeat=True),
         position=pad_matrix(cardinal_integrals(tableau.c, rule.abscissae, 0), lanes),
         velocity=pad_matrix(cardinal_values(tableau.c, rule.abscissae), lanes),
-        action=lower_kernel(
+        action=system_kernel(
+            system,
             "action_lanes",
-            arguments=(*system.coordinates, *system.velocities),
-            time=system.time,
-            parameters=system.parameters,
-            values=(*force(system), *momentum(system)),
+            (*forms.force, *forms.momentum),
+            of=(*system.coordinates, *system.velocities),
+            purpose="L_q and L_v at all points, u = (q, v).",
         ),
     )

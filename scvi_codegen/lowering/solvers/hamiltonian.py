@@ -8,12 +8,12 @@ variational method still has a generating function.
 
 from __future__ import annotations
 
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
-from scvi_codegen.mechanics.forms import force, legendre_map
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["hamiltonian_sweep"]
@@ -25,8 +25,8 @@ def hamiltonian_sweep(system: MechanicalSystem, tables: VelocityTables) -> Hamil
     if lanes > MOST_LANES or tables.velocity:
         return None
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
-    arguments, velocities = legendre_map(system)
-    common = {"arguments": arguments, "time": system.time, "parameters": system.parameters}
+    forms = forms_of(system)
+    of = forms.legendre_arguments
     return HamiltonianSweep(
         points=len(tables.abscissae),
         lanes=lanes,
@@ -38,6 +38,6 @@ def hamiltonian_sweep(system: MechanicalSystem, tables: VelocityTables) -> Hamil
         end_position=pad_vector(over(tables.end_position, position_weights), lanes),
         end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
         guess=guess_tables(tables.blocks, lanes),
-        kernel=lower_kernel("velocity_lanes", values=velocities, **common),
-        force=lower_kernel("force_lanes", values=force(system), **common),
+        kernel=system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
+        force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
     )

@@ -11,10 +11,8 @@ the last evaluation of the points and in the increments.
 
 from __future__ import annotations
 
-from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import SeparableSweep
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.padding import (
     MOST_LANES,
     guess_tables,
@@ -24,7 +22,7 @@ from scvi_codegen.lowering.solvers.padding import (
     pad_vector,
 )
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
-from scvi_codegen.mechanics.forms import force, momentum
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.basis import matrix_product
 from scvi_codegen.tables.precision import mp
@@ -40,6 +38,7 @@ def separable_sweep(system: MechanicalSystem, tables: VelocityTables) -> Separab
     product = matrix_product(tables.position, tables.momentum)
     drift = tuple(mp.fsum(line) for line in tables.position)
     guess = guess_tables(tables.abscissae, lanes, through=product)
+    forms = forms_of(system)
     return SeparableSweep(
         points=len(tables.abscissae),
         lanes=lanes,
@@ -49,26 +48,6 @@ def separable_sweep(system: MechanicalSystem, tables: VelocityTables) -> Separab
         end_position=pad_split(matrix_product((tables.end_position,), tables.momentum)[0], lanes),
         end_momentum=pad_split(tables.end_momentum, lanes),
         guess=guess,
-        force=_force_kernel(system),
-        mass=_mass_kernel(system),
-    )
-
-
-def _force_kernel(system: MechanicalSystem) -> Kernel:
-    return lower_kernel(
-        "force_lanes",
-        arguments=system.coordinates,
-        time=system.time,
-        parameters=system.parameters,
-        values=force(system),
-    )
-
-
-def _mass_kernel(system: MechanicalSystem) -> Kernel:
-    return lower_kernel(
-        "mass",
-        arguments=(),
-        time=system.time,
-        parameters=system.parameters,
-        values=tuple(jacobian(momentum(system), system.velocities).values()),
+        force=system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
+        mass=system_kernel(system, "mass", forms.mass.values(), of=()),
     )

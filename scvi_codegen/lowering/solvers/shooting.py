@@ -10,18 +10,12 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import ShootingSweep
+from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
-from scvi_codegen.mechanics.forms import (
-    accelerations,
-    euler_lagrange,
-    mass_entries,
-    multiplied_residual,
-    multipliers,
-)
+from scvi_codegen.mechanics.forms import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
@@ -40,7 +34,6 @@ def shooting_sweep(system: MechanicalSystem, method: SCVI) -> ShootingSweep | No
         return None
     position = cardinal_integrals(tableau.c, rule.abscissae, 0)
     velocity = cardinal_values(tableau.c, rule.abscissae)
-    kernel, entries = _node_kernel(system)
     return ShootingSweep(
         lanes=lanes,
         nodes=node_tables(tableau, lanes),
@@ -50,22 +43,20 @@ def shooting_sweep(system: MechanicalSystem, method: SCVI) -> ShootingSweep | No
         velocity_transposed=pad_matrix(transpose(velocity), lanes),
         weights=pad_vector(rule.unit_weights, lanes),
         consistency=pad_vector(matrix_product((rule.unit_weights,), velocity)[0], lanes, repeat=True),
-        kernel=kernel,
-        mass_entries=entries,
+        kernel=_node_kernel(system),
+        mass_entries=tuple(forms_of(system).lower_mass),
     )
 
 
-def _node_kernel(system: MechanicalSystem) -> tuple[Kernel, tuple[tuple[int, int], ...]]:
+def _node_kernel(system: MechanicalSystem) -> Kernel:
     """E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
-    scalar = multiplied_residual(system)
-    slopes = gradient(scalar, (*system.coordinates, *system.velocities))
-    mass = {key: entry for key, entry in mass_entries(system).items() if key[0] >= key[1]}
-    kernel = lower_kernel(
+    forms, state = forms_of(system), (*system.coordinates, *system.velocities)
+    slopes = gradient(forms.multiplied_residual, state)
+    return system_kernel(
+        system,
         "node_lanes",
-        arguments=(*system.coordinates, *system.velocities, *accelerations(system), *multipliers(system)),
-        time=system.time,
-        parameters=system.parameters,
-        values=(*euler_lagrange(system), *(slopes.get(i, S.Zero) for i in range(2 * system.dimension))),
-        slopes=tuple(mass.values()),
+        (*forms.euler_lagrange, *(slopes.get(i, S.Zero) for i in range(len(state)))),
+        of=(*state, *accelerations(system), *multipliers(system)),
+        slopes=forms.lower_mass.values(),
+        purpose="E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
     )
-    return kernel, tuple(mass)

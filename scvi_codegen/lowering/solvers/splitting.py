@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.rounding import lower_vector
 from scvi_codegen.ir.sweeps import Splitting
-from scvi_codegen.mechanics.forms import force, is_separable, mass_entries
+from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
@@ -21,16 +21,15 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     if isinstance(method, StoermerVerlet):
         method = Composition(2)
     twin = lagrangian_twin(system) if isinstance(method, Composition) else None
-    if twin is None or not is_separable(twin):
+    if twin is None or not forms_of(twin).separable:
         return None
     assert isinstance(method, Composition)  # or there would be no twin
     kicks, drifts = kicks_and_drifts(method.fractions)
-    common = {"time": system.time, "parameters": system.parameters}
-    mass = mass_entries(twin)
+    forms = forms_of(twin)
     return Splitting(
         kicks=lower_vector(kicks),
         drifts=lower_vector(drifts),
         abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
-        force=lower_kernel("force", arguments=system.coordinates, values=force(twin), **common),
-        mass=lower_kernel("mass", arguments=(), values=tuple(mass.values()), **common),
+        force=system_kernel(twin, "force", forms.force, of=twin.coordinates),
+        mass=system_kernel(twin, "mass", forms.mass.values(), of=()),
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.mechanics.forms import is_separable
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import phase_space_system
 from scvi_codegen.methods.method import Method
@@ -73,7 +73,7 @@ def velocity_tables(system: MechanicalSystem, method: Method) -> VelocityTables 
 def _velocity_stages(system: MechanicalSystem, method: Method) -> StageSystem | None:
     """Stage equations with one family whose kernel is (L_q, L_v) and whose unknowns are velocities."""
     if getattr(method, "form", None) == "position":
-        return phase_space_system(system, method.tableau) if is_separable(system) else None  # type: ignore[attr-defined]
+        return phase_space_system(system, method.tableau) if forms_of(system).separable else None  # type: ignore[attr-defined]
     stages = method.stage_system(system)
     family = stages.families[0]
     plain = len(stages.families) == 1 and len(family.gathers) == len(family.scatters) == 2

@@ -15,7 +15,7 @@ import numpy as np
 import sympy
 from sympy import Expr, prime
 
-from scvi_codegen.mechanics.forms import mass_entries
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.bodies import Body, bodies
 from scvi_codegen.mechanics.symmetry.invariants import Column, Monomial, Polynomial
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -85,7 +85,7 @@ def is_shift(column: Polynomial) -> bool:
 def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list[Polynomial]:
     """The translations among the columns times t, less positions times the masses that they move, and t^2."""
     m, constants = system.dimension, set(system.parameters)
-    masses = {place: x for place, x in mass_entries(system).items() if x.free_symbols <= constants}
+    masses = {place: x for place, x in forms_of(system).mass.items() if x.free_symbols <= constants}
     boosts: list[Polynomial] = []
     for shift in filter(is_shift, rigid):
         moved = {monomial.factors[0] - m for monomial in shift}

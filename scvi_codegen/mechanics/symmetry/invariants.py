@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.mechanics.forms import mass_entries
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.sampling import Motion, Sample, array_value
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
@@ -230,7 +230,7 @@ def _factors(system: MechanicalSystem, motion: Motion) -> list[Expr]:
     """What coefficients may be products of: parameters, and sums of parameters that occur in the system."""
     constants = set(motion.constants)
     found: list[Expr] = list(motion.constants)
-    masses = mass_entries(system)
+    masses = forms_of(system).mass
     sums = [*system.formula.atoms(sympy.Add), *masses.values()]
     sums.append(sympy.Add(*(entry for (i, j), entry in masses.items() if i == j)))
     for total in sums:

@@ -21,7 +21,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import evaluate
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.forms import force, legendre_map
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -119,12 +119,12 @@ class Motion:
 
 def motion_of(system: MechanicalSystem) -> Motion:
     """The motion of a system, long numbers replaced by parameters."""
-    arguments, transformed = legendre_map(system)
+    arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
     if system.auxiliaries:
         slopes = gradient(system.formula, system.coordinates)
         forces = tuple(-slopes.get(i, sympy.S.Zero) for i in range(system.dimension))
     else:
-        forces = force(system)
+        forces = forms_of(system).force
     numbers = _long_numbers((*transformed, *forces))
     if numbers:
         replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}

@@ -28,7 +28,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import closest, evaluated, parse_expression, unsupported_part
-from scvi_codegen.mechanics.forms import legendre_map
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.symmetry.ansatz import (
     Terms,
@@ -308,7 +308,7 @@ def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str
 
 def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     """L_q . xi + L_v . dxi/dt; of a Hamiltonian the rate of p . xi."""
-    p = system.auxiliaries or legendre_map(system)[1]
+    p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
     terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
     return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
@@ -316,6 +316,6 @@ def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
 
 def _rate(system: MechanicalSystem, f: Expr) -> Expr:
     """f_t + f_q . v, with v = H_p of a Hamiltonian."""
-    v = legendre_map(system)[1] if system.auxiliaries else system.velocities
+    v = forms_of(system).legendre if system.auxiliaries else system.velocities
     slopes = gradient(f, (*system.coordinates, system.time))
     return sympy.Add(*(slope * (*v, sympy.S.One)[i] for i, slope in slopes.items()))

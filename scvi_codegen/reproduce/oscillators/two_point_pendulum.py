@@ -10,7 +10,7 @@ import sympy
 from sympy import Rational, Symbol, cos, sin, sqrt
 
 from scvi_codegen.derivation.equations import derive
-from scvi_codegen.mechanics.forms import euler_lagrange
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.shooting import SCVI
@@ -247,7 +247,7 @@ def _linear(function: sympy.Expr) -> sympy.Expr:
 def _derivation(scheme: Scheme) -> Iterator[Block]:
     system = pendulum()
     names = dict(zip((*system.coordinates, *system.velocities), (angle, rate), strict=True))
-    equation = euler_lagrange(system)[0].xreplace(names)
+    equation = forms_of(system).euler_lagrange[0].xreplace(names)
     equation = equation.xreplace(dict.fromkeys(equation.free_symbols - {angle, rate}, acceleration))
     points, weights = exact_rule(gauss_legendre(2)) or ((), ())
     yield Paragraph("The Lagrangian and its Euler-Lagrange equation:")
