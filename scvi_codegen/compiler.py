@@ -17,8 +17,10 @@ kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so t
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
+from functools import cache
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.program import Program
@@ -33,7 +35,7 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.rendering.events import with_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
-from scvi_codegen.rendering.text_cache import Texts, remembered_texts
+from scvi_codegen.rendering.text_cache import remembered_text
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -80,13 +82,32 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
+    key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries))
 
-    def make() -> Texts:
-        program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
-        return render(program), describe(program, system, method), render_ensemble(program)
+    @cache
+    def program() -> Program:
+        return program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
 
-    source, interface, ensemble = remembered_texts(system, method, (solver, prefix, *map(repr, symmetries)), make)
-    return Stepper(source, interface, ensemble=ensemble, flags=flags, events=as_events(events))
+    def texts() -> str:
+        return json.dumps([render(program()).to_json(), describe(program(), system, method).to_json()])
+
+    @cache
+    def ensemble() -> Source | None:
+        text = remembered_text((*key, "ensemble"), lambda: _text_of(render_ensemble(program())))
+        return Source.from_json(text) if text else None
+
+    source, interface = json.loads(remembered_text((*key, "integrator"), texts))
+    return Stepper(
+        Source.from_json(source),
+        Interface.from_json(interface),
+        ensemble=ensemble,
+        flags=flags,
+        events=as_events(events),
+    )
+
+
+def _text_of(source: Source | None) -> str:
+    return "" if source is None else source.to_json()
 
 
 def generate_source(

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.trajectory import Trajectory
-
 __all__ = [
     "BuildError",
     "CacheWarning",
@@ -106,18 +101,11 @@ class StepFailedError(ScviCodegenError, ArithmeticError):
         step: index of the failing step, counted from 0.
         t: time at the start of the failing step.
         residual: the last scaled Newton update.
-        trajectory: the part computed before the failure (``None`` for a single step).
+        trajectory: the :class:`Trajectory` before the failure, ``None`` for a single step; :meth:`Trajectory.before`.
     """
 
     def __init__(
-        self, message: str, *, status: str, step: int, t: float, residual: float, trajectory: Trajectory | None = None
+        self, message: str, *, status: str, step: int, t: float, residual: float, trajectory: object | None = None
     ) -> None:
         super().__init__(message)
         self.status, self.step, self.t, self.residual, self.trajectory = status, step, t, residual, trajectory
-
-    @property
-    def recorded(self) -> Trajectory:
-        """The trajectory before the failure, of an integration."""
-        if self.trajectory is None:
-            raise AttributeError("a single step has no trajectory")
-        return self.trajectory

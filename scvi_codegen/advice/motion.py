@@ -122,7 +122,7 @@ def solve_motion(
             t_eval=None if dense_output else asked,
         )
     except StepFailedError as error:
-        status, message, trajectory, failure = FAILED, str(error), error.recorded, error
+        status, message, trajectory, failure = FAILED, str(error), Trajectory.before(error), error
     ended_by = trajectory.ended_by
     if ended_by is not None and failure is None:
         status, message = EVENT, f"The terminal event '{ended_by.function}' was met."

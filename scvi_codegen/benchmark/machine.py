@@ -9,8 +9,8 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-import scvi_codegen
 from scvi_codegen.native.building import TUNED_FLAGS, find_compiler
+from scvi_codegen.version import __version__
 
 __all__ = ["machine"]
 
@@ -29,7 +29,7 @@ def machine() -> dict[str, str | dict[str, str]]:
         "python": platform.python_version(),
         "compiler": shown.splitlines()[0] if shown else " ".join(compiler),
         "flags": " ".join(TUNED_FLAGS),
-        "versions": {"scvi-codegen": scvi_codegen.__version__, **dict(_versions(PACKAGES))},
+        "versions": {"scvi-codegen": __version__, **dict(_versions(PACKAGES))},
     }
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.runtime.ensemble import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["energy_report", "momentum_report"]

@@ -19,7 +19,8 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model_file import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.ensemble import Ensemble, EnsembleTrajectory
+from scvi_codegen.runtime.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
 

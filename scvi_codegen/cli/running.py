@@ -70,7 +70,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             try:
                 piece = run.record(min(portion, model.step_count - before), every=model.every)
             except StepFailedError as error:
-                if error.trajectory is None:
+                if not isinstance(error.trajectory, Trajectory):
                     raise
                 failure, piece = error, error.trajectory
             elapsed = time.perf_counter() - started

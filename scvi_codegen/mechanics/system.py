@@ -85,6 +85,16 @@ class MechanicalSystem(ABC):
         """Whether time occurs in the function: energy is then not conserved."""
         return self.time in self.formula.free_symbols
 
+    def key(self) -> tuple[str, ...]:
+        """All that tells this system from others: equal for systems of which equal texts are generated."""
+        symbols = (*self.coordinates, *self.auxiliaries, *self.parameters, self.time)
+        return (
+            self.name,
+            sympy.srepr(self.formula),
+            " ".join(symbol.name for symbol in symbols),
+            repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
+        )
+
     def to_text(self) -> str:
         """The function as text that ``from_text`` reads back."""
         return format_expression(self.formula)

@@ -71,6 +71,10 @@ class Method(ABC):
         )
         return card(self.title, facts, *(numbers_html(number_table(part)) for part in self.parts))
 
+    def key(self) -> tuple[str, ...]:
+        """All that tells this method from others."""
+        return (repr(self),)
+
     @abstractmethod
     def specification(self) -> Specification:
         """The method as plain data, read back by ``method_from_specification`` (model files, command line)."""

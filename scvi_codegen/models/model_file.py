@@ -55,8 +55,9 @@ from scvi_codegen.models.problems import Problem, problem
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
+    from scvi_codegen.runtime.inputs import Array
     from scvi_codegen.runtime.run import Run
-    from scvi_codegen.runtime.stepper import Array, Stepper
+    from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["DEFAULT_METHOD", "Model", "dump_model", "load_model", "parse_model", "save_model"]
 

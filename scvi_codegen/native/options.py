@@ -7,7 +7,6 @@ from typing import Any
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_count, checked_number
-from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 
@@ -55,13 +54,11 @@ def checked_options(options: SolverOptions | None) -> SolverOptions | None:
     return options
 
 
-def step_failure(
-    status: int, report: Any, *, step: int, h: float, trajectory: Trajectory | None = None
-) -> StepFailedError:
-    """The exception for a failed step: which, when, how far the iteration was, what to try."""
+def step_failure(status: int, report: Any, *, step: int, h: float, kept: object = None) -> StepFailedError:
+    """The exception for a failed step: which, when, how far the iteration was, what to try; ``kept`` is what it had."""
     word = STATUS[status]
     message = (
         f"step {step} at t = {report.t:.17g} with h = {h:g} failed: {word} "
         f"(last update {report.change:.3g}, {report.iterations} iterations in all); {ADVICE[word]}"
     )
-    return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change, trajectory=trajectory)
+    return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change, trajectory=kept)

@@ -20,6 +20,15 @@ class Source:
     code: str
     declarations: str
 
+    def to_json(self) -> str:
+        """Text read back by :meth:`from_json`."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Source:
+        """The source written by :meth:`to_json`."""
+        return cls(**json.loads(text))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interface:

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from scvi_codegen import __version__
 from scvi_codegen.display.page.environment import page_template, style_sheet
 from scvi_codegen.reproduce.labels import label, linked
 from scvi_codegen.reproduce.laboratory.experiment import Result, Table, Verdict
 from scvi_codegen.reproduce.svg import color_variables, inline_svg
 from scvi_codegen.reproduce.writing import draw
+from scvi_codegen.version import __version__
 
 __all__ = ["report_html", "tally"]
 

@@ -16,7 +16,6 @@ A state takes 0.65 microseconds there, four times as long as a step of the run, 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,9 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import step_failure
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.kept_states import KeptStates
+from scvi_codegen.runtime.memory import Memory
 
 __all__ = ["checked_times", "grid_tolerance", "states_at", "times_of_run"]
 
@@ -35,22 +33,22 @@ ROUNDINGS = 4.0
 ON_GRID = 1e-6
 
 
-def states_at(trajectory: Trajectory, times: Array) -> tuple[Array, Array]:
-    """(n, m) positions and momenta at (n,) times within the trajectory, in any order.
+def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
+    """(n, m) positions and momenta at (n,) times within the states, in any order.
 
     Raises:
         StateError: for times outside, or if the states kept do not stand at whole steps (those of ``t_eval``).
         StepFailedError: if a step of a part of h fails.
     """
-    times = _within(times, trajectory.t[0], trajectory.t[-1])
-    _check_on_grid(trajectory)
-    forward = math.copysign(1.0, trajectory.h)
-    left = np.searchsorted(forward * trajectory.t, forward * times, side="right") - 1
-    t, q, p = trajectory.t[left], trajectory.q[left], trajectory.p[left]
-    whole = _whole_steps(times - t, trajectory.h)
+    times = _within(times, states.t[0], states.t[-1])
+    _check_on_grid(states)
+    forward = math.copysign(1.0, states.h)
+    left = np.searchsorted(forward * states.t, forward * times, side="right") - 1
+    t, q, p = states.t[left], states.q[left], states.p[left]
+    whole = _whole_steps(times - t, states.h)
     between = np.flatnonzero(whole)
-    _take_whole_steps(trajectory, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
-    _take_parts(trajectory, t, times - t, q, p)
+    _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
+    _take_parts(states, t, times - t, q, p)
     return q, p
 
 
@@ -63,7 +61,7 @@ def _whole_steps(spans: Array, h: float) -> NDArray[np.int64]:
 
 
 def _take_whole_steps(
-    trajectory: Trajectory,
+    states: KeptStates,
     left: NDArray[np.intp],
     whole: NDArray[np.int64],
     order: NDArray[np.intp],
@@ -76,18 +74,18 @@ def _take_whole_steps(
     for k in order:
         if run is None or left[k] != kept:
             kept = left[k]
-            run = trajectory.stepper.start(
-                q[k], p[k], h=trajectory.h, t=t[k], parameters=trajectory.parameters, options=trajectory.options
+            run = Memory.started(
+                states.stepper, q[k], p[k], h=states.h, t=t[k], parameters=states.parameters, options=states.options
             )
         run.skip(int(whole[k]) - run.steps)
         t[k], q[k], p[k] = run.t, run.q, run.p
 
 
-def _take_parts(trajectory: Trajectory, t: Array, h: Array, q: Array, p: Array) -> None:
+def _take_parts(states: KeptStates, t: Array, h: Array, q: Array, p: Array) -> None:
     """From each state at t a step of its own h, in place."""
-    binding, m = trajectory.stepper.binding, trajectory.stepper.dimension
+    binding, m = states.stepper.binding, states.stepper.dimension
     step, report, workspace = binding.function("step"), binding.new("report *"), binding.workspace()
-    parameters, options = binding.pointer(trajectory.parameters), binding.options(trajectory.options)
+    parameters, options = binding.pointer(states.parameters), binding.options(states.options)
     q_start, p_start = binding.pointer(q), binding.pointer(p)
     numbers = np.flatnonzero(h)
     for k, begin, length in zip(numbers.tolist(), t[numbers].tolist(), h[numbers].tolist(), strict=True):
@@ -124,23 +122,21 @@ def _within(times: Array, first: float, last: float) -> Array:
     slack = ROUNDINGS * np.finfo(float).eps * max(abs(first), abs(last))
     outside = times[(times < low - slack) | (times > high + slack)]
     if outside.size:
-        raise StateError(
-            f"t = {outside[0]:.17g} is outside of the trajectory, which goes from {first:.17g} to {last:.17g}"
-        )
+        raise StateError(f"t = {outside[0]:.17g} is outside of the states, which goes from {first:.17g} to {last:.17g}")
     return np.clip(times, low, high)
 
 
-def grid_tolerance(trajectory: Trajectory) -> float:
+def grid_tolerance(states: KeptStates) -> float:
     """By how much of a step a kept state may seem to be off the grid of steps: times are rounded."""
-    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(trajectory.t).max() / abs(trajectory.h)
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.t).max() / abs(states.h)
     return float(max(ON_GRID, rounding))
 
 
-def _check_on_grid(trajectory: Trajectory) -> None:
+def _check_on_grid(states: KeptStates) -> None:
     """All states but the last, which an event may have ended, stand at whole steps from the first."""
-    steps = (trajectory.t[:-1] - trajectory.t[0]) / trajectory.h
-    if np.abs(steps - np.round(steps)).max(initial=0.0) > grid_tolerance(trajectory):
+    steps = (states.t[:-1] - states.t[0]) / states.h
+    if np.abs(steps - np.round(steps)).max(initial=0.0) > grid_tolerance(states):
         raise StateError(
-            "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
+            "the states of this states do not stand at whole steps (it was made with t_eval): "
             "integrate without t_eval, then ask for states between"
         )

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.native.arguments import checked_count
-from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters, EnsembleTrajectory
+from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions

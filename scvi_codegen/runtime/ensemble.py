@@ -14,31 +14,27 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_count, checked_number, checked_step, empty_array, real_array
-from scvi_codegen.native.options import checked_options
-from scvi_codegen.runtime.trajectory import relative_changes
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
+from scvi_codegen.runtime.inputs import Array, parameter_index
+from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.portions import record_states
+from scvi_codegen.runtime.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.run import Run
-    from scvi_codegen.runtime.stepper import Stepper
+__all__ = ["Ensemble", "integrate_ensemble"]
 
-__all__ = ["Ensemble", "EnsembleTrajectory", "integrate_ensemble"]
-
-Array = NDArray[np.float64]
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
-OK, INTERRUPTED = "ok", "interrupted"
 FIRST_PORTION = 64
 """Steps of a block before the first look at the clock."""
 PORTION_SECONDS = 0.02
@@ -46,123 +42,8 @@ PORTION_SECONDS = 0.02
 PROGRESS_SECONDS = 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory:
-    """States of k trajectories at common times, the initial one first.
-
-    Attributes:
-        t: (n,) times.
-        q, p: (n, k, m) positions and momenta; NaN after a failure.
-        status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
-            ``"interrupted"``).
-        steps: (k,) steps completed.
-        h: step size.
-        parameters: (k, number of parameters).
-        stepper: the compiled integrator.
-    """
-
-    t: Array
-    q: Array
-    p: Array
-    status: NDArray[np.str_]
-    steps: NDArray[np.int64]
-    h: float
-    parameters: Array
-    stepper: Stepper = field(repr=False)
-
-    def __len__(self) -> int:
-        return len(self.status)
-
-    @property
-    def ok(self) -> NDArray[np.bool_]:
-        """(k,) which trajectories reached the end."""
-        reached: NDArray[np.bool_] = self.status == OK
-        return reached
-
-    def energy(self) -> Array:
-        """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
-        energies = np.full(self.q.shape[:2], np.nan)
-        for j in range(len(self)):
-            good = self._reached(j)
-            try:
-                energies[good, j] = self.stepper.energy(
-                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
-                )
-            except StateError:
-                continue
-        return energies
-
-    def momentum_maps(self) -> Array:
-        """(n, k, c) values of what symmetries conserve, named ``stepper.momentum_map_names``; NaN as above."""
-        return self._momentum_maps()[0]
-
-    def momentum_errors(self) -> Array:
-        """(n, k, c) changes of the momentum maps since the first state, relative to the largest size of their terms."""
-        return relative_changes(*self._momentum_maps())
-
-    def _momentum_maps(self) -> tuple[Array, Array]:
-        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
-        for j in range(len(self)):
-            good = self._reached(j)
-            try:
-                values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
-                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
-                )
-            except StateError:
-                continue
-        return values, sizes
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.
-
-        In a CSV file trajectories are numbered from 0, parameters that differ between them have columns too, and states
-        after a failure are left out.
-
-        Raises:
-            StateError: for another suffix.
-        """
-        suffix = Path(path).suffix.lower()
-        if suffix == ".npz":
-            write_atomically(path, self._write_npz)
-        elif suffix == ".csv":
-            write_atomically(path, self._write_csv)
-        else:
-            raise StateError(f"an ensemble is saved as .npz or .csv, not as {str(path)!r}")
-
-    def _reached(self, j: int) -> NDArray[np.bool_]:
-        """(n,) which states of a trajectory there are."""
-        return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
-
-    def _write_npz(self, file: IO[bytes]) -> None:
-        np.savez(
-            file,
-            t=self.t,
-            q=self.q,
-            p=self.p,
-            status=self.status,
-            steps=self.steps,
-            h=self.h,
-            parameters=self.parameters,
-            coordinates=np.array(self.stepper.coordinates),
-            parameter_names=np.array(self.stepper.parameters, dtype=str),
-            title=self.stepper.title,
-        )
-
-    def _write_csv(self, file: IO[bytes]) -> None:
-        names = self.stepper.coordinates
-        varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
-        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
-        file.write((",".join(header) + "\n").encode())
-        formats = ["%d"] + ["%.17g"] * (len(header) - 1)
-        for j in range(len(self)):
-            good = self._reached(j)
-            label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
-            table = np.column_stack([label, self.t[good], self.q[good, j], self.p[good, j]])
-            np.savetxt(file, table, delimiter=",", fmt=formats)
-
-
 def integrate_ensemble(
-    stepper: Stepper,
+    stepper: Integrator,
     q: ArrayLike,
     p: ArrayLike,
     *,
@@ -186,7 +67,7 @@ class Ensemble:
 
     def __init__(
         self,
-        stepper: Stepper,
+        stepper: Integrator,
         q: ArrayLike,
         p: ArrayLike,
         *,
@@ -251,9 +132,9 @@ class Ensemble:
         source = self.stepper.ensemble
         if source is None:
             return lambda first: _SingleBlock(self, first), 1
-        module, prefix = building.load(source, flags=self.stepper.flags), source.prefix
-        width = len(module.ffi.new(f"{prefix}_block *").active)
-        return lambda first: _LaneBlock(self, first, module, prefix), width
+        binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+        width = len(binding.new("block *").active)
+        return lambda first: _LaneBlock(self, first, binding), width
 
     def result(self) -> EnsembleTrajectory:
         """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
@@ -274,39 +155,31 @@ class Ensemble:
 class _LaneBlock:
     """A few trajectories, lanes of one C block, and those of them that had to leave it."""
 
-    def __init__(self, work: Ensemble, first: int, module: Any, prefix: str) -> None:
-        self.work, self.first, self.prefix = work, first, prefix
-        self.ffi, self.lib = module.ffi, module.lib
-        self.memory = self.ffi.new(f"{prefix}_block *")
-        self._call("start")(self.memory, work.t0, work.h)
-        self.active = np.frombuffer(self.ffi.buffer(self.memory.active), dtype=np.float64)
+    def __init__(self, work: Ensemble, first: int, binding: Binding) -> None:
+        self.work, self.first, self.binding = work, first, binding
+        self.memory = binding.new("block *")
+        binding.function("start")(self.memory, work.t0, work.h)
+        self.active = np.frombuffer(binding.buffer(self.memory.active), dtype=np.float64)
         self.count, self.step = min(len(self.active), work.count - first), 0
         self.left: dict[int, _Alone] = {}
         self._fill()
 
-    def _call(self, name: str) -> Callable[..., Any]:
-        function: Callable[..., Any] = getattr(self.lib, f"{self.prefix}_{name}")
-        return function
-
     def _fill(self) -> None:
         """A trajectory into each lane; those too many repeat the last one and rest."""
-        work, call = self.work, self._call("set")
-        q, p = (self.ffi.from_buffer("double[]", array) for array in (work.q, work.p))
-        values, m, P = self.ffi.from_buffer("double[]", work.parameters), *work.q.shape[2:], work.parameters.shape[1]
+        work, call, pointer = self.work, self.binding.function("set"), self.binding.pointer
         v = self._velocities()
-        velocities = self.ffi.NULL if v is None else self.ffi.from_buffer("double[]", v)
         for lane in range(len(self.active)):
             k = min(lane, self.count - 1)
             j = self.first + k
-            given = velocities if v is None else velocities + k * m
-            call(self.memory, lane, q + j * m, p + j * m, given, values + j * P if P else self.ffi.NULL)
+            velocity = self.binding.null if v is None else pointer(v[k])
+            call(self.memory, lane, pointer(work.q[0, j]), pointer(work.p[0, j]), velocity, pointer(work.parameters[j]))
         self.active[self.count :] = 0.0
         if v is not None:
             self.active[: self.count] *= np.isfinite(v).all(axis=1)
 
     def _velocities(self) -> Array | None:
         """(count, m) initial velocities if the lanes need them, not numbers where there are none."""
-        if not getattr(self.lib, f"{self.prefix.upper()}_NEEDS_VELOCITIES"):
+        if not self.binding.constant("NEEDS_VELOCITIES"):
             return None
         work, v = self.work, np.full((self.count, self.work.stepper.dimension), np.nan)
         for k in range(self.count):
@@ -322,14 +195,14 @@ class _LaneBlock:
             row = begin // work.every + 1
             stride = work.count * work.stepper.dimension
             place = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
-            self._call("advance")(
+            self.binding.function("advance")(
                 self.memory,
                 self.count,
                 size,
                 work.every,
-                self._options(),
-                self.ffi.from_buffer("double[]", work.q) + place,
-                self.ffi.from_buffer("double[]", work.p) + place,
+                self.binding.options(work.options),
+                self.binding.pointer(work.q) + place,
+                self.binding.pointer(work.p) + place,
                 stride,
             )
         running = self.active[: self.count] > 0.0
@@ -351,13 +224,6 @@ class _LaneBlock:
         work.q[rows, j] = work.p[rows, j] = np.nan
         self.left[lane].advance_to(self.step)
 
-    def _options(self) -> Any:
-        options = self.work.options
-        if options is None:
-            return self.ffi.NULL
-        values = [options.tolerance, options.max_iterations, int(options.absolute)]
-        return self.ffi.new(f"{self.prefix}_options *", values)
-
 
 class _SingleBlock:
     """One trajectory, of a method without lanes."""
@@ -378,10 +244,12 @@ class _Alone:
         self, work: Ensemble, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
     ) -> None:
         self.work, self.j = work, j
-        self.run: Run | None = None
+        self.run: Memory | None = None
         work.done[j] = step
         try:
-            run = work.stepper.start(q, p, h=work.h, t=work.t0, parameters=work.parameters[j], options=work.options)
+            run = Memory.started(
+                work.stepper, q, p, h=work.h, t=work.t0, parameters=work.parameters[j], options=work.options
+            )
         except StateError:  # a sum of finite terms that overflowed
             work.status[j] = "not finite"
         else:
@@ -395,15 +263,15 @@ class _Alone:
             return
         row = run.steps // work.every + 1
         try:
-            trajectory = run.record(step - run.steps, every=work.every)
+            trajectory = record_states(run, step - run.steps, every=work.every)
         except StepFailedError as failure:
-            work.status[j], trajectory, self.run = failure.status, failure.recorded, None
+            work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
         work.done[j] = run.steps
         rows = slice(row, row + len(trajectory) - 1)
         work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
 
 
-def _states(stepper: Stepper, value: ArrayLike, name: str) -> Array:
+def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
     """(k, m) finite numbers."""
     array = real_array(value, name)
     if array.ndim == 1:
@@ -416,7 +284,7 @@ def _states(stepper: Stepper, value: ArrayLike, name: str) -> Array:
     return array
 
 
-def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Array:
+def _parameters(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
     """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))
@@ -425,7 +293,7 @@ def _parameters(stepper: Stepper, given: EnsembleParameters, count: int) -> Arra
             column = real_array(value, f"the parameter {name}")
             if column.shape not in ((), (count,)):
                 raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
-            values[:, stepper.parameter_index(name)] = column
+            values[:, parameter_index(stepper.interface, name)] = column
     elif given is not None:
         array = real_array(given, "parameters")
         if array.shape not in ((len(names),), (count, len(names))):

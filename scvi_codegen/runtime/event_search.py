@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,8 @@ from scvi_codegen.errors import EventError, StateError
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.dense_output import grid_tolerance
 from scvi_codegen.runtime.events import Crossings
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.stepper import Stepper
-    from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.kept_states import KeptStates
 
 __all__ = ["EventSearch", "crossings_of"]
 
@@ -31,7 +28,7 @@ class EventSearch:
         found: structured arrays (t, function, q, p), in order of the run.
     """
 
-    def __init__(self, stepper: Stepper) -> None:
+    def __init__(self, stepper: Integrator) -> None:
         self.stepper, self.binding = stepper, stepper.binding
         self.found: list[NDArray[Any]] = []
         self.watch = self.binding.new("watch *")
@@ -48,7 +45,7 @@ class EventSearch:
         """Whether a terminal event was met."""
         return bool(self.watch.ended)
 
-    def search(self, part: Trajectory, first: int = 0) -> int:
+    def search(self, part: KeptStates, first: int = 0) -> int:
         """Look between the states of a trajectory that has all of them; the number of steps before the search ended.
 
         Args:
@@ -93,7 +90,7 @@ class EventSearch:
                 return done
             self._room *= 2
 
-    def _failure(self, status: int, report: Any, step: int, part: Trajectory) -> Exception:
+    def _failure(self, status: int, report: Any, step: int, part: KeptStates) -> Exception:
         if self.watch.undefined:
             function = self.stepper.events[self.watch.undefined - 1].function
             return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
@@ -109,15 +106,15 @@ class EventSearch:
         )
 
 
-def crossings_of(stepper: Stepper, trajectory: Trajectory) -> tuple[Crossings, ...]:
+def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ...]:
     """The crossings of the stepper's events along a trajectory that has all states of its run; none is terminal.
 
     Raises:
         StateError: if states between were not kept.
         EventError, StepFailedError: as :meth:`EventSearch.search`.
     """
-    lengths = np.diff(trajectory.t) / trajectory.h
-    tolerance = grid_tolerance(trajectory)
+    lengths = np.diff(states.t) / states.h
+    tolerance = grid_tolerance(states)
     whole = np.abs(lengths - 1.0) <= tolerance
     if not whole[:-1].all() or (lengths > 1.0 + tolerance).any():
         raise StateError(
@@ -127,13 +124,20 @@ def crossings_of(stepper: Stepper, trajectory: Trajectory) -> tuple[Crossings, .
     for number in range(len(stepper.events)):
         search.watch.remaining[number] = 0
     steps = int(whole.sum())
-    search.search(_part(trajectory, slice(steps + 1), trajectory.h))
+    search.search(_part(states, slice(steps + 1), states.h))
     if steps < len(whole):  # an event ended the last step
-        search.search(_part(trajectory, slice(steps, None), float(trajectory.t[-1] - trajectory.t[-2])))
+        search.search(_part(states, slice(steps, None), float(states.t[-1] - states.t[-2])))
     return search.crossings()
 
 
-def _part(trajectory: Trajectory, states: slice, h: float) -> Trajectory:
+def _part(states: KeptStates, numbers: slice, h: float) -> KeptStates:
     """Some of the states, with steps of h."""
-    kept = {name: getattr(trajectory, name)[states] for name in ("t", "q", "p", "iterations")}
-    return replace(trajectory, h=h, **kept)
+    return KeptStates(
+        t=states.t[numbers],
+        q=states.q[numbers],
+        p=states.p[numbers],
+        h=h,
+        parameters=states.parameters,
+        stepper=states.stepper,
+        options=states.options,
+    )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,9 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import checked_count
 from scvi_codegen.runtime.dense_output import states_at
 from scvi_codegen.runtime.event_search import EventSearch
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.portions import SLICE_SECONDS, record_states, trajectory_of
 from scvi_codegen.runtime.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.run import Run
 
 __all__ = ["Observation"]
 
@@ -28,8 +26,6 @@ Array = NDArray[np.float64]
 NUMBERS = 2**18
 """Of positions in a portion."""
 FIRST_STEPS = 64
-SLICE_SECONDS = 0.1
-"""Time between looks at the keyboard (and calls of ``progress``)."""
 
 
 class Observation:
@@ -41,7 +37,7 @@ class Observation:
         times: (n,) sorted as the run goes; keep the states at these.
     """
 
-    def __init__(self, run: Run, *, every: int = 1, times: Array | None = None) -> None:
+    def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None) -> None:
         self.run, self.every, self.times = run, checked_count(every, "every", least=1), times
         self.search = EventSearch(run.stepper) if run.stepper.events else None
         self.states: list[tuple[Array, Array, Array, NDArray[np.int64]]] = []
@@ -55,7 +51,7 @@ class Observation:
             EventError: where an event function is not finite.
         """
         steps = checked_count(steps, "steps", least=0)
-        self._keep(self.run.record_states(0), first=True)
+        self._keep(record_states(self.run, 0), first=True)
         most = max(1, NUMBERS // self.run.stepper.dimension)
         portion, done = min(FIRST_STEPS, most), 0
         while done < steps:
@@ -78,14 +74,14 @@ class Observation:
         """A portion of the run, its events and what is kept of it; a step that fails after a terminal event is none."""
         before, failure = self.run.save(), None
         try:
-            part = self.run.record_states(size)
+            part = record_states(self.run, size)
         except StepFailedError as error:
-            part, failure = error.recorded, error
+            part, failure = Trajectory.before(error), error
         if self.search is not None:
             reached = self.search.search(part, first=self.run.steps - len(part) + 1)
             if self.search.ended:
                 self.run.rewind(before)
-                part, failure = self._ended(self.run.record_states(reached)), None
+                part, failure = self._ended(record_states(self.run, reached)), None
         self._keep(part)
         if failure is not None:
             raise failure
@@ -132,4 +128,4 @@ class Observation:
 
     def _made(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]) -> Trajectory:
         crossings = self.search.crossings() if self.search is not None else ()
-        return self.run.trajectory(t, q, p, iterations, events=crossings)
+        return trajectory_of(self.run, t, q, p, iterations, events=crossings)

@@ -4,34 +4,33 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, to_xarray, write_states
+from scvi_codegen.runtime.dense_output import checked_times, states_at
+from scvi_codegen.runtime.event_search import crossings_of
+from scvi_codegen.runtime.events import Crossings, Event, EventLike
+from scvi_codegen.runtime.kept_states import Array, KeptStates
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.events import Crossings, Event, EventLike
-    from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Trajectory", "relative_changes"]
-
-Array = NDArray[np.float64]
 
 MOST_DRAWN, MOST_CURVES = 400, 6
 """States, and coordinates, that a notebook draws."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trajectory:
+class Trajectory(KeptStates):
     """States along a run, the initial one first.
 
     Attributes:
@@ -46,18 +45,15 @@ class Trajectory:
         events: the zero crossings found, parallel to ``stepper.events``.
     """
 
-    t: Array
-    q: Array
-    p: Array
     iterations: NDArray[np.int32]
-    h: float
-    parameters: Array
-    stepper: Stepper = field(repr=False)
-    options: SolverOptions | None = field(default=None, repr=False)
     events: tuple[Crossings, ...] = ()
 
-    def __len__(self) -> int:
-        return len(self.t)
+    @classmethod
+    def before(cls, failure: StepFailedError) -> Self:
+        """What an integration kept before the step that failed; StateError if that was a single step."""
+        if not isinstance(failure.trajectory, cls):
+            raise StateError("a single step that failed has no trajectory")
+        return failure.trajectory
 
     def energy(self) -> Array:
         """(n,) energies p.v - L, constant along exact trajectories when L does not depend on time."""
@@ -109,7 +105,9 @@ class Trajectory:
         Raises:
             StateError: for times outside, and of a trajectory made with ``t_eval``.
         """
-        return self.stepper.states_at(self, t)
+        times = checked_times(t, "t")
+        q, p = states_at(self, times.ravel())
+        return q.reshape(*times.shape, -1), p.reshape(*times.shape, -1)
 
     def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
         """Zero crossings of functions along the trajectory, looked for now; it needs all states (``every=1``).
@@ -117,7 +115,7 @@ class Trajectory:
         Args:
             events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
         """
-        return self.stepper.with_events(events).crossings(self)
+        return crossings_of(self.stepper.with_events(events), self)
 
     def _repr_html_(self) -> str:
         every = max(1, -(-len(self) // MOST_DRAWN))

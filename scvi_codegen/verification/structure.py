@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.verification.linearisation import Linearised
 from scvi_codegen.verification.subject import EPSILON, State, Subject
@@ -89,9 +90,9 @@ def _momentum(subject: Subject, k: int) -> Finding:
     try:
         run = subject.stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t)
     except StepFailedError as failure:
-        if failure.trajectory is None or len(failure.trajectory) <= TRIED:
+        run = Trajectory.before(failure)
+        if len(run) <= TRIED:
             raise
-        run = failure.trajectory
     steps = len(run) - 1
     bound = ROUNDINGS * EPSILON * float(np.sqrt(steps))
     error = float(np.abs(run.momentum_errors()[:, k]).max())

@@ -205,11 +205,11 @@ def test_a_step_that_fails_leaves_the_states_before_it(compiled):
         record_run(run, "a.run", steps=1000, rows=8)
     with pytest.raises(StepFailedError) as whole:
         stepper.integrate([1.0], [1.0], h=0.05, steps=1000)
-    assert_same(load_run("a.run"), whole.value.recorded)
+    assert_same(load_run("a.run"), whole.value.trajectory)
     assert load_run("a.run").steps == error.value.step == whole.value.step
     with pytest.raises(StepFailedError):
         resume_run("a.run")
-    assert_same(load_run("a.run"), whole.value.recorded)
+    assert_same(load_run("a.run"), whole.value.trajectory)
 
 
 class TestCommandLine:

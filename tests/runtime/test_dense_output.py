@@ -159,7 +159,7 @@ def test_what_was_kept_before_a_failure_is_there():
     stepper = compile_stepper(runaway, SVI(3), flags=FLAGS)
     with pytest.raises(StepFailedError) as failure:
         stepper.integrate([1.0], [1.0], h=0.1, steps=100, t_eval=np.linspace(0, 10, 101))
-    assert 5 < len(failure.value.recorded) < 50
+    assert 5 < len(failure.value.trajectory) < 50
 
 
 # The call that is like solve_ivp.

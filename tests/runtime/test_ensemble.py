@@ -28,7 +28,8 @@ from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model_file import Model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.ensemble import Ensemble, EnsembleTrajectory, integrate_ensemble
+from scvi_codegen.runtime.ensemble import Ensemble, integrate_ensemble
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.stepper import Stepper
 
 KINDS = {
@@ -89,7 +90,7 @@ class TestEqualsSingleTrajectories:
         stepper = stepper_for("planar-pendulum", SVI(5))
         q, p = states("planar-pendulum", 3)
         each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
-        place = {name: stepper.parameter_index(name) for name in ("g", "l")}
+        place = {name: stepper.parameters.index(name) for name in ("g", "l")}
         assert each.parameters[:, place["g"]].tolist() == [1.0, 2.0, 3.0]
         assert each.parameters[:, place["l"]].tolist() == [2.0] * 3
         again = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters=each.parameters)
@@ -156,7 +157,7 @@ class TestFailures:
         assert result.status[3] == failure.value.status
         assert result.steps[3] == failure.value.step
         reached = failure.value.step + 1
-        single = failure.value.recorded.q
+        single = failure.value.trajectory.q
         assert (np.abs(result.q[:reached, 3] - single) < 1e-9 * np.abs(single)).all()
         assert np.isnan(result.q[reached:, 3]).all()
         assert np.isnan(result.p[reached:, 3]).all()

@@ -270,7 +270,7 @@ def test_a_terminal_event_before_a_step_that_fails_is_met():
     stepper = compiled_plainly(runaway, SVI(3))
     with pytest.raises(StepFailedError) as failure:
         stepper.integrate([1.0], [1.0], h=0.1, steps=100, events="q - 5")
-    assert len(failure.value.recorded.events[0]) == 1
+    assert len(failure.value.trajectory.events[0]) == 1
     run = stepper.integrate([1.0], [1.0], h=0.1, steps=100, events=Event("q - 5", terminal=True))
     assert run.q[-1, 0] == pytest.approx(5, abs=1e-14)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from scvi_codegen import __version__
 from scvi_codegen.compiler import c_identifier, program_of
 from scvi_codegen.derivation.equations import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
@@ -25,6 +24,7 @@ from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.rendering.outline import functions_of
 from scvi_codegen.rendering.text import render
+from scvi_codegen.version import __version__
 
 __all__ = ["derivation_html"]
 

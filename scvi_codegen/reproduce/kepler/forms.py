@@ -97,7 +97,7 @@ def orbit_of(method: Method, h: float, span: float, e: float = ECCENTRICITY) -> 
     try:
         run = trajectory(SYSTEM, method, *perihelion(e), h=h, span=span, options=SECTION_4, solver=_solver(method))
     except StepFailedError as failure:
-        run, failed = failure.recorded, True
+        run, failed = Trajectory.before(failure), True
     energy, momentum = run.energy(), angular_momentum(run.q, run.p)
     turn = perihelion_turn(run.q, run.p) / (run.t[-1] / (2 * math.pi))
     return Orbit(run, energy - energy[0], momentum - momentum[0], turn, failed)

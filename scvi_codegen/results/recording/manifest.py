@@ -12,6 +12,7 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.version import __version__
 
@@ -39,7 +40,7 @@ class Build:
     fingerprint: str
 
     @classmethod
-    def of(cls, stepper: Stepper, step: int) -> Build:
+    def of(cls, stepper: Integrator, step: int) -> Build:
         """What compiles here."""
         return cls(
             step=step,

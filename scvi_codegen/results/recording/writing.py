@@ -23,6 +23,7 @@ from scvi_codegen.native.arguments import checked_count
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
+from scvi_codegen.runtime.portions import record_states
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -95,7 +96,7 @@ def record_run(
     with _locked(target):
         with recorder.telling_where_it_stands():
             _clear(target)
-            recorder.keep(_piece(run.record_states(0), 0))
+            recorder.keep(_piece(record_states(run, 0), 0))
             recorder.write()
             write_manifest(target, manifest)
             sync_folder(target)
@@ -198,9 +199,9 @@ class _Recorder:
 
     def _advance(self, steps: int) -> None:
         try:
-            self.keep(_piece(self.run.record_states(steps, every=self.manifest.every), 1))
+            self.keep(_piece(record_states(self.run, steps, every=self.manifest.every), 1))
         except StepFailedError as error:
-            if error.trajectory is not None:
+            if isinstance(error.trajectory, Trajectory):
                 self.keep(_piece(error.trajectory, 1))
             raise
 

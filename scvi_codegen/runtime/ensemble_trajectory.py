@@ -1,0 +1,136 @@
+"""The result of an ensemble: states of many trajectories at common times, diagnostics and files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.trajectory import relative_changes
+
+__all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory"]
+
+OK, INTERRUPTED = "ok", "interrupted"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleTrajectory:
+    """States of k trajectories at common times, the initial one first.
+
+    Attributes:
+        t: (n,) times.
+        q, p: (n, k, m) positions and momenta; NaN after a failure.
+        status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
+            ``"interrupted"``).
+        steps: (k,) steps completed.
+        h: step size.
+        parameters: (k, number of parameters).
+        stepper: the compiled integrator.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    status: NDArray[np.str_]
+    steps: NDArray[np.int64]
+    h: float
+    parameters: Array
+    stepper: Integrator = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(k,) which trajectories reached the end."""
+        reached: NDArray[np.bool_] = self.status == OK
+        return reached
+
+    def energy(self) -> Array:
+        """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
+        energies = np.full(self.q.shape[:2], np.nan)
+        for j in range(len(self)):
+            good = self._reached(j)
+            try:
+                energies[good, j] = self.stepper.energy(
+                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                )
+            except StateError:
+                continue
+        return energies
+
+    def momentum_maps(self) -> Array:
+        """(n, k, c) values of what symmetries conserve, named ``stepper.momentum_map_names``; NaN as above."""
+        return self._momentum_maps()[0]
+
+    def momentum_errors(self) -> Array:
+        """(n, k, c) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        return relative_changes(*self._momentum_maps())
+
+    def _momentum_maps(self) -> tuple[Array, Array]:
+        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
+        for j in range(len(self)):
+            good = self._reached(j)
+            try:
+                values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
+                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                )
+            except StateError:
+                continue
+        return values, sizes
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.
+
+        In a CSV file trajectories are numbered from 0, parameters that differ between them have columns too, and states
+        after a failure are left out.
+
+        Raises:
+            StateError: for another suffix.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".npz":
+            write_atomically(path, self._write_npz)
+        elif suffix == ".csv":
+            write_atomically(path, self._write_csv)
+        else:
+            raise StateError(f"an ensemble is saved as .npz or .csv, not as {str(path)!r}")
+
+    def _reached(self, j: int) -> NDArray[np.bool_]:
+        """(n,) which states of a trajectory there are."""
+        return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
+
+    def _write_npz(self, file: IO[bytes]) -> None:
+        np.savez(
+            file,
+            t=self.t,
+            q=self.q,
+            p=self.p,
+            status=self.status,
+            steps=self.steps,
+            h=self.h,
+            parameters=self.parameters,
+            coordinates=np.array(self.stepper.coordinates),
+            parameter_names=np.array(self.stepper.parameters, dtype=str),
+            title=self.stepper.title,
+        )
+
+    def _write_csv(self, file: IO[bytes]) -> None:
+        names = self.stepper.coordinates
+        varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
+        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
+        file.write((",".join(header) + "\n").encode())
+        formats = ["%d"] + ["%.17g"] * (len(header) - 1)
+        for j in range(len(self)):
+            good = self._reached(j)
+            label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
+            table = np.column_stack([label, self.t[good], self.q[good, j], self.p[good, j]])
+            np.savetxt(file, table, delimiter=",", fmt=formats)

@@ -1,0 +1,80 @@
+"""States and parameters as users give them, checked against the names and shapes of an integrator's interface."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.rendering.source import Interface
+
+__all__ = ["Array", "Parameters", "checked_parameters", "checked_states", "checked_vector", "parameter_index"]
+
+Array = NDArray[np.float64]
+Parameters = Mapping[str, float] | Sequence[float] | Array | None
+"""By name, others keeping their defaults, or all in order."""
+
+
+def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
+    """A finite, contiguous (m,) copy."""
+    array, coordinates = real_array(value, name), interface.coordinates
+    if array.shape != (interface.dimension,):
+        names = ", ".join(coordinates[:6]) + (", ..." if interface.dimension > 6 else "")
+        raise StateError(f"{name} must have shape ({interface.dimension},) for ({names}), not {array.shape}")
+    if not np.isfinite(array).all():
+        worst = int(np.flatnonzero(~np.isfinite(array))[0])
+        raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}")
+    return array
+
+
+def checked_states(interface: Interface, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
+    """(n,) times and (n, m) positions and momenta, contiguous, of one state or many."""
+    positions, momenta = real_array(q, "q"), real_array(p, "p")
+    if positions.ndim == 1:
+        positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
+    elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
+        raise StateError(
+            f"states must have shape (n, {interface.dimension}), not q {positions.shape} and p {momenta.shape}"
+        )
+    count = positions.size // interface.dimension
+    times = real_array(t, "the time t")
+    if not np.isfinite(times).all():
+        raise StateError("a time t is not finite")
+    if times.shape not in ((), (count,)):
+        raise StateError(f"there are {count} states, but the time has shape {times.shape}")
+    times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
+    return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
+
+
+def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
+    """(k,) values in order."""
+    names, values = interface.parameters, np.array(interface.defaults, dtype=float)
+    if parameters is None:
+        return values
+    if isinstance(parameters, Mapping):
+        for name, value in parameters.items():
+            values[parameter_index(interface, name)] = checked_number(value, f"the parameter {name}")
+    else:
+        given = real_array(parameters, "parameters")
+        if given.shape != values.shape:
+            raise StateError(f"there are {len(values)} parameters ({', '.join(names) or 'none'}), not {given.size}")
+        values = given
+    if not np.isfinite(values).all():
+        worst = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise StateError(f"the parameter {names[worst]} is {values[worst]}")
+    return values
+
+
+def parameter_index(interface: Interface, name: str) -> int:
+    """The place of a parameter; StateError with the nearest name if there is none."""
+    names = interface.parameters
+    if name in names:
+        return names.index(name)
+    folded = {parameter.lower(): parameter for parameter in names}
+    near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise StateError(f"there is no parameter {name!r} among {', '.join(names) or 'none'}{hint}")

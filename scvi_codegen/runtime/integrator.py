@@ -1,0 +1,336 @@
+"""A compiled method for one system: steps, Legendre transforms, energies, each a function of its arguments alone.
+
+All calls into C release the GIL and share nothing, so one integrator may be used from many threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.display.cards import card, listed, plain
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.native import building
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.events import Event, EventLike, as_events
+from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_states, checked_vector
+
+__all__ = ["Integrator"]
+
+
+def no_ensemble() -> None:
+    """Of a method without a text for many trajectories."""
+
+
+class Integrator:
+    """One method for one system, compiled.
+
+    Attributes:
+        title: system and method, one line.
+        coordinates, parameters: names in order.
+        defaults: (k,) default parameter values.
+        dimension: degrees of freedom m.
+        momentum_map_names: what symmetries conserve.
+        source: the C text it was compiled from.
+        events: zero crossings that every run records.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        interface: Interface,
+        *,
+        ensemble: Callable[[], Source | None] = no_ensemble,
+        flags: tuple[str, ...] = building.TUNED_FLAGS,
+        events: tuple[Event, ...] = (),
+    ) -> None:
+        self.interface, self._ensemble, self.flags, self.events = interface, ensemble, flags, events
+        self._plain = source
+        self.source = _watching(source, interface, events) if events else source
+        self.binding = Binding(building.load(self.source, flags=flags), interface.prefix, interface.workspace)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.title}>"
+
+    def _repr_html_(self) -> str:
+        interface = self.interface
+        parameters = zip(interface.parameters, interface.defaults, strict=True)
+        return card(
+            interface.title,
+            (
+                ("method", plain(", ".join(interface.notes))),
+                ("coordinates", listed(interface.coordinates)),
+                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
+                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
+            ),
+        )
+
+    @property
+    def ensemble(self) -> Source | None:
+        """The C text for many trajectories at once, derived when first asked for; ``None`` if the method has none."""
+        return self._ensemble()
+
+    @property
+    def title(self) -> str:
+        """System and method, one line."""
+        return self.interface.title
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Coordinate names."""
+        return self.interface.coordinates
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Parameter names."""
+        return self.interface.parameters
+
+    @property
+    def defaults(self) -> Array:
+        """(k,) default parameter values."""
+        return np.array(self.interface.defaults, dtype=float)
+
+    @property
+    def momentum_map_names(self) -> tuple[str, ...]:
+        """What symmetries of the system conserve: ``"angular momentum"``, ``"boost of x"``."""
+        return self.interface.map_names
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return self.interface.dimension
+
+    def step(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """One step from (q, p) at t to t + h, a function of its arguments alone.
+
+        Args:
+            q, p: (m,) positions and momenta.
+            h: step size, negative to go back.
+            t: time.
+            parameters: by name (others keep their defaults) or all in order.
+            options: convergence of the stage equations.
+
+        Returns:
+            (q1, p1), each (m,).
+
+        Raises:
+            StateError: on wrong shapes, names or non-finite numbers.
+            StepFailedError: if the stage equations cannot be solved.
+        """
+        q0, p0, values = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
+        q1, p1 = np.empty_like(q0), np.empty_like(p0)
+        report = self.binding.new("report *")
+        status = self.binding.function("step")(
+            checked_number(t, "the time t"),
+            checked_step(h),
+            self.binding.pointer(q0),
+            self.binding.pointer(p0),
+            self.binding.pointer(values),
+            self.binding.options(options),
+            self.binding.pointer(q1),
+            self.binding.pointer(p1),
+            report,
+            self.binding.workspace(),
+        )
+        if status:
+            raise step_failure(status, report, step=0, h=h)
+        return q1, p1
+
+    def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
+        """The same integrator, whose runs record these events in place of its own."""
+        wanted = as_events(events)
+        if wanted == self.events:
+            return self
+        return type(self)(self._plain, self.interface, ensemble=self._ensemble, flags=self.flags, events=wanted)
+
+    def momentum(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
+        """(m,) momenta p = dL/dv at (q, v, t), the Legendre transform."""
+        return self._transform("momentum", self._vector(q, "q"), self._vector(v, "v"), t, parameters)
+
+    def velocity(self, q: ArrayLike, p: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
+        """(m,) velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from rest)."""
+        return self._transform("velocity", self._vector(q, "q"), self._vector(p, "p"), t, parameters)
+
+    def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
+        """Energy p.v - L: a float for (m,) states, (n,) for (n, m) states with one time or (n,) times."""
+        times, positions, momenta = checked_states(self.interface, q, p, t)
+        result = np.empty(len(times))
+        status = self.binding.function("energies")(
+            len(times),
+            self.binding.pointer(times),
+            self.binding.pointer(positions),
+            self.binding.pointer(momenta),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(result),
+            self.binding.workspace(),
+        )
+        if status:
+            raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
+        return float(result[0]) if np.ndim(q) == 1 else result
+
+    def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """What symmetries conserve, k numbers in the order of ``momentum_map_names``.
+
+        Returns:
+            (k,) for (m,) states, (n, k) for (n, m) states with one time or (n,) times.
+
+        Raises:
+            StateError: on wrong shapes, names or numbers.
+        """
+        values = self.momentum_maps_and_sizes(q, p, t, parameters)[0]
+        return values[0] if np.ndim(q) == 1 else values
+
+    def momentum_maps_and_sizes(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """The same, (n, k), and the roots of the sums of the squares of their terms, beside which rounding is small."""
+        times, positions, momenta = checked_states(self.interface, q, p, t)
+        values, sizes = np.empty((2, len(times), len(self.momentum_map_names)))
+        if not values.size:
+            return values, sizes
+        status = self.binding.function("momentum_maps")(
+            len(times),
+            self.binding.pointer(times),
+            self.binding.pointer(positions),
+            self.binding.pointer(momenta),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(values),
+            self.binding.pointer(sizes),
+        )
+        if status:
+            raise StateError(f"the momentum maps of a state cannot be computed ({STATUS[status]})")
+        return values, sizes
+
+    def discrete_lagrangian(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> float:
+        """L_d(q0, q1), the approximate action of the curve from q0 at t to q1 at t + h; paper (25), (33).
+
+        Raises:
+            MethodError: for methods without a discrete Lagrangian.
+            StepFailedError: if no curve is found.
+        """
+        return self._discrete_legendre(q0, q1, h, t, parameters, options)[2]
+
+    def discrete_legendre_minus(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
+        return self._vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
+
+    def discrete_legendre_plus(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
+        return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
+
+    def step_positions(
+        self,
+        q_previous: ArrayLike,
+        q_current: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> Array:
+        """The discrete Euler-Lagrange equation (4): (q_{k-1} at t, q_k at t + h) -> q_{k+1} at t + 2 h.
+
+        Raises as :meth:`discrete_lagrangian`.
+        """
+        q, p = self.discrete_legendre_plus(q_previous, q_current, h, t, parameters, options=options)
+        return self.step(q, p, h, t + h, parameters, options=options)[0]
+
+    def _discrete_legendre(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+    ) -> tuple[Array, Array, float]:
+        if not self.interface.has_action:
+            raise MethodError(f"{self.interface.method} has no discrete Lagrangian; SVI, SCVI and Gauss methods have")
+        start, end = self._vector(q0, "q0"), self._vector(q1, "q1")
+        p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
+        report = self.binding.new("report *")
+        status = self.binding.function("discrete_legendre")(
+            checked_number(t, "the time t"),
+            checked_step(h),
+            self.binding.pointer(start),
+            self.binding.pointer(end),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.options(options),
+            self.binding.pointer(p0),
+            self.binding.pointer(p1),
+            self.binding.pointer(action),
+            report,
+            self.binding.workspace(),
+        )
+        if status:
+            raise step_failure(status, report, step=0, h=h)
+        return p0, p1, float(action[0])
+
+    def _transform(self, name: str, q: Array, other: Array, t: float, parameters: Parameters) -> Array:
+        result = np.empty_like(other)
+        status = self.binding.function(name)(
+            checked_number(t, "the time t"),
+            self.binding.pointer(q),
+            self.binding.pointer(other),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(result),
+            self.binding.workspace(),
+        )
+        if status:
+            hint = "; does this Hamiltonian determine momenta by velocities? Give p" if name == "momentum" else ""
+            raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]}{hint})")
+        return result
+
+    def _vector(self, value: ArrayLike, name: str) -> Array:
+        return checked_vector(self.interface, value, name)
+
+    def _parameters(self, parameters: Parameters) -> Array:
+        return checked_parameters(self.interface, parameters)
+
+
+def _watching(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+    from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
+
+    return with_events(source, interface, tuple(event.function for event in events))

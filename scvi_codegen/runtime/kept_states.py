@@ -1,0 +1,31 @@
+"""States kept along a run, with all that leads from one to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["KeptStates"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeptStates:
+    """What states between these, and crossings, are found from; fields as of :class:`Trajectory`."""
+
+    t: Array
+    q: Array
+    p: Array
+    h: float
+    parameters: Array
+    stepper: Integrator = field(repr=False)
+    options: SolverOptions | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.t)
