@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 __all__ = [
     "BuildError",
     "CacheWarning",
@@ -19,7 +22,14 @@ __all__ = [
     "StateError",
     "StepFailedError",
     "SystemDefinitionError",
+    "closest",
 ]
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"`` for the known name nearest to ``name``, or a full stop."""
+    matches = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean '{matches[0]}'?" if matches else "."
 
 
 class ScviCodegenError(Exception):

@@ -39,8 +39,7 @@ from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.tables import Table
-from scvi_codegen.errors import ScviCodegenError, StateError
-from scvi_codegen.formulas.grammar import closest
+from scvi_codegen.errors import ScviCodegenError, StateError, closest
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.grammar import closest
+from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.problems import problem
 

@@ -11,7 +11,7 @@ from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.wording import duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 
 __all__ = ["advised_model"]

@@ -14,7 +14,8 @@ import click
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
-from scvi_codegen.models.model_file import Model, load_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 __all__ = ["SOLVER_OPTION", "Choices", "model_arguments", "read_model"]

@@ -19,7 +19,8 @@ from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
-from scvi_codegen.models.model_file import Model, dump_model, parse_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run import Run

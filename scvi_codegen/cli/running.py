@@ -13,7 +13,7 @@ from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import Trajectory

@@ -1,7 +1,7 @@
 """From the Lagrangian to the emitted C on one page of HTML: every equation, table and count, and the C beside them.
 
     >>> from scvi_codegen.methods import SVI
-    >>> from scvi_codegen.models.problems import planar_pendulum
+    >>> from scvi_codegen.models.systems import planar_pendulum
     >>> "Euler-Lagrange equations" in derivation_html(planar_pendulum(), SVI(2))
     True
 

@@ -1,7 +1,7 @@
 """The closed form of a step: every equation written out, with the paper's numbers, as exact SymPy.
 
     >>> from scvi_codegen.methods import SCVI
-    >>> from scvi_codegen.models.problems import planar_pendulum
+    >>> from scvi_codegen.models.systems import planar_pendulum
     >>> print(derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True).equations[0])
     (34a) 0 = g*l*m*sin(Q_1) + l**2*m*(Q_1/h**2 - q_k/h**2 - v_0/h)
 
@@ -16,67 +16,28 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import sympy
 
-from scvi_codegen.display.cards import Html, card, listed, plain
-from scvi_codegen.display.mathml import mathml_terms
-from scvi_codegen.display.mathml.names import latex_name
+from scvi_codegen.derivation.entries import entries
+from scvi_codegen.derivation.matrix_form import MatrixForm, matrix_form
+from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, html, latex, text_lines
+from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
+from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.exactness import is_exact
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.methods.stage_system import Block, PointFamily, StageSystem, Table
-from scvi_codegen.tables.basis import differentiation_matrix
-from scvi_codegen.tables.nodes import exact_points
-from scvi_codegen.tables.precision import DIGITS, Number, mp
-from scvi_codegen.tables.quadrature import exact_rule
-from scvi_codegen.tables.tableau import exact_tableau
+from scvi_codegen.tables.precision import Number
 
-__all__ = ["Equation", "MatrixForm", "StepEquations", "TableEntry", "derive", "table_entries"]
+__all__ = ["StepEquations", "derive"]
 
-LARGEST_BASIS = 8
-LARGEST_COEFFICIENT = 10**5
-PSLQ_SLACK = 6
-MOST_SHOWN, MOST_SHOWN_OPERATIONS = 12, 4800
-"""Equations, and operations of all equations, that a notebook shows."""
-
-
-@dataclass(frozen=True, slots=True)
-class TableEntry:
-    """A number of a table: its symbol, its value in 60 digits, and a short exact form or ``None``."""
-
-    symbol: sympy.Symbol
-    value: Number
-    exact: sympy.Expr | None
-
-    def __str__(self) -> str:
-        form = f" = {self.exact}" if self.exact is not None else ""
-        return f"{self.symbol}{form} = {mp.nstr(self.value, 20)}"
-
-
-@dataclass(frozen=True, slots=True)
-class Equation:
-    """0 = residual.
-
-    Attributes:
-        number: the paper's number, or the variable with respect to which a generating function is stationary.
-        kind: ``"stage"``, ``"IDEL"`` (implicit discrete Euler-Lagrange), ``"multiplier"`` or ``"Legendre"``.
-        residual: in the unknowns, (q_k, p_k, t_k, h), parameters and table entries.
-    """
-
-    number: str
-    kind: str
-    residual: sympy.Expr
-
-    def __str__(self) -> str:
-        return f"({self.number}) 0 = {self.residual}"
+MOST_SHOWN = 12
+"""Equations that a notebook shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -142,15 +103,34 @@ class StepEquations:
         """
         if not isinstance(self.method, SpectralCollocation):
             raise MethodError(f"the matrix form (18), (21) is one of spectral collocation, not of {self.method.name}")
-        return _matrix_form(self)
+        return matrix_form(self.system, self.method, self.unknowns, self.state, self.time, self.step)
 
     def to_text(self) -> str:
         """Plain text: unknowns, equations, end state, guess, tables."""
-        return "\n".join(_text_lines(self)) + "\n"
+        written = text_lines(self.equations, self._end, self.initial_guess, self.entries)
+        return "".join(f"{line}\n" for line in (*self._heading(), *written, *self._conserved()))
 
     def to_latex(self) -> str:
         """LaTeX: an ``align*`` environment with the paper's numbers as tags, and the tables."""
-        return _latex(self)
+        return latex(self.equations, self._end, self.entries, self.symmetries)
+
+    @property
+    def _end(self) -> dict[sympy.Symbol, Equation]:
+        """The new values by the symbols of the old."""
+        return dict(zip((*self.state[0], *self.state[1]), (*self.end_position, *self.end_momentum), strict=True))
+
+    def _heading(self) -> Iterator[str]:
+        q, p = self.state
+        yield f"{self.system.name}: {self.method.title}"
+        yield f"{'H' if self.system.auxiliaries else 'L'} = {self.system.to_text()}"
+        yield f"known: {', '.join(s.name for s in (*q, *p, self.time, self.step))}"
+        yield f"unknown: {', '.join(s.name for s in self.unknowns)}"
+
+    def _conserved(self) -> Iterator[str]:
+        if self.symmetries:
+            yield "\nconserved (momentum maps of symmetries)"
+        for symmetry in self.symmetries:
+            yield f"  {symmetry}{'' if is_exact(symmetry, self.method) else '  (not guaranteed by this method)'}"
 
     def __repr__(self) -> str:
         count = len(self.equations)
@@ -159,10 +139,10 @@ class StepEquations:
     def _repr_latex_(self) -> str | None:
         """LaTeX of all equations, nothing where a notebook could not show them."""
         size = sympy.count_ops(self.equations[0].residual) * len(self.equations)
-        return _latex(self) if size <= MOST_SHOWN_OPERATIONS else None
+        return self.to_latex() if size <= MOST_SHOWN * LARGEST_SHOWN else None
 
     def _repr_html_(self) -> str:
-        shown = [_equation_html(equation) for equation in self.equations[:MOST_SHOWN]]
+        shown = [html(equation) for equation in self.equations[:MOST_SHOWN]]
         left_out = len(self.equations) - len(shown)
         more = [plain(f"and {left_out} more: to_text and to_latex have all")] if left_out else []
         facts = (
@@ -170,28 +150,6 @@ class StepEquations:
             ("table entries", listed([entry.symbol.name for entry in self.entries])),
         )
         return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatrixForm:
-    """Spectral collocation with Kronecker products: left = right, both column vectors.
-
-    Position form (18): left = (A^2 x I) vec(Q) + a0 x v0 + (A a0) x q0 = vec(accelerations); ``residual`` is the
-    Euler-Lagrange residual with these accelerations and V = A Q + a0 q0. Phase space (21): left =
-    [[A x I, 0], [0, A x I]] (vec Q, vec P) + (a0 x q0, a0 x p0), right = (vec H_p, vec -H_q).
-
-    Attributes:
-        A, a0: the differentiation matrix on [t_k, t_k + h] without its first row, (s, s), and its first column, (s, 1).
-        operator: the Kronecker product that acts on the unknowns.
-        left: operator times unknowns plus the known state.
-        residual: a column vector that vanishes on the step.
-    """
-
-    A: sympy.ImmutableMatrix
-    a0: sympy.ImmutableMatrix
-    operator: sympy.ImmutableMatrix
-    left: sympy.ImmutableMatrix
-    residual: sympy.ImmutableMatrix
 
 
 def derive(system: MechanicalSystem, method: Method, *, radicals: bool = False) -> StepEquations:
@@ -207,7 +165,6 @@ def derive(system: MechanicalSystem, method: Method, *, radicals: bool = False) 
     writer = _Writer(system, stages)
     equations = writer.equations()
     end_position, end_momentum = writer.end_state()
-    entries = _entries(writer.values, _radical_basis(method))
     derived = StepEquations(
         system=system,
         method=method,
@@ -219,7 +176,7 @@ def derive(system: MechanicalSystem, method: Method, *, radicals: bool = False) 
         equations=equations,
         end_position=end_position,
         end_momentum=end_momentum,
-        entries=entries,
+        entries=entries(writer.values, method),
         initial_guess=writer.guess(),
     )
     return _with_radicals(derived) if radicals else derived
@@ -351,96 +308,6 @@ def _fraction(value: object) -> sympy.Rational:
     return sympy.Rational(str(value))
 
 
-def _entries(values: Mapping[sympy.Symbol, Number], basis: tuple[sympy.Expr, ...]) -> tuple[TableEntry, ...]:
-    known = [_high_precision(element) for element in basis]
-    return tuple(
-        TableEntry(symbol, value, _exact(value, basis, known)) for symbol, value in sorted(values.items(), key=_by_name)
-    )
-
-
-def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
-    """The named numbers of all tables of a method's equations; those that do not occur in the equations, too."""
-    tables = [stages.end_position]
-    values: dict[sympy.Symbol, Number] = {}
-    for family in stages.families:
-        tables += [gather.table for gather in family.gathers] + [scatter.table for scatter in family.scatters]
-        tables.append(Table(entries=(family.weights,), names=(family.weight_names,)))
-    for table in tables:
-        for names, numbers in zip(table.names, table.entries, strict=True):
-            for name, value in zip(names, numbers, strict=True):
-                base, _, divisor = name.partition("/")
-                if base:
-                    values[sympy.Symbol(base, real=True)] = value * int(divisor or 1)
-    return _entries(values, _radical_basis(method))
-
-
-def _by_name(item: tuple[sympy.Symbol, Number]) -> tuple[object, ...]:
-    prefix, *indices = item[0].name.lstrip("_").split("_")
-    return (prefix, *(int(index) for index in indices))
-
-
-def _high_precision(expression: sympy.Expr) -> Number:
-    return mp.mpf(str(sympy.N(expression, DIGITS + 5)))
-
-
-def _exact(value: Number, basis: tuple[sympy.Expr, ...], known: Sequence[Number]) -> sympy.Expr | None:
-    """The combination of basis elements with small rational coefficients that equals ``value`` to 54 digits (PSLQ)."""
-    if value == 0:
-        return sympy.S.Zero
-    if not basis:
-        return None
-    tolerance = mp.mpf(10) ** (PSLQ_SLACK - DIGITS)
-    relation = mp.pslq([value, *known], tol=tolerance, maxcoeff=LARGEST_COEFFICIENT, maxsteps=10**5)
-    if not relation or relation[0] == 0:
-        return None
-    terms = [sympy.Rational(-int(c), int(relation[0])) * e for c, e in zip(relation[1:], basis, strict=True)]
-    return sympy.Add(*terms)
-
-
-@lru_cache(maxsize=64)
-def _radical_basis(method: Method) -> tuple[sympy.Expr, ...]:
-    """1 and the roots in the method's nodes and points with their pairwise products; () where they are not short."""
-    roots: set[sympy.Expr] = set()
-    for expressions in _closed_forms(method):
-        if expressions is None:
-            return ()
-        for expression in expressions:
-            roots |= {atom for atom in expression.atoms(sympy.Pow) if atom.exp in (sympy.S.Half, -sympy.S.Half)}
-    roots = {sympy.sqrt(root.base) if root.base.is_Rational else root for root in roots}
-    squares = sorted({_square_free(root) for root in roots}, key=str)
-    basis = [sympy.S.One, *squares, *(sympy.sqrtdenest(a * b) for a, b in itertools.combinations(squares, 2))]
-    return tuple(basis) if len(basis) <= LARGEST_BASIS else ()
-
-
-def _square_free(root: sympy.Expr) -> sympy.Expr:
-    """sqrt(n) without its rational factor."""
-    coefficient, rest = sympy.sqrt(root.base).as_coeff_Mul()
-    return rest if coefficient.is_Rational else root
-
-
-def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
-    """The exact points, weights and coefficients behind the method's tables."""
-    if isinstance(method, RungeKutta):
-        exact = exact_tableau(method.tableau)
-        yield None if exact is None else [x for row in exact[0] for x in row] + list(exact[1]) + list(exact[2])
-        return
-    nodes = getattr(method, "node_set", None)
-    if nodes is not None:
-        yield exact_points(nodes)
-    rule = getattr(method, "rule", None)
-    if rule is not None:
-        exact_points_and_weights = exact_rule(rule)
-        yield None if exact_points_and_weights is None else [x for part in exact_points_and_weights for x in part]
-
-
-def _equation_html(equation: Equation) -> Html:
-    size = sympy.count_ops(equation.residual)
-    if size > MOST_SHOWN_OPERATIONS // MOST_SHOWN:
-        return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
-    pieces = [piece for term in mathml_terms(equation.residual, sympy.S.Zero) for piece in term]
-    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(pieces)}</div>")
-
-
 def _with_radicals(derived: StepEquations) -> StepEquations:
     """Table entries replaced by their exact forms, where there is one."""
     exact = {entry.symbol: entry.exact for entry in derived.entries if entry.exact is not None}
@@ -455,154 +322,3 @@ def _with_radicals(derived: StepEquations) -> StepEquations:
         end_momentum=written(derived.end_momentum),
         entries=tuple(entry for entry in derived.entries if entry.exact is None),
     )
-
-
-def _matrix_form(derived: StepEquations) -> MatrixForm:
-    """(18) or (21) by Kronecker products and row-wise vec (Lemmas 2.1, 2.2), independent of the written-out rows."""
-    method, system = derived.method, derived.system
-    assert isinstance(method, SpectralCollocation)
-    size, m = method.degree, system.dimension
-    slopes = differentiation_matrix(method.node_set.points)
-    full = sympy.Matrix(size, size + 1, lambda i, j: 2 * _number(slopes[i + 1][j]) / derived.step)
-    a0, A = full[:, :1], full[:, 1:]
-    q0 = sympy.Matrix(1, m, derived.state[0])
-    identity = sympy.eye(m)
-    form = _position_matrix_form if method.form == "position" else _phase_space_matrix_form
-    return form(derived, A, a0, q0, identity)
-
-
-def _number(value: Number) -> sympy.Expr:
-    return sympy.Float(str(value), 50)
-
-
-def _position_matrix_form(
-    derived: StepEquations, A: sympy.Matrix, a0: sympy.Matrix, q0: sympy.Matrix, identity: sympy.Matrix
-) -> MatrixForm:
-    system = derived.system
-    size, m = A.rows, system.dimension
-    Q = sympy.Matrix(size, m, derived.unknowns[: size * m])
-    v0 = sympy.Matrix(1, m, derived.unknowns[size * m :])
-    operator = sympy.kronecker_product(A * A, identity)
-    left = operator * _vec(Q) + sympy.kronecker_product(a0, v0.T) + sympy.kronecker_product(A * a0, q0.T)
-    V = A * Q + a0 * q0
-    E = forms_of(system).euler_lagrange
-    residual = []
-    for i in range(size):
-        replaced = _at_node(derived, i, Q.row(i), V.row(i))
-        replaced |= dict(zip(accelerations(system), left[i * m : (i + 1) * m], strict=True))
-        residual += [e.xreplace(replaced) for e in E]
-    return _frozen_form(A, a0, operator, left, sympy.Matrix(residual))
-
-
-def _phase_space_matrix_form(
-    derived: StepEquations, A: sympy.Matrix, a0: sympy.Matrix, q0: sympy.Matrix, identity: sympy.Matrix
-) -> MatrixForm:
-    """(21) with H_p = V, -H_q = L_q and P = L_v(Q, V); the positions Q follow from the unknowns V by (15)."""
-    system = derived.system
-    size, m = A.rows, system.dimension
-    V = sympy.Matrix(size, m, derived.unknowns)
-    p0 = sympy.Matrix(1, m, derived.state[1])
-    Q = A.inv() * (V - a0 * q0)
-    P_rows, G_rows = [], []
-    for i in range(size):
-        replaced = _at_node(derived, i, Q.row(i), V.row(i))
-        P_rows.append([p.xreplace(replaced) for p in forms_of(system).momentum])
-        G_rows.append([f.xreplace(replaced) for f in forms_of(system).force])
-    P, G = sympy.Matrix(P_rows), sympy.Matrix(G_rows)
-    single = sympy.kronecker_product(A, identity)
-    operator = sympy.diag(single, single)
-    known = sympy.Matrix.vstack(sympy.kronecker_product(a0, q0.T), sympy.kronecker_product(a0, p0.T))
-    left = operator * sympy.Matrix.vstack(_vec(Q), _vec(P)) + known
-    return _frozen_form(A, a0, operator, left, left - sympy.Matrix.vstack(_vec(V), _vec(G)))
-
-
-def _frozen_form(
-    A: sympy.Matrix, a0: sympy.Matrix, operator: sympy.Matrix, left: sympy.Matrix, residual: sympy.Matrix
-) -> MatrixForm:
-    return MatrixForm(
-        A=A.as_immutable(),
-        a0=a0.as_immutable(),
-        operator=operator.as_immutable(),
-        left=left.as_immutable(),
-        residual=residual.as_immutable(),
-    )
-
-
-def _vec(matrix: sympy.Matrix) -> sympy.Matrix:
-    """Rows stacked atop one another (Definition 2.2)."""
-    return sympy.Matrix(list(matrix))
-
-
-def _at_node(derived: StepEquations, i: int, q: sympy.Matrix, v: sympy.Matrix) -> dict[sympy.Symbol, sympy.Expr]:
-    system, method = derived.system, derived.method
-    assert isinstance(method, SpectralCollocation)
-    replaced = dict(zip(system.coordinates, q, strict=True)) | dict(zip(system.velocities, v, strict=True))
-    replaced[system.time] = derived.time + _number((method.node_set.points[i + 1] + 1) / 2) * derived.step
-    return replaced
-
-
-def _text_lines(derived: StepEquations) -> Iterator[str]:
-    q, p = derived.state
-    yield f"{derived.system.name}: {derived.method.title}"
-    yield f"{'H' if derived.system.auxiliaries else 'L'} = {derived.system.to_text()}"
-    yield f"known: {', '.join(s.name for s in (*q, *p, derived.time, derived.step))}"
-    yield f"unknown: {', '.join(s.name for s in derived.unknowns)}"
-    yield "\nequations"
-    yield from (f"  {equation}" for equation in derived.equations)
-    yield "\nend of the step"
-    for symbol, equation in zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True):
-        yield f"  ({equation.number}) {symbol.name[:-2]}_(k+1) = {equation.residual}"
-    yield "\nfirst guess (q_dot_k: the velocity that belongs to p_k)"
-    yield from (f"  {symbol} = {value}" for symbol, value in derived.initial_guess.items())
-    if derived.entries:
-        yield "\ntable entries"
-        yield from (f"  {entry}" for entry in derived.entries)
-    if derived.symmetries:
-        yield "\nconserved (momentum maps of symmetries)"
-        yield from (f"  {symmetry}{_exactness(derived, symmetry)}" for symmetry in derived.symmetries)
-
-
-def _exactness(derived: StepEquations, symmetry: Symmetry) -> str:
-    return "" if is_exact(symmetry, derived.method) else "  (not guaranteed by this method)"
-
-
-def _latex(derived: StepEquations) -> str:
-    names = {symbol: latex_name(symbol.name) for symbol in _all_symbols(derived)}
-
-    def written(expression: sympy.Expr) -> str:
-        return str(sympy.latex(expression, symbol_names=names))
-
-    lines = [rf"0 &= {written(e.residual)} \tag{{{_tag(e.number)}}}" for e in derived.equations]
-    q, p = derived.state
-    for symbol, equation in zip((*q, *p), (*derived.end_position, *derived.end_momentum), strict=True):
-        new = latex_name(f"{symbol.name}+1")
-        lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
-    tables = [
-        rf"{names[entry.symbol]} &= "
-        + (written(entry.exact) + " = " if entry.exact is not None else "")
-        + mp.nstr(entry.value, 17)
-        for entry in derived.entries
-    ]
-    maps = [
-        rf"J &= {sympy.latex(s.momentum_map, symbol_names=_names_of_maps(s))} \tag{{{_tag(s.name)}}}"
-        for s in derived.symmetries
-    ]
-    blocks = [block for block in (lines, tables, maps) if block]
-    return "\n".join("\\begin{align*}\n" + " \\\\\n".join(block) + "\n\\end{align*}" for block in blocks)
-
-
-def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:
-    return {symbol: latex_name(symbol.name) for symbol in symmetry.momentum_map.free_symbols}
-
-
-def _tag(number: str) -> str:
-    if not number.startswith("dG"):
-        return number.replace("_", r"\_")
-    return "$" + number.replace("dG", r"\partial G").replace("/d", r"/\partial ") + "$"
-
-
-def _all_symbols(derived: StepEquations) -> set[sympy.Symbol]:
-    symbols: set[sympy.Symbol] = {entry.symbol for entry in derived.entries}
-    for equation in (*derived.equations, *derived.end_position, *derived.end_momentum):
-        symbols |= equation.residual.free_symbols
-    return symbols | set(derived.state[0]) | set(derived.state[1])

@@ -10,10 +10,11 @@ import sympy
 
 from scvi_codegen.display.cards import Html, grid, plain
 from scvi_codegen.display.mathml import mathml
-from scvi_codegen.tables.nodes import Nodes, exact_points
+from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
+from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Number, Vector, mp
-from scvi_codegen.tables.quadrature import Quadrature, exact_rule
-from scvi_codegen.tables.tableau import Tableau, exact_tableau
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import Tableau
 
 __all__ = ["NumberTable", "Part", "decimal", "number_table", "numbers_html", "positions", "short"]
 

@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.mechanics import Mechanics
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
-from scvi_codegen.formulas.grammar import closest
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import Number, Vector, mp
 

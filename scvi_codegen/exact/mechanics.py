@@ -11,7 +11,7 @@ import sympy
 
 from scvi_codegen.exact.newton import Array, Floats, Solve, newton, solver
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import Number, mp

@@ -19,7 +19,7 @@ from typing import Any
 from sympy import Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.grammar import FUNCTIONS
+from scvi_codegen.formulas.vocabulary import FUNCTIONS
 
 __all__ = ["C_KEYWORDS", "DOT", "TIME", "check_name", "check_names", "given_name", "identifier", "number", "symbol"]
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import sympy
 
-from scvi_codegen.formulas.grammar import FUNCTIONS
+from scvi_codegen.formulas.vocabulary import LARGEST, NAME_OF, shortened
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Tape"]
+__all__ = ["Tape", "evaluate"]
 
-NAMES = {function: name for name, function in FUNCTIONS.items() if isinstance(function, type)}
 CONSTANTS = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
 
 
@@ -69,7 +68,7 @@ def _operation(expression: sympy.Expr, operands: tuple[int, ...]) -> tuple[Calla
     if expression.is_Mul:
         return (operator.mul if len(operands) == 2 else _product), operands
     if not expression.is_Pow:
-        return getattr(mp, NAMES[expression.func]), operands
+        return getattr(mp, NAME_OF[expression.func]), operands
     exponent = expression.exp
     if exponent.is_Integer:
         power = int(exponent)
@@ -89,3 +88,44 @@ def _constant(expression: Any) -> Number:
     if expression.is_Rational:
         return mp.mpf(int(expression.p)) / int(expression.q)
     return CONSTANTS[expression]
+
+
+def evaluate(
+    expression: sympy.Expr, values: Mapping[sympy.Symbol, Number], known: dict[sympy.Expr, Number] | None = None
+) -> Number:
+    """Value of an expression of the grammar in the arithmetic of ``precision``, 60 digits.
+
+    Args:
+        expression: an expression ``unsupported_part`` has nothing against.
+        values: a number for each of its symbols.
+        known: values of parts computed before at the same point; filled on the way.
+
+    Raises:
+        ArithmeticError: if the value, or that of a part, is not real or not within the range of a C double.
+    """
+    known = {} if known is None else known
+    if expression in known:
+        return known[expression]
+    try:
+        result = _evaluate_node(expression, values, known)
+    except (ValueError, TypeError) as error:
+        raise ArithmeticError(f"'{shortened(expression)}' has no real value") from error
+    if not isinstance(result, mp.mpf) or not abs(result) <= LARGEST:
+        raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number")
+    known[expression] = result
+    return result
+
+
+def _evaluate_node(expression: Any, values: Mapping[sympy.Symbol, Number], known: dict[sympy.Expr, Number]) -> Number:
+    if expression.is_Symbol:
+        return mp.mpf(values[expression])
+    if expression.is_Rational:
+        return mp.mpf(int(expression.p)) / int(expression.q)
+    if not expression.args:
+        return CONSTANTS[expression]
+    arguments = [evaluate(argument, values, known) for argument in expression.args]
+    if expression.is_Add:
+        return mp.fsum(arguments)
+    if expression.is_Mul:
+        return mp.fprod(arguments)
+    return mp.power(*arguments) if expression.is_Pow else getattr(mp, NAME_OF[expression.func])(*arguments)

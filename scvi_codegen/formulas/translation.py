@@ -9,7 +9,7 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.grammar import evaluated
+from scvi_codegen.formulas.canonical import evaluated
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
 __all__ = ["Translation"]

@@ -15,9 +15,11 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient, hessian
-from scvi_codegen.formulas.grammar import evaluate, parse_expression, unsupported_part
+from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
+from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
@@ -67,7 +69,7 @@ class HamiltonianSystem(MechanicalSystem):
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
     ) -> HamiltonianSystem:
-        """Read H from text of the grammar in ``expression_text``.
+        """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
         Args:
             name: what the system is called.

@@ -64,7 +64,7 @@ class LagrangianSystem(MechanicalSystem):
     def from_text(
         cls, *, name: str, coordinates: Sequence[str], lagrangian: str, parameters: Mapping[str, float] | None = None
     ) -> LagrangianSystem:
-        """Read L from text of the grammar in ``expression_text``.
+        """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
         Args:
             name: what the system is called.

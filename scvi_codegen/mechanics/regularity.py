@@ -9,7 +9,7 @@ import numpy as np
 from sympy import Expr, Matrix, Symbol
 
 from scvi_codegen.formulas.derivatives import hessian
-from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["Entries", "coupled_blocks", "null_direction", "sample_points", "singular_part"]

@@ -22,9 +22,10 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.display.mathml import mathml_terms
-from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.grammar import closest, format_expression, unsupported_part
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
+from scvi_codegen.formulas.writing import format_expression
 
 __all__ = ["MechanicalSystem", "named_parameters"]
 

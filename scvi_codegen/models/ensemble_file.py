@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.files.toml_text import read_toml
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.stepper import Stepper
@@ -156,14 +156,14 @@ def _axis(value: Any, where: str) -> Array:
         count = value["count"]
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST:
             raise ModelFileError(f"{where} count must be a whole number from 1 to {MOST}, not {count!r}")
-        return np.linspace(_real(value["from"], f"{where} from"), _real(value["to"], f"{where} to"), count)
+        return np.linspace(real(value["from"], f"{where} from"), real(value["to"], f"{where} to"), count)
     values = value if isinstance(value, list) else [value]
     if not values:
         raise ModelFileError(f"{where} is an empty list")
-    return np.array([_real(item, where) for item in values])
+    return np.array([real(item, where) for item in values])
 
 
-def _real(value: Any, where: str) -> float:
+def real(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ModelFileError(f"{where} must be a finite number, not {value!r}")
     return float(value)

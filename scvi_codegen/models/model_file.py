@@ -34,14 +34,11 @@ the names ``p_q``.
 from __future__ import annotations
 
 import difflib
-import math
 import os
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError
 from scvi_codegen.files.atomic import write_atomically
@@ -50,124 +47,18 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
-from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.models.model import Model, check_length, real, whole
 from scvi_codegen.models.problems import Problem, problem
 
-if TYPE_CHECKING:
-    from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.inputs import Array
-    from scvi_codegen.runtime.run import Run
-    from scvi_codegen.runtime.stepper import Stepper
-
-__all__ = ["DEFAULT_METHOD", "Model", "dump_model", "load_model", "parse_model", "save_model"]
+__all__ = ["dump_model", "load_model", "parse_model", "save_model"]
 
 Built = TypeVar("Built")
 Section = Mapping[str, Any]
-
-DEFAULT_METHOD = SVI(8)
-"""What the problems of the catalogue are integrated with unless another method is chosen."""
 
 SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "catalogue")
 SECTIONS = ("system", "parameters", "initial", "method", "run")
 SHORT_VECTOR = 4
 TEXT_WIDTH = 100
-MOST_STEPS = 2**53
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Model:
-    """A system, a method, an initial state and the length of a run; equality is structural.
-
-    Attributes:
-        system: what moves, with the parameter values of the run as its defaults.
-        method: how its motion is discretised.
-        q: (m,) initial coordinates.
-        p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
-        velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h: step size, not 0, negative for a run backward.
-        span: length of time, positive, or ``None`` if ``steps`` is given.
-        steps: number of steps, or ``None`` if ``span`` is given.
-        every: distance between kept states in steps.
-        t: initial time.
-
-    Raises:
-        ModelFileError: naming the field, unless exactly one of p and velocity and one of span and steps is given, each
-            vector has m entries, and every number is finite and in its range.
-    """
-
-    system: MechanicalSystem
-    method: Method
-    q: tuple[float, ...]
-    p: tuple[float, ...] | None = None
-    velocity: tuple[float, ...] | None = None
-    h: float
-    span: float | None = None
-    steps: int | None = None
-    every: int = 1
-    t: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
-        _check_one_of("span", self.span, "steps", self.steps)
-        for name in ("q", "p", "velocity"):
-            if (vector := getattr(self, name)) is not None:
-                object.__setattr__(self, name, self._vector(name, vector))
-        for name in ("h", "t", "span"):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _real(value, name))
-        if self.h == 0.0:
-            raise ModelFileError("the step is 0: it must be positive, or negative to go back")
-        if self.span is not None and not 0.0 < self.span / abs(self.h) < MOST_STEPS:
-            raise ModelFileError(
-                f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
-                "backward, of fewer than 2^53 steps"
-            )
-        if self.steps is not None:
-            object.__setattr__(self, "steps", _whole(self.steps, "steps", least=0))
-        object.__setattr__(self, "every", _whole(self.every, "every", least=1))
-
-    @classmethod
-    def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
-        """An entry of the catalogue with a method."""
-        return cls(
-            system=entry.system,
-            method=method,
-            q=entry.q,
-            p=entry.p,
-            velocity=entry.velocity,
-            h=entry.step,
-            span=entry.span,
-        )
-
-    @property
-    def step_count(self) -> int:
-        """Number of steps: ``steps``, or the whole number (at least 1) of steps nearest to ``span``."""
-        if self.steps is not None:
-            return self.steps
-        assert self.span is not None  # by construction
-        return max(1, round(self.span / abs(self.h)))
-
-    def momenta(self, stepper: Stepper) -> Array:
-        """(m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
-        import numpy as np  # here, so that reading a model does not wait for it
-
-        if self.p is not None:
-            return np.array(self.p)
-        assert self.velocity is not None  # by construction
-        return stepper.momentum(self.q, self.velocity, self.t, self.system.defaults)
-
-    def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
-        """The run of this model from its initial state; advance it by :attr:`step_count` steps."""
-        p = self.momenta(stepper)
-        return stepper.start(self.q, p, h=self.h, t=self.t, parameters=self.system.defaults, options=options)
-
-    def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:
-        names = [coordinate.name for coordinate in self.system.coordinates]
-        if not isinstance(values, Iterable):
-            raise ModelFileError(f"{name} must be {len(names)} numbers, not {values!r}")
-        values = tuple(values)
-        _check_length(values, names, name)
-        return tuple(_real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
 
 
 def load_model(path: str | os.PathLike[str]) -> Model:
@@ -274,7 +165,7 @@ def _read_catalogue(section: Section) -> Problem | None:
 
 
 def _read_system(section: Section, parameters: Section, entry: Problem | None) -> MechanicalSystem:
-    values = {key: _real(value, f"[parameters] {key}") for key, value in parameters.items()}
+    values = {key: real(value, f"[parameters] {key}") for key, value in parameters.items()}
     if entry is not None:
         return _in_section("[parameters]", lambda: entry.system.with_parameters(**values))
     _check_keys(section, SYSTEM_KEYS, "key", "[system]")
@@ -312,7 +203,7 @@ def _read_state(document: Mapping[str, Section], system: MechanicalSystem, defau
     _required(section, "q", "[initial]")
     keys = {"q": "q", "p": "p", "q_dot": "velocity"}
     vectors = {field: _read_vector(section[key], names, key) for key, field in keys.items() if key in section}
-    return {**vectors, "t": _real(section.get("t", 0.0), "[initial] t")}
+    return {**vectors, "t": real(section.get("t", 0.0), "[initial] t")}
 
 
 def _read_vector(value: Any, names: Sequence[str], key: str) -> tuple[float, ...]:
@@ -322,8 +213,8 @@ def _read_vector(value: Any, names: Sequence[str], key: str) -> tuple[float, ...
         value = [_required(value, name, where) for name in names]
     if not isinstance(value, list):
         raise ModelFileError(f"{where} must be a list of numbers or a table by coordinate, not {value!r}")
-    _check_length(value, names, where)
-    return tuple(_real(item, f"{where}, {name},") for name, item in zip(names, value, strict=True))
+    check_length(value, names, where)
+    return tuple(real(item, f"{where}, {name},") for name, item in zip(names, value, strict=True))
 
 
 def _read_method(section: Section) -> Method:
@@ -345,11 +236,11 @@ def _read_run(document: Mapping[str, Section], default: Model | None) -> dict[st
     if ("span" in section) == ("steps" in section):
         found = "both" if "span" in section else "neither"
         raise ModelFileError(f"[run] has {found} of span and steps: give a length of time or a number of steps")
-    step = _real(_required(section, "step", "[run]"), "[run] step")
-    every = _whole(section.get("every", 1), "[run] every", least=1)
+    step = real(_required(section, "step", "[run]"), "[run] step")
+    every = whole(section.get("every", 1), "[run] every", least=1)
     if "span" in section:
-        return {"h": step, "span": _real(section["span"], "[run] span"), "every": every}
-    return {"h": step, "steps": _whole(section["steps"], "[run] steps", least=0), "every": every}
+        return {"h": step, "span": real(section["span"], "[run] span"), "every": every}
+    return {"h": step, "steps": whole(section["steps"], "[run] steps", least=0), "every": every}
 
 
 def _section(document: Mapping[str, Section], name: str) -> Section:
@@ -385,35 +276,3 @@ def _in_section(where: str, build: Callable[[], Built]) -> Built:
         return build()
     except (ScviCodegenError, TypeError) as error:
         raise ModelFileError(f"{where}: {error}") from error
-
-
-def _check_length(values: Sequence[object], names: Sequence[str], where: str) -> None:
-    if len(values) != len(names):
-        shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-        raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
-
-
-def _check_one_of(one: str, first: object, other: str, second: object) -> None:
-    if (first is None) == (second is None):
-        raise ModelFileError(f"give exactly one of {one} and {other}")
-
-
-def _real(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise ModelFileError(f"{where} must be a number, not {value!r}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ModelFileError(f"{where} is {number}: a finite number is wanted")
-    return number
-
-
-def _whole(value: Any, where: str, *, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise ModelFileError(f"{where} must be a whole number, not {value!r}")
-    number = int(value)
-    if not least <= number < MOST_STEPS:
-        raise ModelFileError(f"{where} must be at least {least} and below 2^53, not {number}")
-    return number

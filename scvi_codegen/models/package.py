@@ -28,7 +28,7 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.stepper import Stepper
 
 if TYPE_CHECKING:
-    from scvi_codegen.models.model_file import Model
+    from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
 __all__ = ["generate_package", "load_package"]
@@ -167,7 +167,7 @@ def _example(model: Model) -> ExampleRun:
 
 def _momenta(model: Model) -> tuple[float, ...]:
     """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
-    from scvi_codegen.formulas.grammar import evaluate
+    from scvi_codegen.formulas.tape import evaluate
     from scvi_codegen.mechanics.forms import forms_of
     from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
     from scvi_codegen.tables.precision import mp

@@ -24,8 +24,9 @@ import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
-from scvi_codegen.errors import EventError, SystemDefinitionError
-from scvi_codegen.formulas.grammar import closest, evaluated, parse_expression, unsupported_part
+from scvi_codegen.errors import EventError, SystemDefinitionError, closest
+from scvi_codegen.formulas.canonical import evaluated, unsupported_part
+from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel

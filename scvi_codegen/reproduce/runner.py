@@ -19,8 +19,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import TypeAlias
 
-from scvi_codegen.errors import MethodWarning, StateError
-from scvi_codegen.formulas.grammar import closest
+from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
 
 __all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]

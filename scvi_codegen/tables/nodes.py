@@ -28,8 +28,6 @@ __all__ = [
     "chebyshev_lobatto_points",
     "checked_count",
     "equispaced",
-    "exact_family_points",
-    "exact_points",
     "family_named",
     "is_antisymmetric",
     "legendre_gauss",
@@ -42,6 +40,7 @@ __all__ = [
     "radau_right",
     "radau_right_points",
     "to_number",
+    "to_unit",
 ]
 
 GUARD = 20
@@ -76,6 +75,11 @@ class Nodes:
             )
 
     @property
+    def abscissae(self) -> Vector:
+        """The points mapped to [0, 1]: c = (x + 1) / 2."""
+        return to_unit(self.points)
+
+    @property
     def contains_ends(self) -> bool:
         """Whether the first node is -1 and the last is 1, exactly."""
         return bool(self.points[0] == -1 and self.points[-1] == 1)
@@ -84,6 +88,11 @@ class Nodes:
     def symmetric(self) -> bool:
         """Whether x and -x are nodes together, to 50 digits."""
         return is_antisymmetric(self.points)
+
+
+def to_unit(points: Vector) -> Vector:
+    """Points of [-1, 1] mapped to [0, 1]: c = (x + 1) / 2."""
+    return tuple((x + 1) / 2 for x in points)
 
 
 def to_number(value: Any) -> Number:
@@ -183,11 +192,6 @@ def jacobi_roots(count: int, alpha: int, beta: int) -> Vector:
         if alpha == beta:
             roots = [(root - mirror) / 2 for root, mirror in zip(roots, reversed(roots), strict=True)]
     return tuple(roots)
-
-
-def reflected(values: Expressions) -> Expressions:
-    """Return exact points mirrored at 0, ascending again."""
-    return tuple(-value for value in reversed(values))
 
 
 def legendre_gauss_points(count: int) -> Vector:
@@ -296,102 +300,3 @@ NODE_FAMILIES: Mapping[str, Callable[[int], Nodes]] = {
 def nodes_by_name(name: str, degree: int) -> Nodes:
     """Return the nodes of the named family; ``MethodError`` lists the names when there is no such family."""
     return family_named(name, NODE_FAMILIES, "node family")(degree)
-
-
-def exact_points(nodes: Nodes) -> Expressions | None:
-    """Return the nodes as SymPy rationals and radicals, or None where no short closed form is known.
-
-    Closed forms: equispaced always; Chebyshev whenever SymPy knows the cosines as radicals (Lobatto degree 1 to 6, 8,
-    10, 12, ...); Legendre-Lobatto up to degree 5; Legendre-Gauss up to degree 4; Radau up to degree 2. Nodes that a
-    user made carry no closed form, whatever their name.
-    """
-    family = NODE_FAMILIES.get(nodes.name)
-    if family is None or family(nodes.degree) != nodes:
-        return None
-    return exact_family_points(nodes.name, nodes.degree + 1)
-
-
-def exact_family_points(name: str, count: int) -> Expressions | None:
-    """Return the ``count`` ascending points of the node family as SymPy radicals, or None (see ``exact_points``)."""
-    exact: Mapping[str, Callable[[int], Expressions | None]] = {
-        "chebyshev-lobatto": lambda n: exact_sines(range(1 - n, n, 2), 2 * (n - 1)),
-        "legendre-lobatto": exact_lobatto,
-        "equispaced": exact_equispaced,
-        "legendre-gauss": exact_gauss,
-        "chebyshev-gauss": lambda n: exact_sines(range(1 - n, n, 2), 2 * n),
-        "radau-left": exact_radau_left,
-        "radau-right": exact_radau_right,
-    }
-    return family_named(name, exact, "node family")(count)
-
-
-def exact_sines(numerators: Iterable[int], denominator: int) -> Expressions | None:
-    """Return sin(k pi / denominator) as radicals, or None when SymPy keeps a sine or cosine."""
-    import sympy as sp
-
-    values = tuple(sp.sin(sp.Rational(k, denominator) * sp.pi) for k in numerators)
-    return None if any(value.has(sp.sin, sp.cos) for value in values) else values
-
-
-def exact_equispaced(count: int) -> Expressions:
-    """Return the rationals (2j - N) / N, N = count - 1."""
-    import sympy as sp
-
-    return tuple(sp.Rational(j, count - 1) for j in range(1 - count, count, 2))
-
-
-def mirrored(positive: Expressions | None, count: int) -> Expressions | None:
-    """Return the symmetric points of which ``positive`` are the positive ones, ascending."""
-    if positive is None:
-        return None
-    import sympy as sp
-
-    return (*reflected(positive), *([sp.Integer(0)] if count % 2 else []), *positive)
-
-
-def exact_gauss(count: int) -> Expressions | None:
-    """Return the Legendre-Gauss points for count <= 5 (Abramowitz & Stegun, table 25.4, in radicals)."""
-    from sympy import Rational, sqrt
-
-    four, five = 2 * sqrt(30) / 35, 2 * sqrt(70) / 63
-    positive: dict[int, Expressions] = {
-        1: (),
-        2: (sqrt(3) / 3,),
-        3: (sqrt(15) / 5,),
-        4: (sqrt(Rational(3, 7) - four), sqrt(Rational(3, 7) + four)),
-        5: (sqrt(Rational(5, 9) - five), sqrt(Rational(5, 9) + five)),
-    }
-    return mirrored(positive.get(count), count)
-
-
-def exact_lobatto(count: int) -> Expressions | None:
-    """Return the Legendre-Lobatto points for count <= 6 (Abramowitz & Stegun, table 25.6, in radicals)."""
-    from sympy import Integer, Rational, sqrt
-
-    six = 2 * sqrt(7) / 21
-    inside: dict[int, Expressions] = {
-        2: (),
-        3: (),
-        4: (sqrt(5) / 5,),
-        5: (sqrt(21) / 7,),
-        6: (sqrt(Rational(1, 3) - six), sqrt(Rational(1, 3) + six)),
-    }
-    return mirrored((*inside[count], Integer(1)) if count in inside else None, count)
-
-
-def exact_radau_left(count: int) -> Expressions | None:
-    """Return the left Radau points for count <= 3, in radicals."""
-    from sympy import Integer, Rational, sqrt
-
-    inside: dict[int, Expressions] = {
-        1: (),
-        2: (Rational(1, 3),),
-        3: ((1 - sqrt(6)) / 5, (1 + sqrt(6)) / 5),
-    }
-    return (Integer(-1), *inside[count]) if count in inside else None
-
-
-def exact_radau_right(count: int) -> Expressions | None:
-    """Return the right Radau points for count <= 3, in radicals."""
-    left = exact_radau_left(count)
-    return None if left is None else tuple(value.expand() for value in reflected(left))

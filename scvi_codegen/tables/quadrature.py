@@ -14,12 +14,10 @@ from typing import Any, Literal, TypeVar
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.tables.nodes import (
-    Expressions,
     ascending_points,
     chebyshev_gauss_points,
     chebyshev_lobatto_points,
     checked_count,
-    exact_family_points,
     family_named,
     is_antisymmetric,
     legendre_gauss_points,
@@ -34,7 +32,6 @@ __all__ = [
     "QUADRATURE_FAMILIES",
     "Quadrature",
     "clenshaw_curtis",
-    "exact_rule",
     "fejer",
     "gauss_legendre",
     "gauss_lobatto",
@@ -47,10 +44,13 @@ __all__ = [
 
 GUARD = 20
 COMPUTED_TOLERANCE = mp.mpf("1e-12")
+
 CLAIMED_TOLERANCE = mp.mpf("1e-8")
+
 MOST_ORDER = 10**6
 MOST_CONDITIONS = 64
 """Of a rule with derivatives, whose weights solve as many equations."""
+
 MOST_DIGITS = 9
 
 Item = TypeVar("Item")
@@ -331,88 +331,3 @@ def quadrature_by_name(name: str) -> Quadrature:
     """
     family, count = split_name(name, QUADRATURE_FAMILIES, "quadrature")
     return family(count)
-
-
-POINT_FAMILIES: Mapping[str, str] = {
-    "gauss-legendre": "legendre-gauss",
-    "gauss-lobatto": "legendre-lobatto",
-    "gauss-radau-left": "radau-left",
-    "gauss-radau-right": "radau-right",
-    "clenshaw-curtis": "chebyshev-lobatto",
-    "fejer": "chebyshev-gauss",
-}
-
-
-def exact_rule(quadrature: Quadrature) -> tuple[Expressions, Expressions] | None:
-    """Return (points, weights) as SymPy rationals and radicals, or None where no short closed form is known.
-
-    Closed forms: Gauss-Legendre n <= 5, Lobatto n <= 6, Radau n <= 3; Clenshaw-Curtis and Fejer wherever SymPy knows
-    the cosines as radicals. A rule that a user made carries no closed form, whatever its name.
-    """
-    family, count = quadrature.name.partition(":")[0], len(quadrature)
-    if family not in POINT_FAMILIES:
-        return None
-    if quadrature.name != f"{family}:{count}" or not is_made_by(quadrature_by_name, quadrature.name, quadrature):
-        return None
-    points = exact_family_points(POINT_FAMILIES[family], count)
-    return None if points is None else (points, exact_weights(family, count))
-
-
-def exact_weights(family: str, count: int) -> Expressions:
-    """Return the weights of a rule whose points have a closed form, in radicals."""
-    import sympy as sp
-
-    if family in ("clenshaw-curtis", "fejer"):
-        weights = clenshaw_curtis_weights if family == "clenshaw-curtis" else fejer_weights
-        return tuple(sp.expand(weight) for weight in weights(count, sp.pi, sp.cos))
-    if family == "gauss-radau-right":
-        return tuple(reversed(exact_weights("gauss-radau-left", count)))
-    if family == "gauss-radau-left":
-        return exact_radau_weights()[count - 1]
-    table = exact_gauss_weights() if family == "gauss-legendre" else exact_lobatto_weights()
-    half = table[count]
-    return (*half, *reversed(half[: count // 2]))
-
-
-def rationals(*values: tuple[int, int]) -> Expressions:
-    """Return SymPy rationals from numerators and denominators."""
-    import sympy as sp
-
-    return tuple(sp.Rational(*value) for value in values)
-
-
-def exact_gauss_weights() -> Mapping[int, Expressions]:
-    """Return the Gauss-Legendre weights up to the middle, by number of points (Davis & Rabinowitz, section 2.7)."""
-    from sympy import sqrt
-
-    return {
-        1: rationals((2, 1)),
-        2: rationals((1, 1)),
-        3: rationals((5, 9), (8, 9)),
-        4: ((18 - sqrt(30)) / 36, (18 + sqrt(30)) / 36),
-        5: ((322 - 13 * sqrt(70)) / 900, (322 + 13 * sqrt(70)) / 900, *rationals((128, 225))),
-    }
-
-
-def exact_lobatto_weights() -> Mapping[int, Expressions]:
-    """Return the Lobatto weights up to the middle, by number of points (Davis & Rabinowitz, section 2.7)."""
-    from sympy import sqrt
-
-    return {
-        2: rationals((1, 1)),
-        3: rationals((1, 3), (4, 3)),
-        4: rationals((1, 6), (5, 6)),
-        5: rationals((1, 10), (49, 90), (32, 45)),
-        6: (*rationals((1, 15)), (14 - sqrt(7)) / 30, (14 + sqrt(7)) / 30),
-    }
-
-
-def exact_radau_weights() -> tuple[Expressions, ...]:
-    """Return the weights of the left Radau rules with 1, 2 and 3 points."""
-    from sympy import sqrt
-
-    return (
-        rationals((2, 1)),
-        rationals((1, 2), (3, 2)),
-        (*rationals((2, 9)), (16 + sqrt(6)) / 18, (16 - sqrt(6)) / 18),
-    )

@@ -12,21 +12,20 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count as count_from
-from itertools import pairwise, zip_longest
-from typing import Any, TypeAlias
+from itertools import pairwise
+from typing import Any
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.tables.basis import cardinal_integrals, matrix_product, transpose
+from scvi_codegen.tables.basis import cardinal_integrals, transpose
 from scvi_codegen.tables.nodes import (
-    Expressions,
     chebyshev_gauss_points,
     chebyshev_lobatto_points,
     checked_count,
-    exact_family_points,
     to_number,
 )
-from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
-from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, is_made_by, split_name
+from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, split_name
+from scvi_codegen.tables.stability import determinant_polynomial, has_roots_right, is_nonnegative, modulus_gap, reduced
 
 __all__ = [
     "TABLEAU_FAMILIES",
@@ -34,7 +33,6 @@ __all__ = [
     "chebyshev_gauss",
     "chebyshev_lobatto",
     "collocation_tableau",
-    "exact_tableau",
     "explicit_euler",
     "gauss",
     "lobatto_iiia",
@@ -45,11 +43,7 @@ __all__ = [
 ]
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
-ZERO_TOLERANCE = mp.mpf("1e-30")
 MOST_STAGES = 64
-
-Polynomial: TypeAlias = list[Number]
-"""Coefficients in ascending powers; the last is not zero, and the zero polynomial is empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,154 +153,6 @@ def simplifying_conditions(tableau: Tableau) -> tuple[int, int, int]:
         return next(k for k in count_from(0) if k == 2 * len(b) or not condition(k + 1))
 
     return largest(B), largest(C), largest(D)
-
-
-def determinant_polynomial(matrix: Matrix) -> Polynomial:
-    """Return det(I - z M) in powers of z, by the Faddeev-LeVerrier recurrence with guard digits.
-
-    Coefficient k is rounded to zero below 1e-30 of binomial(s, k) (2s - k)! / (2s)!, the natural scale: it is the
-    coefficient of the Gauss method.
-    """
-    s = len(matrix)
-    coefficients, power = [mp.one], matrix
-    with mp.workdps(DIGITS + 20 + 2 * s):
-        for k in range(1, s + 1):
-            coefficients.append(-mp.fsum(power[i][i] for i in range(s)) / k)
-            moved = [[power[i][j] + (coefficients[k] if i == j else 0) for j in range(s)] for i in range(s)]
-            power = matrix_product(matrix, tuple(map(tuple, moved)))
-        scales = [mp.binomial(s, k) * mp.factorial(2 * s - k) / mp.factorial(2 * s) for k in range(s + 1)]
-    return trimmed(coefficients, scales)
-
-
-def trimmed(coefficients: Iterable[Number], scales: Iterable[Number]) -> Polynomial:
-    """Return the polynomial with coefficients below 1e-30 of their scales set to zero and trailing zeros dropped."""
-    kept = [
-        +value if abs(value) > ZERO_TOLERANCE * scale else mp.zero
-        for value, scale in zip(coefficients, scales, strict=True)
-    ]
-    while kept and kept[-1] == 0:
-        kept.pop()
-    return kept
-
-
-def divided(dividend: Polynomial, divisor: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return quotient and remainder; a remainder below 1e-30 of the numbers it came from is zero."""
-    rest, quotient = list(dividend), [mp.zero] * max(0, len(dividend) - len(divisor) + 1)
-    for k in reversed(range(len(quotient))):
-        quotient[k] = rest.pop() / divisor[-1]
-        for j, value in enumerate(divisor[:-1]):
-            rest[k + j] -= quotient[k] * value
-    scale = size(dividend) + size(quotient) * size(divisor)
-    return quotient, trimmed(rest, [scale] * len(rest))
-
-
-def size(polynomial: Sequence[Number]) -> Number:
-    """Return the largest coefficient in absolute value."""
-    return max(map(abs, polynomial), default=mp.zero)
-
-
-def scaled(polynomial: Polynomial) -> Polynomial:
-    """Return the polynomial divided by its size, a positive number."""
-    return [value / size(polynomial) for value in polynomial]
-
-
-def common_factor(left: Polynomial, right: Polynomial) -> Polynomial:
-    """Return a greatest common divisor, by Euclid's algorithm."""
-    while right:
-        left, right = right, divided(scaled(left), scaled(right))[1]
-    return scaled(left)
-
-
-def derivative(polynomial: Polynomial) -> Polynomial:
-    """Return the derivative."""
-    return [k * value for k, value in enumerate(polynomial)][1:]
-
-
-def reduced(P: Sequence[Number], Q: Sequence[Number]) -> tuple[Polynomial, Polynomial]:
-    """Return P and Q without common factors, in the variable z / rho that gives Q balanced coefficients."""
-    rho = abs(Q[0] / Q[-1]) ** (mp.one / max(1, len(Q) - 1))
-    numerator, denominator = ([value * rho**k for k, value in enumerate(polynomial)] for polynomial in (P, Q))
-    factor = common_factor(denominator, numerator)
-    return divided(numerator, factor)[0], divided(denominator, factor)[0]
-
-
-def has_roots_right(polynomial: Polynomial) -> bool:
-    """Whether all roots have positive real parts: Routh's criterion on the polynomial of -z."""
-    mirrored = [value if k % 2 == 0 else -value for k, value in enumerate(polynomial)]
-    descending = [value / mirrored[-1] for value in reversed(mirrored)]
-    upper, lower = descending[0::2], descending[1::2]
-    while lower:
-        if lower[0] <= ZERO_TOLERANCE * size(lower):
-            return False
-        ratio = upper[0] / lower[0]
-        padded = [*lower[1:], mp.zero]
-        upper, lower = lower, [a - ratio * b for a, b in zip(upper[1:], padded, strict=False)]
-    return True
-
-
-def squared_modulus(polynomial: Sequence[Number]) -> list[Number]:
-    """Return |F(iy)|^2 in ascending powers of x = y^2: even(-x)^2 + x odd(-x)^2."""
-    signed = [value if k % 4 < 2 else -value for k, value in enumerate(polynomial)]
-    result = [mp.zero] * len(signed)
-    for i, left in enumerate(signed):
-        for j, right in enumerate(signed):
-            if (i - j) % 2 == 0:
-                result[(i + j) // 2] += left * right
-    return result
-
-
-def modulus_gap(Q: Polynomial, P: Polynomial) -> Polynomial:
-    """Return |Q(iy)|^2 - |P(iy)|^2 in ascending powers of y^2, vanishing coefficients set to zero."""
-    length = max(len(P), len(Q))
-    padded = [[*polynomial, *[mp.zero] * (length - len(polynomial))] for polynomial in (Q, P)]
-    gap = [left - right for left, right in zip(*map(squared_modulus, padded), strict=True)]
-    scales = [mp.zero] * length
-    for polynomial in padded:
-        for i, left in enumerate(polynomial):
-            for j, right in enumerate(polynomial):
-                scales[(i + j) // 2] += abs(left * right)
-    return trimmed(gap, scales)
-
-
-def is_nonnegative(polynomial: Polynomial) -> bool:
-    """Whether the polynomial is never negative for x >= 0: no positive root of odd multiplicity, then its sign at 0."""
-    if all(value >= 0 for value in polynomial):
-        return True
-    lowest = next(k for k, value in enumerate(polynomial) if value != 0)
-    rest = polynomial[lowest:]
-    return bool(rest[0] > 0) and not any(map(positive_roots, odd_factors(rest)))
-
-
-def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
-    """Return the square-free factors of odd multiplicity (Yun's algorithm)."""
-    slope = derivative(polynomial)
-    repeated = common_factor(polynomial, slope)
-    rest, other = divided(polynomial, repeated)[0], divided(slope, repeated)[0]
-    odd: list[Polynomial] = []
-    for multiplicity in count_from(1):
-        if len(rest) <= 1:
-            return odd
-        pairs = list(zip_longest(other, derivative(rest), fillvalue=mp.zero))
-        gap = trimmed([a - b for a, b in pairs], [abs(a) + abs(b) for a, b in pairs])
-        factor = common_factor(rest, gap)
-        if multiplicity % 2 == 1:
-            odd.append(factor)
-        rest, other = divided(rest, factor)[0], divided(gap, factor)[0]
-    return odd
-
-
-def positive_roots(polynomial: Polynomial) -> int:
-    """Return the number of distinct roots x > 0 (Sturm's theorem); 0 is no root."""
-    chain = [scaled(polynomial), derivative(polynomial)]
-    while chain[-1]:
-        remainder = divided(scaled(chain[-2]), scaled(chain[-1]))[1]
-        chain.append([-value for value in remainder])
-    return sign_changes(p[0] for p in chain[:-1]) - sign_changes(p[-1] for p in chain[:-1])
-
-
-def sign_changes(values: Iterable[Number]) -> int:
-    """Return the number of sign changes, zeros left out."""
-    return sum(1 for left, right in pairwise([value for value in values if value != 0]) if left * right < 0)
 
 
 def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> Tableau:
@@ -429,79 +275,3 @@ def tableau_by_name(name: str) -> Tableau:
         return explicit_euler()
     family, stages = split_name(name, TABLEAU_FAMILIES, "tableau")
     return family(stages)
-
-
-EXACT_FAMILIES: Mapping[str, tuple[str, int]] = {
-    "gauss": ("legendre-gauss", 4),
-    "radau-iia": ("radau-right", 3),
-    "radau-ia": ("radau-left", 3),
-    "lobatto-iiia": ("legendre-lobatto", 5),
-    "lobatto-iiib": ("legendre-lobatto", 5),
-    "chebyshev-gauss": ("chebyshev-gauss", 3),
-    "chebyshev-lobatto": ("chebyshev-lobatto", 7),
-}
-
-
-def exact_tableau(tableau: Tableau) -> tuple[tuple[Expressions, ...], Expressions, Expressions] | None:
-    """Return (A, b, c) as SymPy rationals and radicals, or None where no short closed form is known.
-
-    Closed forms: Gauss s <= 4, Radau s <= 3, Lobatto s <= 5, Chebyshev-Gauss s <= 3, Chebyshev-Lobatto s <= 7, explicit
-    Euler. A tableau that a user made carries no closed form, whatever its name.
-    """
-    family, s = tableau.name.partition(":")[0], tableau.stages
-    if tableau == explicit_euler():
-        from sympy import Integer
-
-        return ((Integer(0),),), (Integer(1),), (Integer(0),)
-    points, most = EXACT_FAMILIES.get(family, ("", 0))
-    if s > most or not is_made_by(tableau_by_name, tableau.name, tableau):
-        return None
-    if tableau.name == "gauss:4":
-        return exact_gauss_four()
-    A, b, c = exact_collocation(exact_family_points(points, s) or ())
-    if family in ("radau-ia", "lobatto-iiib"):
-        from sympy import radsimp
-
-        A = tuple(tuple(radsimp(value).expand() for value in row) for row in partner_matrix(A, b))
-    return A, b, c
-
-
-def exact_collocation(points: Expressions) -> tuple[tuple[Expressions, ...], Expressions, Expressions]:
-    """Return equation (23) on exact points of [-1, 1], all in one quadratic field, so that radicals do not nest."""
-    import sympy as sp
-
-    t = sp.Symbol("t")
-    c = tuple(sp.expand((1 + point) / 2) for point in points)
-    ends, columns = (*c, sp.Integer(1)), []
-    for j, here in enumerate(c):
-        others = [other for k, other in enumerate(c) if k != j]
-        scale = sp.radsimp(1 / sp.expand(sp.prod(here - other for other in others)))
-        primitive = sp.Poly(sp.expand(sp.prod(t - other for other in others)), t).integrate()
-        columns.append([sp.expand(scale * sp.expand(primitive.as_expr().subs(t, end))) for end in ends])
-    *A, b = zip(*columns, strict=True)
-    return tuple(A), b, c
-
-
-def exact_gauss_four() -> tuple[tuple[Expressions, ...], Expressions, Expressions]:
-    """Return the Gauss method of order 8, table 3 of Li, Wu & Leok (HW, section IV.5), where v is their w'.
-
-    Their entry a_34 is misprinted: it must be w1 + w3' - w4.
-    """
-    from sympy import Rational, sqrt
-
-    def letters(root: Any) -> Expressions:
-        first = Rational(1, 8) - root / 144
-        second = sqrt((15 + 2 * root) / 35) / 2
-        third, fourth = second * (Rational(1, 6) + root / 24), second * (Rational(1, 21) + 5 * root / 168)
-        return first, second, third, fourth, second - 2 * third
-
-    half = Rational(1, 2)
-    w1, w2, w3, w4, w5 = letters(sqrt(30))
-    v1, v2, v3, v4, v5 = letters(-sqrt(30))
-    A = (
-        (w1, v1 - w3 + v4, v1 - w3 - v4, w1 - w5),
-        (w1 - v3 + w4, v1, v1 - v5, w1 - v3 - w4),
-        (w1 + v3 + w4, v1 + v5, v1, w1 + v3 - w4),
-        (w1 + w5, v1 + w3 + v4, v1 + w3 - v4, w1),
-    )
-    return A, (2 * w1, 2 * v1, 2 * v1, 2 * w1), (half - w2, half - v2, half + v2, half + w2)

@@ -23,7 +23,8 @@ from scvi_codegen.cli import ABOUT, main
 from scvi_codegen.cli.choices import Choices, read_model
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
-from scvi_codegen.models.model_file import Model, load_model, parse_model, save_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import load_model, parse_model, save_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 COMMAND = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))

@@ -28,7 +28,8 @@ import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import program_of
 from scvi_codegen.derivation import derivation_html
-from scvi_codegen.derivation.equations import derive, table_entries
+from scvi_codegen.derivation.entries import table_entries
+from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.page.elision import MOST_LINES, formulas, operations
 from scvi_codegen.derivation.page.kernels import kernels_of
 from scvi_codegen.derivation.page.sparsity import jacobian_pattern

@@ -23,7 +23,7 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
-from scvi_codegen.models.problems import double_pendulum, duffing, kepler, planar_pendulum
+from scvi_codegen.models.systems import double_pendulum, duffing, kepler, planar_pendulum
 
 UNIT = {"m": 1, "l": 1, "g": 1}
 

@@ -27,13 +27,15 @@ from scvi_codegen.errors import (
     ScviCodegenError,
     SystemDefinitionError,
 )
-from scvi_codegen.formulas.grammar import format_expression, parse_expression
+from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import IDENTIFIER
+from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import ARGUMENTS, METHODS, SCVI, SVI, Gauss, method_from_specification
 from scvi_codegen.models.ensemble_file import load_ensemble
-from scvi_codegen.models.model_file import Model, dump_model, parse_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.nodes import nodes_by_name

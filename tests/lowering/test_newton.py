@@ -19,7 +19,7 @@ from scvi_codegen import (
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.ir.program import WORTH_REMEMBERING
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.models.problems import fput_chain
+from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.text import workspace_size
 from scvi_codegen.runtime.stepper import Stepper
 

@@ -27,7 +27,8 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
-from scvi_codegen.models.model_file import Model, dump_model, parse_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.models.problems import problem
 
 QUICK = ("-O1", "-ffp-contract=off")

@@ -29,7 +29,8 @@ from scvi_codegen.methods import (
     StoermerVerlet,
 )
 from scvi_codegen.methods.exactness import is_exact
-from scvi_codegen.models.problems import PROBLEMS, point_vortices, problem
+from scvi_codegen.models.problems import PROBLEMS, problem
+from scvi_codegen.models.systems import point_vortices
 
 ROUNDOFF = 3e-14
 

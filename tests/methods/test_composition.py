@@ -6,7 +6,8 @@ import pytest
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet, method_from_specification
-from scvi_codegen.models.problems import double_pendulum, duffing, kepler, outer_solar_system, problem
+from scvi_codegen.models.problems import problem
+from scvi_codegen.models.systems import double_pendulum, duffing, kepler, outer_solar_system
 
 DRIVEN = duffing().with_parameters(gamma=0.3, omega=1.3)
 STATES = {1: ([0.7], [0.4], 0.2), 2: ([0.7, -0.3], [0.3, 0.9], 0.15)}

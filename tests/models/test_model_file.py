@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ExpressionError, ModelFileError, SystemDefinitionError
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
-from scvi_codegen.models.model_file import Model, dump_model, load_model, parse_model, save_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model, load_model, parse_model, save_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import lobatto_iiib

@@ -15,7 +15,8 @@ import pytest
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import BuildError, PackageError, StateError
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
-from scvi_codegen.models.model_file import Model, load_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import load_model
 from scvi_codegen.models.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.quadrature import Quadrature

@@ -12,7 +12,8 @@ from sympy import Symbol, cos, sin
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.models.problems import PROBLEMS, Problem, fput_chain, outer_solar_system, problem
+from scvi_codegen.models.problems import PROBLEMS, Problem, problem
+from scvi_codegen.models.systems import fput_chain, outer_solar_system
 
 
 def accelerations(system: LagrangianSystem, values: dict[Symbol, float]) -> np.ndarray:

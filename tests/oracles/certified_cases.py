@@ -22,7 +22,8 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
-from scvi_codegen.models.problems import point_vortices, problem
+from scvi_codegen.models.problems import problem
+from scvi_codegen.models.systems import point_vortices
 
 __all__ = ["CASES", "case"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import scvi_codegen
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.models.problems import problem
 

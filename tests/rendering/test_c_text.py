@@ -34,7 +34,7 @@ from scvi_codegen.methods import (
     StoermerVerlet,
 )
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import fput_chain
+from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
 from scvi_codegen.rendering.source import Interface, Source
 

@@ -20,7 +20,7 @@ from scvi_codegen.ir.arithmetic import FUNCTIONS
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.rendering.single_precision import SPELLING, check_single, to_single

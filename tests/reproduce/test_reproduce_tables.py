@@ -15,8 +15,9 @@ from scvi_codegen.reproduce.laboratory.experiment import Check, Result, Verdict
 from scvi_codegen.reproduce.oscillators import two_point_pendulum as two_point
 from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
 from scvi_codegen.reproduce.writing import statement
+from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.tables.tableau import exact_tableau, gauss
+from scvi_codegen.tables.tableau import gauss
 
 MODULES = (tableaux, properties, outlines, two_point)
 QUICK = [experiment for module in MODULES for experiment in module.EXPERIMENTS]

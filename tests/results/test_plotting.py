@@ -12,7 +12,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.methods import SVI, StoermerVerlet
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.results.plotting import check_plot_path, draw_section, draw_trajectory, plot_section, plot_trajectory
 from scvi_codegen.runtime.events import Event

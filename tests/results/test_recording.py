@@ -18,7 +18,8 @@ from recorded_runs import COLUMNS, STATE, H, StopsAfter, assert_same, digests, r
 from scvi_codegen.errors import MissingLibraryError, RecordingError, RecordingWarning, StateError
 from scvi_codegen.files import export
 from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
-from scvi_codegen.models.model_file import Model, dump_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 from scvi_codegen.native.options import SolverOptions

@@ -13,13 +13,13 @@ import sympy as sp
 from mpmath import MPContext
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.closed_forms import exact_points
 from scvi_codegen.tables.nodes import (
     NODE_FAMILIES,
     Nodes,
     chebyshev_gauss,
     chebyshev_lobatto,
     equispaced,
-    exact_points,
     legendre_gauss,
     legendre_lobatto,
     nodes_by_name,

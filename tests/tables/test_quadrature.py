@@ -11,12 +11,12 @@ import scipy.special
 import sympy as sp
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.closed_forms import exact_rule
 from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_lobatto
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import (
     Quadrature,
     clenshaw_curtis,
-    exact_rule,
     fejer,
     gauss_legendre,
     gauss_lobatto,

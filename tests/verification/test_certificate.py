@@ -21,9 +21,10 @@ from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.motion import motion_of
 from scvi_codegen.exact.step import derived_step
-from scvi_codegen.formulas.grammar import evaluate
+from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.methods import Gauss, SpectralCollocation
-from scvi_codegen.models.model_file import Model, save_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import save_model
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.precision import mp

@@ -6,8 +6,9 @@ import click
 
 from scvi_codegen.cli.wording import table
 from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification
+from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.tables.tableau import exact_tableau, tableau_by_name
+from scvi_codegen.tables.tableau import tableau_by_name
 
 __all__ = ["methods"]
 

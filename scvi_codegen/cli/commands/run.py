@@ -15,7 +15,7 @@ from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_w
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
 from scvi_codegen.cli.running import Outcome, integrate_model, summary
 from scvi_codegen.models.ensemble_file import load_ensemble
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.plotting import check_plot_path, plot_trajectory
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import click
 
 from scvi_codegen.cli.wording import table
-from scvi_codegen.models.model_file import Model, dump_model
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 __all__ = ["systems"]

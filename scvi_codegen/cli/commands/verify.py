@@ -12,7 +12,7 @@ from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, re
 from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PackageError
-from scvi_codegen.models.model_file import Model
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import load_package
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification import Certificate

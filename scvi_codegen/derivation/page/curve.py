@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import sympy
 from sympy import Function, Symbol
 
-from scvi_codegen.derivation.equations import TableEntry
+from scvi_codegen.derivation.notation import TableEntry
 from scvi_codegen.derivation.page.step_drawing import step_drawing
 from scvi_codegen.display.number_tables import decimal, number_table, short
 from scvi_codegen.display.page.blocks import Cell, Content, Formula, Paragraph, Section, Table

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from scvi_codegen.compiler import c_identifier, program_of
-from scvi_codegen.derivation.equations import table_entries
+from scvi_codegen.derivation.entries import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
 from scvi_codegen.derivation.page.functions import functions_section
 from scvi_codegen.derivation.page.kernels import kernels_section, operations_section

@@ -8,7 +8,8 @@ from itertools import groupby
 import sympy
 from sympy import Symbol
 
-from scvi_codegen.derivation.equations import Equation, StepEquations, derive
+from scvi_codegen.derivation.equations import StepEquations, derive
+from scvi_codegen.derivation.notation import Equation
 from scvi_codegen.derivation.page.elision import formulas, operations
 from scvi_codegen.derivation.page.result_names import meaning
 from scvi_codegen.derivation.page.sparsity import jacobian_pattern, pattern_drawing

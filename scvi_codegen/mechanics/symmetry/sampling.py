@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.grammar import evaluate
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp

@@ -25,9 +25,10 @@ from functools import lru_cache
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.grammar import closest, evaluated, parse_expression, unsupported_part
+from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.symmetry.ansatz import (
@@ -110,7 +111,7 @@ class Symmetry:
 def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
     """The affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, others.
 
-    >>> from scvi_codegen.models.problems import kepler
+    >>> from scvi_codegen.models.systems import kepler
     >>> print(*symmetries(kepler()))
     angular momentum = q1*p_q2 - q2*p_q1
     """
@@ -156,7 +157,7 @@ def check_symmetry(
         SystemDefinitionError: with the change of L, if it is not the time derivative of f; naming the symbol, if one
             is unknown.
 
-    >>> from scvi_codegen.models.problems import kepler
+    >>> from scvi_codegen.models.systems import kepler
     >>> print(check_symmetry(kepler(), ["-q2", "q1"]))
     given symmetry = q1*p_q2 - q2*p_q1
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sympy
 
-from scvi_codegen.derivation.equations import Equation
+from scvi_codegen.derivation.notation import Equation
 from scvi_codegen.reproduce.correction.example import (
     by_hand,
     compiled,

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.models.problems import kepler
+from scvi_codegen.models.systems import kepler
 
 __all__ = [
     "SYSTEM",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import kepler, planar_pendulum
+from scvi_codegen.models.systems import kepler, planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_orbit, panels
 from scvi_codegen.reproduce.laboratory.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
 from scvi_codegen.reproduce.laboratory.running import stepper_of, trajectory

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import duffing
+from scvi_codegen.models.systems import duffing
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels, thinned
 from scvi_codegen.reproduce.laboratory.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
 from scvi_codegen.reproduce.laboratory.running import trajectory

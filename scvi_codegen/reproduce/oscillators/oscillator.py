@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import harmonic_oscillator
+from scvi_codegen.models.systems import harmonic_oscillator
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of, trajectory

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import planar_pendulum
+from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, panels, thinned
 from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory

@@ -27,8 +27,9 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.basis import differentiation_matrix
-from scvi_codegen.tables.nodes import chebyshev_lobatto, exact_points
-from scvi_codegen.tables.quadrature import exact_rule, gauss_legendre
+from scvi_codegen.tables.closed_forms import exact_points, exact_rule
+from scvi_codegen.tables.nodes import chebyshev_lobatto
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = ["EXPERIMENTS"]
 

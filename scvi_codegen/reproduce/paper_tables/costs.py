@@ -18,7 +18,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import duffing, planar_pendulum
+from scvi_codegen.models.systems import duffing, planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in

@@ -15,7 +15,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.problems import kepler
+from scvi_codegen.models.systems import kepler
 from scvi_codegen.reproduce.laboratory.drawing import panels
 from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
 from scvi_codegen.reproduce.laboratory.full_newton import newton_counts

@@ -9,7 +9,7 @@ from scvi_codegen.compiler import generate_source
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.models.problems import planar_pendulum
+from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.rendering.outline import Function, functions_of, outline
 from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Listing, Paragraph, Result, Table, holds
 

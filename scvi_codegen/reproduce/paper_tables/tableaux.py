@@ -18,8 +18,9 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Verdict,
     holds,
 )
+from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import Number, mp
-from scvi_codegen.tables.tableau import Tableau, exact_tableau, gauss
+from scvi_codegen.tables.tableau import Tableau, gauss
 
 __all__ = ["EXPERIMENTS"]
 

@@ -1,0 +1,69 @@
+"""The named numbers of a method's tables, with their short exact forms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+
+import sympy
+
+from scvi_codegen.derivation.notation import TableEntry
+from scvi_codegen.methods.collocation import RungeKutta
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import StageSystem, Table
+from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
+from scvi_codegen.tables.precision import Number
+from scvi_codegen.tables.radicals import radical_basis, recognised
+
+__all__ = ["entries", "table_entries"]
+
+
+def entries(values: Mapping[sympy.Symbol, Number], method: Method) -> tuple[TableEntry, ...]:
+    """Numbers of a method's tables by symbol, sorted by name and index, with their radicals."""
+    basis = _basis(method)
+    return tuple(
+        TableEntry(symbol, value, recognised(value, basis)) for symbol, value in sorted(values.items(), key=_by_name)
+    )
+
+
+def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
+    """The named numbers of all tables of a method's equations; those that do not occur in the equations, too."""
+    tables = [stages.end_position]
+    values: dict[sympy.Symbol, Number] = {}
+    for family in stages.families:
+        tables += [gather.table for gather in family.gathers] + [scatter.table for scatter in family.scatters]
+        tables.append(Table(entries=(family.weights,), names=(family.weight_names,)))
+    for table in tables:
+        for names, numbers in zip(table.names, table.entries, strict=True):
+            for name, value in zip(names, numbers, strict=True):
+                base, _, divisor = name.partition("/")
+                if base:
+                    values[sympy.Symbol(base, real=True)] = value * int(divisor or 1)
+    return entries(values, method)
+
+
+def _by_name(item: tuple[sympy.Symbol, Number]) -> tuple[object, ...]:
+    prefix, *indices = item[0].name.lstrip("_").split("_")
+    return (prefix, *(int(index) for index in indices))
+
+
+@lru_cache(maxsize=64)
+def _basis(method: Method) -> tuple[sympy.Expr, ...]:
+    """1 and the roots in the method's nodes and points with their products; () where one has no closed form."""
+    forms = list(_closed_forms(method))
+    return () if None in forms else radical_basis(x for form in forms for x in form or ())
+
+
+def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
+    """The exact points, weights and coefficients behind the method's tables."""
+    if isinstance(method, RungeKutta):
+        exact = exact_tableau(method.tableau)
+        yield None if exact is None else [x for row in exact[0] for x in row] + list(exact[1]) + list(exact[2])
+        return
+    nodes = getattr(method, "node_set", None)
+    if nodes is not None:
+        yield exact_points(nodes)
+    rule = getattr(method, "rule", None)
+    if rule is not None:
+        exact_points_and_weights = exact_rule(rule)
+        yield None if exact_points_and_weights is None else [x for part in exact_points_and_weights for x in part]

@@ -1,0 +1,114 @@
+"""Equations and table entries as data, as plain text, LaTeX and HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import sympy
+
+from scvi_codegen.display.cards import Html, plain
+from scvi_codegen.display.mathml import mathml_terms
+from scvi_codegen.display.mathml.names import latex_name
+from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
+from scvi_codegen.tables.precision import Number, mp
+
+__all__ = ["LARGEST_SHOWN", "Equation", "TableEntry", "html", "latex", "text_lines"]
+
+LARGEST_SHOWN = 400
+"""Operations of an equation that a notebook shows."""
+
+End = Mapping[sympy.Symbol, "Equation"]
+"""The state at the end of a step, by the symbol of the state at its start."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableEntry:
+    """A number of a table: its symbol, its value in 60 digits, and a short exact form or ``None``."""
+
+    symbol: sympy.Symbol
+    value: Number
+    exact: sympy.Expr | None
+
+    def __str__(self) -> str:
+        form = f" = {self.exact}" if self.exact is not None else ""
+        return f"{self.symbol}{form} = {mp.nstr(self.value, 20)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Equation:
+    """0 = residual.
+
+    Attributes:
+        number: the paper's number, or the variable with respect to which a generating function is stationary.
+        kind: ``"stage"``, ``"IDEL"`` (implicit discrete Euler-Lagrange), ``"multiplier"`` or ``"Legendre"``.
+        residual: in the unknowns, (q_k, p_k, t_k, h), parameters and table entries.
+    """
+
+    number: str
+    kind: str
+    residual: sympy.Expr
+
+    def __str__(self) -> str:
+        return f"({self.number}) 0 = {self.residual}"
+
+
+def text_lines(
+    equations: Iterable[Equation], end: End, guess: Mapping[sympy.Symbol, sympy.Expr], entries: Sequence[TableEntry]
+) -> Iterator[str]:
+    """The equations of a step in plain text."""
+    yield "\nequations"
+    yield from (f"  {equation}" for equation in equations)
+    yield "\nend of the step"
+    yield from (f"  ({e.number}) {symbol.name[:-2]}_(k+1) = {e.residual}" for symbol, e in end.items())
+    yield "\nfirst guess (q_dot_k: the velocity that belongs to p_k)"
+    yield from (f"  {symbol} = {value}" for symbol, value in guess.items())
+    if entries:
+        yield "\ntable entries"
+        yield from (f"  {entry}" for entry in entries)
+
+
+def latex(
+    equations: Sequence[Equation], end: End, entries: Sequence[TableEntry], symmetries: Sequence[Symmetry]
+) -> str:
+    """An ``align*`` environment with numbers as tags, one for the tables, one for the momentum maps."""
+    residuals = [equation.residual for equation in (*equations, *end.values())]
+    symbols = set(end).union(*(r.free_symbols for r in residuals), (entry.symbol for entry in entries))
+    names = {symbol: latex_name(symbol.name) for symbol in symbols}
+
+    def written(expression: sympy.Expr) -> str:
+        return str(sympy.latex(expression, symbol_names=names))
+
+    def exact(entry: TableEntry) -> str:
+        return written(entry.exact) + " = " if entry.exact is not None else ""
+
+    lines = [rf"0 &= {written(e.residual)} \tag{{{_tag(e.number)}}}" for e in equations]
+    for symbol, equation in end.items():
+        new = latex_name(f"{symbol.name}+1")
+        lines.append(rf"{new} &= {written(equation.residual)} \tag{{{_tag(equation.number)}}}")
+    tables = [rf"{names[entry.symbol]} &= {exact(entry)}{mp.nstr(entry.value, 17)}" for entry in entries]
+    maps = [
+        rf"J &= {sympy.latex(s.momentum_map, symbol_names=_names_of_maps(s))} \tag{{{_tag(s.name)}}}"
+        for s in symmetries
+    ]
+    blocks = [block for block in (lines, tables, maps) if block]
+    return "\n".join("\\begin{align*}\n" + " \\\\\n".join(block) + "\n\\end{align*}" for block in blocks)
+
+
+def html(equation: Equation) -> Html:
+    """An equation for a notebook, or its size where that is large."""
+    size = sympy.count_ops(equation.residual)
+    if size > LARGEST_SHOWN:
+        return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")
+    pieces = [piece for term in mathml_terms(equation.residual, sympy.S.Zero) for piece in term]
+    return Html(f"<div>{plain(f'({equation.number})')} {' '.join(pieces)}</div>")
+
+
+def _names_of_maps(symmetry: Symmetry) -> dict[sympy.Symbol, str]:
+    return {symbol: latex_name(symbol.name) for symbol in symmetry.momentum_map.free_symbols}
+
+
+def _tag(number: str) -> str:
+    if not number.startswith("dG"):
+        return number.replace("_", r"\_")
+    return "$" + number.replace("dG", r"\partial G").replace("/d", r"/\partial ") + "$"

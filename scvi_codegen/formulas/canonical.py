@@ -1,0 +1,147 @@
+"""What the grammar accepts, and the one form in which SymPy's constructors leave it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+from sympy import Add, Expr, Mul, Pow, Rational, S
+from sympy.core.function import AppliedUndef
+
+from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS, LARGEST, NAME_OF, shortened
+
+__all__ = [
+    "MAX_BITS",
+    "MAX_DIGITS",
+    "NODES",
+    "beyond_double",
+    "bits",
+    "evaluated",
+    "exponent_problem",
+    "unsupported_part",
+]
+
+MAX_EXPONENT = 64
+MAX_EXPONENT_DENOMINATOR = 10_000
+MAX_BITS = 2048
+MAX_DIGITS = 616
+"""Of a whole number of so many bits."""
+MAX_PASSES = 8
+
+
+def bits(number: Expr) -> int:
+    """Size of a rational, in bits of its larger half; 0 for anything else."""
+    return max(int(number.p).bit_length(), int(number.q).bit_length()) if number.is_Rational else 0
+
+
+def beyond_double(number: Expr) -> bool:
+    """Whether a rational is an infinity as a C double, or 0 without being 0."""
+    p, q = abs(int(number.p)), int(number.q)
+    return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
+
+
+NODES = frozenset([Add, Mul, Pow, *NAME_OF])
+
+
+_SMOOTHER = {
+    "Abs": "the absolute value is not differentiable; sqrt(x**2) is one, too",
+    "sign": "the sign is not differentiable",
+    "Piecewise": "pieces are not differentiable where they meet",
+    "Heaviside": "steps are not differentiable",
+    "ImaginaryUnit": "a Lagrangian is real",
+}
+
+
+def unsupported_part(expression: Expr) -> str | None:
+    """Say what keeps an expression out of the grammar, or ``None``: the rule of the parser, the printer and the system.
+
+    Refused are other functions, floating-point numbers, non-finite or non-real constants, numbers of more than
+    ``MAX_BITS`` bits and constant exponents beyond ``MAX_EXPONENT``.
+    """
+    pending, seen = [expression], set()
+    while pending:
+        node = pending.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        problem = _node_problem(node)
+        if problem:
+            return problem
+        pending.extend(node.args)
+    return _constant_problem(expression)
+
+
+def _node_problem(node: Any) -> str | None:
+    if not node.args:
+        if node.is_Symbol or node in (S.Pi, S.Exp1):
+            return None
+        if node.is_Rational and bits(node) > MAX_BITS:
+            return f"a constant grows beyond {MAX_BITS} bits, more than any C double can hold"
+        if node.is_Rational:
+            return f"the constant {shortened(node)} lies beyond any C double" if beyond_double(node) else None
+        if node in (S.NaN, S.ComplexInfinity, S.Infinity, S.NegativeInfinity):
+            return f"a part of the formula is not finite ({node})"
+    elif node.func in NODES:
+        return exponent_problem(node.exp) if node.is_Pow else None
+    kind = type(node).__name__
+    reason = f": {_SMOOTHER[kind]}" if kind in _SMOOTHER else ""
+    known = ", ".join([*FUNCTIONS, *CONSTANTS])
+    return f"{kind} ('{shortened(node)}') is not supported{reason}. Use + - * / ** and {known}"
+
+
+def exponent_problem(exponent: Expr) -> str | None:
+    """Bound the rational part of an exponent: SymPy takes 2**1000000000 out of 2**(x + 1000000000), digit by digit."""
+    constant = exponent.as_coeff_Add(rational=True)[0]
+    if abs(constant) <= MAX_EXPONENT and constant.q <= MAX_EXPONENT_DENOMINATOR:
+        return None
+    return (
+        f"the constant in an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most "
+        f"{MAX_EXPONENT_DENOMINATOR}, not {shortened(constant)}"
+    )
+
+
+def _constant_problem(expression: Expr) -> str | None:
+    """Look at the largest parts without symbols: each must be a finite real number."""
+    pending = [expression]
+    while pending:
+        node = pending.pop()
+        if node.free_symbols:
+            pending.extend(argument for argument in node.args if argument.args)
+        elif node.args:
+            try:
+                evaluate(node, {})
+            except ArithmeticError:
+                return f"the constant '{shortened(node)}' is not a finite real number"
+    return None
+
+
+def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None) -> Expr:
+    """Replace parts, make floating-point numbers rational and call every constructor anew until nothing changes.
+
+    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``);
+    after this, an expression is the one its text means. A float becomes the rational its shortest decimal form says.
+    """
+    rules = dict(replacements or {})
+    for _ in range(MAX_PASSES):
+        result = _rebuilt(expression, rules)
+        if result == expression:
+            break
+        expression, rules = result, {}
+    return expression
+
+
+def _rebuilt(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression not in known:
+        known[expression] = _rebuilt_node(expression, known)
+    return known[expression]
+
+
+def _rebuilt_node(expression: Expr, known: dict[Expr, Expr]) -> Expr:
+    if expression.is_Float:
+        value = float(expression)
+        return Rational(repr(value) if expression == value else str(expression))
+    if not expression.args or isinstance(expression, (sympy.Derivative, AppliedUndef)):
+        return expression
+    return expression.func(*(_rebuilt(argument, known) for argument in expression.args))

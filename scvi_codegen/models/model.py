@@ -1,0 +1,158 @@
+"""A system with a method, an initial state and the length of a run, checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Any
+
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import Method
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.models.problems import Problem
+
+if TYPE_CHECKING:
+    from scvi_codegen.native.options import SolverOptions
+    from scvi_codegen.runtime.inputs import Array
+    from scvi_codegen.runtime.run import Run
+    from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["DEFAULT_METHOD", "Model", "check_length", "real", "whole"]
+
+DEFAULT_METHOD = SVI(8)
+"""What the problems of the catalogue are integrated with unless another method is chosen."""
+MOST_STEPS = 2**53
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """A system, a method, an initial state and the length of a run; equality is structural.
+
+    Attributes:
+        system: what moves, with the parameter values of the run as its defaults.
+        method: how its motion is discretised.
+        q: (m,) initial coordinates.
+        p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
+        velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
+        h: step size, not 0, negative for a run backward.
+        span: length of time, positive, or ``None`` if ``steps`` is given.
+        steps: number of steps, or ``None`` if ``span`` is given.
+        every: distance between kept states in steps.
+        t: initial time.
+
+    Raises:
+        ModelFileError: naming the field, unless exactly one of p and velocity and one of span and steps is given, each
+            vector has m entries, and every number is finite and in its range.
+    """
+
+    system: MechanicalSystem
+    method: Method
+    q: tuple[float, ...]
+    p: tuple[float, ...] | None = None
+    velocity: tuple[float, ...] | None = None
+    h: float
+    span: float | None = None
+    steps: int | None = None
+    every: int = 1
+    t: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
+        _check_one_of("span", self.span, "steps", self.steps)
+        for name in ("q", "p", "velocity"):
+            if (vector := getattr(self, name)) is not None:
+                object.__setattr__(self, name, self._vector(name, vector))
+        for name in ("h", "t", "span"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, real(value, name))
+        if self.h == 0.0:
+            raise ModelFileError("the step is 0: it must be positive, or negative to go back")
+        if self.span is not None and not 0.0 < self.span / abs(self.h) < MOST_STEPS:
+            raise ModelFileError(
+                f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
+                "backward, of fewer than 2^53 steps"
+            )
+        if self.steps is not None:
+            object.__setattr__(self, "steps", whole(self.steps, "steps", least=0))
+        object.__setattr__(self, "every", whole(self.every, "every", least=1))
+
+    @classmethod
+    def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
+        """An entry of the catalogue with a method."""
+        return cls(
+            system=entry.system,
+            method=method,
+            q=entry.q,
+            p=entry.p,
+            velocity=entry.velocity,
+            h=entry.step,
+            span=entry.span,
+        )
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps: ``steps``, or the whole number (at least 1) of steps nearest to ``span``."""
+        if self.steps is not None:
+            return self.steps
+        assert self.span is not None  # by construction
+        return max(1, round(self.span / abs(self.h)))
+
+    def momenta(self, stepper: Stepper) -> Array:
+        """(m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
+        import numpy as np  # here, so that reading a model does not wait for it
+
+        if self.p is not None:
+            return np.array(self.p)
+        assert self.velocity is not None  # by construction
+        return stepper.momentum(self.q, self.velocity, self.t, self.system.defaults)
+
+    def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
+        """The run of this model from its initial state; advance it by :attr:`step_count` steps."""
+        p = self.momenta(stepper)
+        return stepper.start(self.q, p, h=self.h, t=self.t, parameters=self.system.defaults, options=options)
+
+    def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:
+        names = [coordinate.name for coordinate in self.system.coordinates]
+        if not isinstance(values, Iterable):
+            raise ModelFileError(f"{name} must be {len(names)} numbers, not {values!r}")
+        values = tuple(values)
+        check_length(values, names, name)
+        return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
+
+
+def check_length(values: Sequence[object], names: Sequence[str], where: str) -> None:
+    """Refuse values that are not one for each name."""
+    if len(values) != len(names):
+        shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+        raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
+
+
+def _check_one_of(one: str, first: object, other: str, second: object) -> None:
+    if (first is None) == (second is None):
+        raise ModelFileError(f"give exactly one of {one} and {other}")
+
+
+def real(value: Any, where: str) -> float:
+    """A finite number, or an error that begins with ``where``."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ModelFileError(f"{where} must be a number, not {value!r}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ModelFileError(f"{where} is {number}: a finite number is wanted")
+    return number
+
+
+def whole(value: Any, where: str, *, least: int) -> int:
+    """A whole number of at least ``least`` and below 2^53, or an error that begins with ``where``."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ModelFileError(f"{where} must be a whole number, not {value!r}")
+    number = int(value)
+    if not least <= number < MOST_STEPS:
+        raise ModelFileError(f"{where} must be at least {least} and below 2^53, not {number}")
+    return number
