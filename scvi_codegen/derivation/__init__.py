@@ -13,5 +13,6 @@ a page of the same kind.
 from __future__ import annotations
 
 from scvi_codegen.derivation.page.document import derivation_html
+from scvi_codegen.derivation.page.jacobian import Start
 
-__all__ = ["derivation_html"]
+__all__ = ["Start", "derivation_html"]

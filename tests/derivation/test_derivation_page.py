@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
 import warnings
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import sympy
@@ -27,13 +28,16 @@ from summed_equations import Evaluation
 import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import program_of
-from scvi_codegen.derivation import derivation_html
+from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.entries import table_entries
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.page.elision import MOST_LINES, formulas, operations
+from scvi_codegen.derivation.page.functions import SWEEPS
+from scvi_codegen.derivation.page.jacobian import entry_numbers
 from scvi_codegen.derivation.page.kernels import kernels_of
 from scvi_codegen.derivation.page.sparsity import jacobian_pattern
 from scvi_codegen.display.page.blocks import Formula, Paragraph
+from scvi_codegen.ir.sweeps import Sweep
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.rendering.outline import functions_of, reached
 from scvi_codegen.rendering.text import render
@@ -130,8 +134,10 @@ class TestEquations:
 
 
 @cache
-def kepler_page(method: Any) -> str:
-    return derivation_html(sc.problem("kepler").system, method)
+def kepler_page(method: Any, *, started: bool = False) -> str:
+    kepler = sc.problem("kepler")
+    start = Start(q=kepler.q, velocity=kepler.velocity, p=kepler.p, h=kepler.step)
+    return derivation_html(kepler.system, method, start=start if started else None)
 
 
 class TestPage:
@@ -158,6 +164,23 @@ class TestPage:
         assert len(shown) == len(set(shown))
         called = {f.name for f in reached(functions, "double_pendulum_advance") if f.comment and "lanes" not in f.name}
         assert called <= set(shown)
+
+    def test_every_kind_of_sweep_is_explained(self):
+        assert set(SWEEPS) == {sweep.kind for sweep in get_args(Sweep)}
+        page = derivation_html(sc.problem("point-vortices").system, sc.Gauss(2))
+        assert "one from the other until they rest" in page
+
+    def test_an_entry_of_the_jacobian_says_its_number(self):
+        pendulum, q, v, h = sc.problem("planar-pendulum").system.with_parameters(g=9.81), 0.5, 0.7, 0.1
+        expected = -1.0 / h - 9.81 * h / 4 * math.cos(q + h * v / 2)
+        start = Start(q=[q], velocity=[v], p=None, h=h)
+        derived = derive(pendulum, sc.SVI(1, "gauss-legendre:1"))
+        assert entry_numbers(derived, start) == {(0, 0): pytest.approx(expected, rel=1e-14)}
+        page = derivation_html(pendulum, derived.method, start=start)
+        assert f"<title>equation 1 by Q_1: {expected:.6g}</title>" in page
+        unknown = Start(q=[q], velocity=None, p=[v], h=h)
+        assert entry_numbers(derived, unknown) == {}
+        assert "<title>equation 1 by Q_1</title>" in derivation_html(pendulum, derived.method, start=unknown)
 
     def test_operations_are_counted(self):
         program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
@@ -248,7 +271,7 @@ class TestCommand:
         assert done.exit_code == 0, done.output
         assert done.stderr == f"wrote {path}\n"
         assert done.stdout == ""
-        assert path.read_text(encoding="utf-8").rstrip("\n") == kepler_page(sc.SVI(2)).rstrip("\n")
+        assert path.read_text(encoding="utf-8").rstrip("\n") == kepler_page(sc.SVI(2), started=True).rstrip("\n")
         assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
 
     @pytest.mark.parametrize("more", [["--latex"], ["--radicals"], ["-o", "text"]])

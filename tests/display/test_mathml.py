@@ -167,11 +167,12 @@ def test_derived_equations_read_as_they_are(name, method, radicals):
         check_read_back(equation.residual)
 
 
-TAU_1 = "<msub><mi>τ</mi><mn>1</mn></msub>"
-DOT = "<mo>˙</mo></mover>"
+GREEK = '<mi mathvariant="normal" style="font-style:italic">'
+TAU_1 = f"<msub>{GREEK}τ</mi><mn>1</mn></msub>"
+DOT = '<mo style="font-weight:bold;padding-bottom:0.12em">˙</mo></mover>'
 NAMED = {
-    "theta_1": "<msub><mi>θ</mi><mn>1</mn></msub>",
-    "theta1": "<msub><mi>θ</mi><mn>1</mn></msub>",
+    "theta_1": f"<msub>{GREEK}θ</mi><mn>1</mn></msub>",
+    "theta1": f"<msub>{GREEK}θ</mi><mn>1</mn></msub>",
     "Q__2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
     "Q_2_x": "<msubsup><mi>Q</mi><mi>x</mi><mn>2</mn></msubsup>",
     "Q_1": "<msup><mi>Q</mi><mn>1</mn></msup>",
@@ -182,7 +183,7 @@ NAMED = {
     "q1_dot_k": f'<msub><mover accent="true"><mi>q</mi>{DOT}<mrow><mn>1</mn><mo>,</mo><mi>k</mi></mrow></msub>',
     "p_k": "<msub><mi>p</mi><mi>k</mi></msub>",
     "q_{k+1}": "<msub><mi>q</mi><mrow><mi>k</mi><mo>+</mo><mn>1</mn></mrow></msub>",
-    "lambda_1_q1": "<msub><mi>λ</mi><mrow><mn>1</mn><mo>,</mo><msub><mi>q</mi><mn>1</mn></msub></mrow></msub>",
+    "lambda_1_q1": f"<msub>{GREEK}λ</mi><mrow><mn>1</mn><mo>,</mo><msub><mi>q</mi><mn>1</mn></msub></mrow></msub>",
     "l_1_0": f'<mrow><msub><mi>l</mi><mn>0</mn></msub><mrow><mo stretchy="false">(</mo>{TAU_1}'
     '<mo stretchy="false">)</mo></mrow></mrow>',
     "_h": "<mi>h</mi>",
@@ -196,7 +197,7 @@ def test_names(name):
 
 
 def test_names_of_tables():
-    assert "<mi>l</mi><mo>˙</mo>" in inner(Symbol("dl_2_1"))
+    assert f"<mi>l</mi>{DOT}" in inner(Symbol("dl_2_1"))
     assert "<mi>D</mi><mo>^</mo>" in inner(Symbol("DD_1_0"))
     assert "<msup><mi>A</mi><mn>2</mn></msup>" in inner(Symbol("aa_1_2"))
     assert "<mi>b</mi><mi>A</mi>" in inner(Symbol("bA_2"))

@@ -29,7 +29,7 @@ UNREADABLE = """() => {
         }
     };
     const found = [];
-    for (const element of document.querySelectorAll('body *')) {
+    for (const element of document.querySelectorAll('body *:not(title)')) {
         if (![...element.childNodes].some(node => node.nodeType === 3 && node.data.trim())) continue;
         const style = getComputedStyle(element);
         const color = channels(element.closest('svg') ? style.fill : style.color);

@@ -9,7 +9,7 @@ import click
 
 from scvi_codegen.cli.choices import Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import check_writable, emit
-from scvi_codegen.derivation import derivation_html
+from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import derive as derive_equations
 
 __all__ = ["derive"]
@@ -40,7 +40,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, Choices(**choices))
     if html is not None:
-        emit(derivation_html(model.system, model.method), html)
+        start = Start(q=model.q, velocity=model.velocity, p=model.p, h=model.h, t=model.t)
+        emit(derivation_html(model.system, model.method, start=start), html)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
     emit(equations.to_latex() if latex else equations.to_text(), output)

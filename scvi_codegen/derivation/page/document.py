@@ -8,11 +8,11 @@ from scvi_codegen.compiler import c_identifier, program_of
 from scvi_codegen.derivation.entries import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
 from scvi_codegen.derivation.page.functions import functions_section
+from scvi_codegen.derivation.page.jacobian import Start, jacobian_section
 from scvi_codegen.derivation.page.kernels import kernels_section, operations_section
 from scvi_codegen.derivation.page.motion import motion_section, system_section
 from scvi_codegen.derivation.page.stage_equations import (
     idel_section,
-    jacobian_section,
     stage_section,
     written_out,
     written_out_section,
@@ -29,13 +29,16 @@ from scvi_codegen.version import __version__
 __all__ = ["derivation_html"]
 
 
-def derivation_html(system: MechanicalSystem, method: Method, *, solver: str = "auto") -> str:
+def derivation_html(
+    system: MechanicalSystem, method: Method, *, solver: str = "auto", start: Start | None = None
+) -> str:
     """The derivation of ``method`` for ``system`` as a page of HTML that needs nothing else.
 
     Args:
         system: what moves.
         method: how its motion is discretised.
         solver: of the C that is shown; as of :func:`~scvi_codegen.compiler.compile_stepper`.
+        start: of a step, at whose first guess the numbers of the Jacobian are shown.
 
     Raises:
         MethodError: for a solver that the method does not have, or a system that the method is not for.
@@ -46,13 +49,13 @@ def derivation_html(system: MechanicalSystem, method: Method, *, solver: str = "
         body_class="derivation",
         system=system,
         method=method,
-        sections=list(_sections(system, method, solver)),
+        sections=list(_sections(system, method, solver, start)),
         css=style_sheet("page.css", "derivation.css"),
         version=__version__,
     )
 
 
-def _sections(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Section]:
+def _sections(system: MechanicalSystem, method: Method, solver: str, start: Start | None) -> Iterator[Section]:
     program = program_of(system, method, solver=solver, prefix=c_identifier(system.name))
     functions = functions_of(render(program).code)
     stages = with_auxiliaries(system, method.paper_form(system))
@@ -64,7 +67,7 @@ def _sections(system: MechanicalSystem, method: Method, solver: str) -> Iterator
     yield stage_section(system, stages)
     yield idel_section(system, stages)
     yield written_out_section(derived)
-    yield jacobian_section(system, stages, derived, program)
+    yield jacobian_section(system, stages, derived, program, start)
     yield operations_section(program)
     yield kernels_section(system, program, functions)
     yield functions_section(system, method, program, functions)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 
 import sympy
+from sympy import Function as Applied
 from sympy import Symbol
 
 from scvi_codegen.derivation.page.elision import lines
@@ -112,6 +113,17 @@ SWEEPS: dict[str, tuple[Content, ...]] = {
         Formula(Symbol("V_n") + inverse_mass * (Symbol("P_n") - Symbol("L_v_n")), Symbol("V_n_new")),
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
+    ),
+    "hamiltonian": (
+        Paragraph(
+            "Positions, forces, momenta and velocities V_n = H_p at the points, one from the other until they rest:"
+        ),
+        Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
+        Formula(-Applied("H_q")(Symbol("q_n"), Symbol("P_n")), Symbol("F_n")),
+        Formula(p + h * _sum("A_n_j", Symbol("F_j")), Symbol("P_n")),
+        Formula(Applied("H_p")(Symbol("q_n"), Symbol("P_n")), Symbol("V_n")),
+        Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
+        Formula(p + h * _sum("B_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
     "shooting": (
         Paragraph(

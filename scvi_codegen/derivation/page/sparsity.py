@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from html import escape
 
 from scvi_codegen.display.page.blocks import Drawing
 from scvi_codegen.formulas.derivatives import jacobian
@@ -55,8 +56,8 @@ def _met(rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]
     }
 
 
-def pattern_drawing(pattern: Pattern) -> Drawing | None:
-    """A picture of the matrix, ``None`` where it would be too large to be seen."""
+def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | None = None) -> Drawing | None:
+    """A picture of the matrix, ``None`` where it would be too large to be seen; ``titles`` show where one points."""
     if pattern.size > LARGEST_DRAWN:
         return None
     cell = SIDE / pattern.size
@@ -73,10 +74,17 @@ def pattern_drawing(pattern: Pattern) -> Drawing | None:
     svg = (
         f'<svg viewBox="-1 -1 {SIDE + 2} {SIDE + 2}" role="img" aria-label="{caption}" '
         f'style="--width: {SIDE}px; min-width: 0">'
-        f'<path d="{"".join(runs)}" fill="var(--link)"/>'
+        f'<path d="{"".join(runs)}" fill="var(--link)"/>{"".join(_pointed(titles or {}, cell))}'
         f'<path d="M0 0H{SIDE}V{SIDE}H0z" fill="none" stroke="currentColor" opacity="0.5"/></svg>'
     )
     return Drawing(svg, caption)
+
+
+def _pointed(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
+    """What is seen of an entry where one points at it."""
+    for (i, j), title in titles.items():
+        place = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
+        yield f'<rect class="entry" {place}><title>{escape(title)}</title></rect>'
 
 
 def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:

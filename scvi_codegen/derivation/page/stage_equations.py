@@ -12,10 +12,8 @@ from scvi_codegen.derivation.equations import StepEquations, derive
 from scvi_codegen.derivation.notation import Equation
 from scvi_codegen.derivation.page.elision import formulas, operations
 from scvi_codegen.derivation.page.result_names import meaning
-from scvi_codegen.derivation.page.sparsity import jacobian_pattern, pattern_drawing
 from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, row_formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section
-from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem
@@ -23,7 +21,6 @@ from scvi_codegen.methods.stage_system import PointFamily, StageSystem
 __all__ = [
     "families_contents",
     "idel_section",
-    "jacobian_section",
     "stage_section",
     "written_out",
     "written_out_section",
@@ -31,7 +28,6 @@ __all__ = [
 
 MOST_OPERATIONS = 6000
 """Of all equations written out, about: beyond, they are not."""
-LARGEST_SHOWN_JACOBIAN = 3
 FAMILIES = {
     "quadrature": "At the quadrature points tau_n",
     "node": "At the nodes",
@@ -114,37 +110,8 @@ def written_out_section(derived: StepEquations | None) -> Section:
         together=MOST_OPERATIONS,
     )
     contents.append(Paragraph("Newton's iteration begins on the straight line with the velocity that belongs to p_k:"))
-    contents += formulas([Formula(value, symbol) for symbol, value in derived.initial_guess.items()], "first guess")
+    contents += formulas([Formula(value, symbol) for symbol, value in derived.initial_guess.items()], "first value")
     return Section(name=name, title=title, contents=tuple(contents))
-
-
-def jacobian_section(
-    system: MechanicalSystem, stages: StageSystem, derived: StepEquations | None, program: Program
-) -> Section:
-    """Where the derivatives of the equations by their unknowns are not zero."""
-    pattern = jacobian_pattern(stages, system.dimension)
-    drawing = pattern_drawing(pattern)
-    text = (
-        f"Derivatives of the {pattern.size} equations with respect to the {pattern.size} unknowns: {pattern.entries} "
-        f"of {pattern.size**2} entries are not zero by structure. It is not written out but summed over the points "
-        "from the slopes of the kernels, the same expressions at every point."
-    )
-    contents: list[Content] = [Paragraph(text)]
-    contents += [] if drawing is None else [drawing]
-    if derived is not None and pattern.size <= LARGEST_SHOWN_JACOBIAN:
-        entries = derived.jacobian.todok().items()
-        contents += formulas([Formula(value, Symbol(f"J_{i + 1}_{j + 1}")) for (i, j), value in entries], "entry")
-    if program.newton:
-        contents.append(
-            Paragraph(
-                f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations a "
-                f"coordinate, {program.unknowns} numbers. In the order chosen, coordinates that meet are at most "
-                f"{program.bandwidth} apart, and the matrix is the band that follows, or full if that is smaller."
-            )
-        )
-    else:
-        contents.append(Paragraph("The step is explicit, or solved by sweeps alone: the C has no Jacobian."))
-    return Section(name="jacobian", title="Jacobian", contents=tuple(contents))
 
 
 def _rows(system: MechanicalSystem, stages: StageSystem, kinds: set[str]) -> Iterator[Formula]:

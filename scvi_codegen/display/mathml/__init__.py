@@ -2,7 +2,7 @@
 
     >>> from sympy import Symbol
     >>> mathml(Symbol("theta_1_dot") / 2)  # doctest: +ELLIPSIS
-    '<math><mfrac><msub><mover accent="true"><mi>θ</mi><mo>˙</mo></mover>...</math>'
+    '<math><mfrac><msub><mover accent="true"><mi mathvariant="normal" ...>θ</mi><mo ...>˙</mo></mover>...</math>'
 
 Fractions keep what is short; wide factors stand behind them, and nothing is rewritten: signs and factors are those of
 the expression. Browsers do not break lines within ``<math>``, so :func:`mathml_terms` gives a long equation in pieces

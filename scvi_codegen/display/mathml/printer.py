@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterator, Sequence
 from itertools import chain, takewhile
 from typing import Any, TypeAlias
@@ -32,6 +33,11 @@ SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
 """Functions whose power is written at their name."""
 TYPESET = str.maketrans({"-": "\N{MINUS SIGN}", "ⅆ": "d", "ⅇ": "e", "ⅈ": "i"})
 TALL_TAGS = ("mfrac", "mtable", "munderover")
+DOT = {"style": "font-weight:bold;padding-bottom:0.12em"}
+"""Of dots above a letter: fonts without a table for mathematics set them onto the letter, where they are not seen."""
+GREEK = re.compile("[\u0370-\u03ff]")
+UPRIGHT = {"mathvariant": "normal", "style": "font-style:italic"}
+"""Of Greek letters: the slanted ones that browsers would put in their place are missing in most fonts."""
 
 Child: TypeAlias = Element | str
 Piece: TypeAlias = list[Element]
@@ -46,7 +52,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         root = self._element("math", *elements)
         if display:
             root.setAttribute("displaystyle", "true")
-        _escape(root)
+        _finish(root)
         return str(root.toxml())
 
     def printed(self, expression: Any) -> Element:
@@ -265,7 +271,8 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
     def _typeset(self, name: Name) -> Element:
         letter = self._element("mi", name.letter)
         if name.accent:
-            letter = self._element("mover", letter, self.operator(ACCENTS[name.accent]))
+            shape = DOT if name.accent.endswith("dot") else {}
+            letter = self._element("mover", letter, self.operator(ACCENTS[name.accent], **shape))
             letter.setAttribute("accent", "true")
         scripts = [self._indices(part) for part in (name.below, name.above) if part]
         tag = "msubsup" if len(scripts) == 2 else "msup" if name.above else "msub"
@@ -338,10 +345,13 @@ def _is_tall(element: Element) -> bool:
     return element.tagName in TALL_TAGS or any(_is_tall(child) for child in element.childNodes if child.nodeType == 1)
 
 
-def _escape(node: Node) -> None:
-    """Make the text within well-formed: SymPy's printer writes some of it as HTML entities."""
+def _finish(node: Any) -> None:
+    """Make the text within well-formed (SymPy's printer writes HTML entities) and its Greek letters seen."""
     for child in node.childNodes:
-        if child.nodeType == Node.TEXT_NODE:
-            child.data = html.escape(html.unescape(child.data).translate(TYPESET), quote=False)
-        else:
-            _escape(child)
+        if child.nodeType != Node.TEXT_NODE:
+            _finish(child)
+            continue
+        child.data = html.escape(html.unescape(child.data).translate(TYPESET), quote=False)
+        if node.nodeName == "mi" and GREEK.fullmatch(child.data):
+            for name, value in UPRIGHT.items():
+                node.setAttribute(name, value)

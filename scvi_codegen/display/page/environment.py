@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.display.page import blocks
-from scvi_codegen.display.page.typesetting import cell, column_class, prose
+from scvi_codegen.display.page.typesetting import cell, column_class, column_heading, prose
 from scvi_codegen.files.templates import template_folder
 
 __all__ = ["page_template", "style_sheet"]
@@ -46,6 +46,7 @@ def _environment() -> Environment:
     environment.filters |= {
         "prose": prose,
         "cell": cell,
+        "column_heading": column_heading,
         "column": column_class,
         "equation": _equation,
         "c_text": _c_text,

@@ -11,7 +11,7 @@ from sympy.printing.pretty.pretty_symbology import greek_unicode
 from scvi_codegen.display.mathml import mathml
 from scvi_codegen.display.page.blocks import Cell, Table
 
-__all__ = ["SPACE", "cell", "column_class", "prose"]
+__all__ = ["SPACE", "cell", "column_class", "column_heading", "prose"]
 
 FORMAT = ".3g"
 LONGEST_LINE = 32
@@ -31,6 +31,7 @@ SCIENTIFIC = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?!\w)")
 RAISED = re.compile(r"\^(?:\{([^}]*)\}|\(([^)]*)\)|(-?\w+))")
 LOWERED = re.compile(r"(?<![\w.])(d?[A-Za-z]|lambda|tau|theta)_(?:(\d+|[a-z]{1,2}\d?)(?!\w)|\((\w\+1)\)|\{([^}]*)\})")
 EQUALITY = re.compile(r"(?<=\w) = (?=[-\d])")
+INDEX = re.compile(f"^([ijkn])(?={SPACE}=)")
 NEGATIVE = re.compile(r"(?<![\w)\]>;-])-(?=\d)|(?<== )-(?=\w)|(?<= )-(?= |[A-Za-z](?:<su|\())")
 
 
@@ -40,6 +41,11 @@ def prose(text: str) -> Markup:
     typeset = LOWERED.sub(_lowered, SCIENTIFIC.sub(_scientific, typeset))
     typeset = EQUALITY.sub(f"{SPACE}={SPACE}", RAISED.sub(_raised, typeset))
     return Markup(NEGATIVE.sub(MINUS, typeset))
+
+
+def column_heading(text: str) -> Markup:
+    """Of a column; an index that it gives a value is set as a variable, whose letter is not mistaken for another."""
+    return Markup(INDEX.sub(r"<var>\1</var>", str(prose(text))))
 
 
 def cell(value: Cell, specification: str | None = None) -> Markup:

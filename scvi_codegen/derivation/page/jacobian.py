@@ -1,0 +1,107 @@
+"""The Jacobian of the stage equations: where it is not zero, and its numbers at the first guess of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import sympy
+from sympy import Symbol
+
+from scvi_codegen.derivation.equations import StepEquations
+from scvi_codegen.derivation.page.elision import formulas
+from scvi_codegen.derivation.page.sparsity import Pattern, jacobian_pattern, pattern_drawing
+from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section
+from scvi_codegen.ir.program import Program
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import StageSystem
+
+__all__ = ["Start", "entry_numbers", "jacobian_section"]
+
+LARGEST_SHOWN = 3
+"""Rows of a Jacobian whose entries are typeset."""
+MOST_NUMBERS = 1000
+"""Entries of a Jacobian whose numbers are computed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """The step at whose first guess numbers are shown.
+
+    Attributes:
+        q: (m,) positions.
+        velocity, p: (m,) each, ``None`` where not known; what needs it has no numbers then.
+        h, t: step size and time.
+    """
+
+    q: Sequence[float]
+    velocity: Sequence[float] | None
+    p: Sequence[float] | None
+    h: float
+    t: float = 0.0
+
+
+def jacobian_section(
+    system: MechanicalSystem,
+    stages: StageSystem,
+    derived: StepEquations | None,
+    program: Program,
+    start: Start | None = None,
+) -> Section:
+    """Where the derivatives of the equations by their unknowns are not zero, and what they are at a start."""
+    pattern = jacobian_pattern(stages, system.dimension)
+    small = derived is not None and pattern.entries <= MOST_NUMBERS
+    numbers = entry_numbers(derived, start) if derived is not None and start is not None and small else {}
+    drawing = pattern_drawing(pattern, _titles(derived, pattern, numbers) if derived is not None and small else {})
+    text = (
+        f"Derivatives of the {pattern.size} equations with respect to the {pattern.size} unknowns: {pattern.entries} "
+        f"of {pattern.size**2} entries are not zero by structure. It is not written out but summed over the points "
+        "from the slopes of the kernels, the same expressions at every point."
+    )
+    contents: list[Content] = [Paragraph(text)]
+    contents += [] if drawing is None else [drawing]
+    if numbers and start is not None:
+        contents.append(
+            Paragraph(f"Pointed at, an entry shows its number at the first guess of a step h = {start.h:g}.")
+        )
+    if derived is not None and pattern.size <= LARGEST_SHOWN:
+        entries = derived.jacobian.todok().items()
+        contents += formulas([Formula(value, Symbol(f"J_{i + 1}_{j + 1}")) for (i, j), value in entries], "entry")
+    if program.newton:
+        contents.append(
+            Paragraph(
+                f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations a "
+                f"coordinate, {program.unknowns} numbers. In the order chosen, coordinates that meet are at most "
+                f"{program.bandwidth} apart, and the matrix is the band that follows, or full if that is smaller."
+            )
+        )
+    else:
+        contents.append(Paragraph("The step is explicit, or solved by sweeps alone: the C has no Jacobian."))
+    return Section(name="jacobian", title="Jacobian", contents=tuple(contents))
+
+
+def entry_numbers(derived: StepEquations, start: Start) -> dict[tuple[int, int], float]:
+    """Entries by row and column at the first guess; those that need what is not known are left out."""
+    values: dict[Symbol, sympy.Expr] = {entry.symbol: sympy.Float(str(entry.value)) for entry in derived.entries}
+    values |= {parameter: sympy.Float(value) for parameter, value in derived.system.constants.items()}
+    values |= {derived.step: sympy.Float(start.h), derived.time: sympy.Float(start.t)}
+    q, p = derived.state
+    rates = [Symbol(f"{symbol.name.removesuffix('_k')}_dot_k") for symbol in q]
+    for symbols, given in ((q, start.q), (p, start.p), (rates, start.velocity)):
+        values |= dict(zip(symbols, map(sympy.Float, given), strict=True)) if given is not None else {}
+    named = {symbol.name: value for symbol, value in values.items()}
+    for unknown, guess in derived.initial_guess.items():
+        values[unknown] = guess.xreplace({s: named[s.name] for s in guess.free_symbols if s.name in named})
+    found = {place: entry.xreplace(values).evalf() for place, entry in derived.jacobian.todok().items()}
+    return {place: float(value) for place, value in found.items() if value.is_Float}
+
+
+def _titles(
+    derived: StepEquations, pattern: Pattern, numbers: Mapping[tuple[int, int], float]
+) -> dict[tuple[int, int], str]:
+    """What an entry is: the equation, the unknown by which it is differentiated, and the number if that is known."""
+    return {
+        (i, j): f"equation {i + 1} by {derived.unknowns[j]}" + (f": {numbers[i, j]:.6g}" if (i, j) in numbers else "")
+        for i, row in enumerate(pattern.rows)
+        for j in row
+    }
