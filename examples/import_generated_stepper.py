@@ -22,5 +22,5 @@ print(f"100000 steps, energy error {abs(run.energy() / run.energy()[0] - 1).max(
 model = sc.load_model(Path(__file__).with_name("pendulum.toml"))
 with tempfile.TemporaryDirectory() as folder:
     package = sc.generate_package(model, Path(folder) / "pendulum_svi")
-    print("generated:", *sorted(path.name for path in package.iterdir()))
+    print("generated:", *sorted(path.name for path in package.iterdir()), flush=True)
     subprocess.run([sys.executable, "-c", USE], cwd=folder, check=True)

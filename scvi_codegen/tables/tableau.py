@@ -195,6 +195,11 @@ def partner_matrix(A: Sequence[Sequence[Any]], b: Sequence[Any]) -> tuple[tuple[
     return tuple(tuple(b[j] - b[j] * A[j][i] / b[i] for j in span) for i in span)
 
 
+def _stages(s: Any) -> int:
+    """Refuse more stages than there may be before their points are computed."""
+    return checked_count(s, "the number of stages", 0, MOST_STAGES)
+
+
 @lru_cache(maxsize=None, typed=True)
 def gauss(s: int) -> Tableau:
     """Return the s-stage Gauss method: collocation on the Gauss-Legendre points; order 2s, symplectic, symmetric.
@@ -202,13 +207,13 @@ def gauss(s: int) -> Tableau:
     >>> gauss(1).order, gauss(3).order, gauss(3).is_symplectic
     (2, 6, True)
     """
-    return collocation_tableau(gauss_legendre(s).abscissae, f"gauss:{s}")
+    return collocation_tableau(gauss_legendre(_stages(s)).abscissae, f"gauss:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
 def radau_iia(s: int) -> Tableau:
     """Return the s-stage Radau IIA method: collocation on the right Radau points; order 2s - 1."""
-    return collocation_tableau(gauss_radau(s, "right").abscissae, f"radau-iia:{s}")
+    return collocation_tableau(gauss_radau(_stages(s), "right").abscissae, f"radau-iia:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
@@ -217,13 +222,13 @@ def radau_ia(s: int) -> Tableau:
 
     Not a collocation method (HW, section IV.5), but the symplectic partner of collocation on the same points.
     """
-    return symplectic_partner(collocation_tableau(gauss_radau(s, "left").abscissae), f"radau-ia:{s}")
+    return symplectic_partner(collocation_tableau(gauss_radau(_stages(s), "left").abscissae), f"radau-ia:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
 def lobatto_iiia(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIA method (s >= 2): collocation on the Lobatto points; order 2s - 2, symmetric."""
-    return collocation_tableau(gauss_lobatto(s).abscissae, f"lobatto-iiia:{s}")
+    return collocation_tableau(gauss_lobatto(_stages(s)).abscissae, f"lobatto-iiia:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
@@ -238,14 +243,14 @@ def lobatto_iiib(s: int) -> Tableau:
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_gauss(s: int) -> Tableau:
     """Return collocation on the s Chebyshev-Gauss points: symmetric, of order s for even s and s + 1 for odd s."""
-    s = checked_count(s, "the number of Chebyshev-Gauss stages", 1)
+    s = checked_count(s, "the number of Chebyshev-Gauss stages", 1, MOST_STAGES)
     return collocation_tableau([(1 + x) / 2 for x in chebyshev_gauss_points(s)], f"chebyshev-gauss:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(s: int) -> Tableau:
     """Return collocation on the s >= 2 Chebyshev-Lobatto points: symmetric, of order s (even s) or s + 1 (odd s)."""
-    s = checked_count(s, "the number of Chebyshev-Lobatto stages", 2)
+    s = checked_count(s, "the number of Chebyshev-Lobatto stages", 2, MOST_STAGES)
     return collocation_tableau([(1 + x) / 2 for x in chebyshev_lobatto_points(s)], f"chebyshev-lobatto:{s}")
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from itertools import pairwise
 
 import pytest
 import sympy
+from counting import at_most
 from sympy import Rational, Symbol, atan2, cos, exp, log, sin, sqrt
 
 from scvi_codegen.formulas.derivatives import gradient, hessian, jacobian
@@ -70,7 +70,6 @@ def test_an_unknown_node_is_refused_not_guessed() -> None:
 def test_a_long_lattice_is_quick_and_sparse() -> None:
     q = [Symbol(f"q{index}", real=True) for index in range(257)]
     energy = sympy.Add(*((b - a) ** 2 / 2 + (b - a) ** 4 / 4 for a, b in pairwise(q)))
-    start = time.perf_counter()
-    entries = hessian(energy, q)
-    assert time.perf_counter() - start < 5
+    with at_most(5_000_000):
+        entries = hessian(energy, q)
     assert len(entries) == 257 + 2 * 256

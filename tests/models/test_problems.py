@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 import sympy
+from counting import at_most
 from sympy import Symbol, cos, sin
 
 from scvi_codegen.errors import SystemDefinitionError
@@ -117,9 +116,8 @@ def test_outer_solar_system_is_newtons() -> None:
 
 def test_outer_solar_system_is_quick_to_define() -> None:
     sympy.core.cache.clear_cache()
-    start = time.perf_counter()
-    outer_solar_system()
-    assert time.perf_counter() - start < 1.5
+    with at_most(2_000_000):
+        outer_solar_system()
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -134,9 +132,8 @@ def test_chain_forces(n: int) -> None:
 
 
 def test_a_long_chain_is_quick_to_define() -> None:
-    start = time.perf_counter()
-    entry = problem("fput-chain:256")
-    assert time.perf_counter() - start < 5
+    with at_most(5_000_000):
+        entry = problem("fput-chain:256")
     assert entry.name == "fput-chain:256"
     assert entry.system.dimension == len(entry.q) == 256
 

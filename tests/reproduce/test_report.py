@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import multiprocessing
 import os
 import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -91,9 +91,8 @@ class TestRunner:
     def test_closing_it_ends_the_processes(self):
         outcomes = run_experiments(["table-9", "slow"], 2, module=TOYS)
         assert next(outcomes).name == "table-9"
-        began = time.perf_counter()
         outcomes.close()
-        assert time.perf_counter() - began < 10.0
+        assert multiprocessing.active_children() == []
 
 
 def an_svg(draw_on: Callable[[Axes], object]) -> str:
@@ -344,10 +343,8 @@ def test_ctrl_c_ends_everything_at_once_and_keeps_what_was_written(tmp_path):
     )
     assert child.stdout is not None
     assert child.stdout.readline().startswith("table-9")
-    began = time.perf_counter()
     interrupt_group(child)
-    output, errors = child.communicate(timeout=30.0)
-    assert time.perf_counter() - began < 10.0
+    output, errors = child.communicate(timeout=300.0)  # by itself it would take twice as long
     assert output == "interrupted ['table-9.txt']\n"
     assert "Traceback" not in errors
     assert (tmp_path / "made" / "table-9.txt").is_file()

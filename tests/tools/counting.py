@@ -1,0 +1,32 @@
+"""Work bounded by a number of function calls: the same on a quick, a slow and a busy machine, unlike seconds."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["TooMuchWorkError", "at_most"]
+
+
+class TooMuchWorkError(BaseException):
+    """Not an ``Exception``, so that nothing under test mistakes it for one of its own."""
+
+
+@contextmanager
+def at_most(calls: int) -> Iterator[None]:
+    """Raise :class:`TooMuchWorkError` where more functions, of Python or C, are called."""
+    count = 0
+
+    def look(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+        if count > calls:
+            raise TooMuchWorkError(f"more than {calls} function calls")
+
+    sys.setprofile(look)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
