@@ -143,4 +143,5 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
         q=np.concatenate([first.q, *(piece.q[1:] for piece in rest)]),
         p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
         iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
+        lengths=np.concatenate([first.lengths, *(piece.lengths[1:] for piece in rest)]),
     )

@@ -25,8 +25,9 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.times import times_after
 
-__all__ = ["checked_times", "grid_tolerance", "states_at", "times_of_run"]
+__all__ = ["checked_times", "grid_tolerance", "lengths_at", "states_at", "times_of_run"]
 
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0
@@ -45,14 +46,15 @@ def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
     forward = math.copysign(1.0, states.h)
     left = np.searchsorted(forward * states.t, forward * times, side="right") - 1
     t, q, p = states.t[left], states.q[left], states.p[left]
-    whole = _whole_steps(times - t, states.h)
+    lengths = states.lengths[left]
+    whole = _whole_steps(times - t, np.nan_to_num(lengths, nan=states.h))
     between = np.flatnonzero(whole)
     _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
     _take_parts(states, t, times - t, q, p)
     return q, p
 
 
-def _whole_steps(spans: Array, h: float) -> NDArray[np.int64]:
+def _whole_steps(spans: Array, h: Array) -> NDArray[np.int64]:
     """Steps of h that fit into spans; one that only rounding makes too long fits."""
     ratio = spans / h
     nearest = np.rint(ratio)
@@ -75,7 +77,13 @@ def _take_whole_steps(
         if run is None or left[k] != kept:
             kept = left[k]
             run = Memory.started(
-                states.stepper, q[k], p[k], h=states.h, t=t[k], parameters=states.parameters, options=states.options
+                states.stepper,
+                q[k],
+                p[k],
+                h=states.lengths[kept],
+                t=t[k],
+                parameters=states.parameters,
+                options=states.options,
             )
         run.skip(int(whole[k]) - run.steps)
         t[k], q[k], p[k] = run.t, run.q, run.p
@@ -113,7 +121,7 @@ def times_of_run(t_eval: ArrayLike, t: float, h: float, steps: int) -> Array:
         raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
     if (np.diff(times) * h < 0.0).any():
         raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
-    return _within(times, t, t + steps * h)
+    return _within(times, t, float(times_after(t, h, steps)[0]))
 
 
 def _within(times: Array, first: float, last: float) -> Array:
@@ -126,17 +134,27 @@ def _within(times: Array, first: float, last: float) -> Array:
     return np.clip(times, low, high)
 
 
-def grid_tolerance(states: KeptStates) -> float:
-    """By how much of a step a kept state may seem to be off the grid of steps: times are rounded."""
-    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.t).max() / abs(states.h)
-    return float(max(ON_GRID, rounding))
+def grid_tolerance(states: KeptStates) -> Array:
+    """(n,) by how much a state may seem to be off the end of a step: times are rounded."""
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.t).max()
+    tolerance: Array = np.fmax(ON_GRID * np.abs(states.lengths), rounding)
+    return tolerance
+
+
+def lengths_at(states: KeptStates, times: Array) -> Array:
+    """(n,) of the steps that follow at times, not numbers where these are between two steps."""
+    forward = math.copysign(1.0, states.h)
+    before = np.searchsorted(forward * states.t, forward * times, side="right") - 1
+    after = np.minimum(before + 1, len(states) - 1)
+    nearest = np.where(np.abs(states.t[after] - times) < np.abs(times - states.t[before]), after, before)
+    off = np.abs(times - states.t[nearest]) > grid_tolerance(states)[nearest]
+    return np.where(off, np.nan, states.lengths[nearest])
 
 
 def _check_on_grid(states: KeptStates) -> None:
     """All states but the last, which an event may have ended, stand at whole steps from the first."""
-    steps = (states.t[:-1] - states.t[0]) / states.h
-    if np.abs(steps - np.round(steps)).max(initial=0.0) > grid_tolerance(states):
+    if np.isnan(states.lengths[:-1]).any():
         raise StateError(
-            "the states of this states do not stand at whole steps (it was made with t_eval): "
+            "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
             "integrate without t_eval, then ask for states between"
         )

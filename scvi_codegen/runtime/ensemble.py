@@ -29,6 +29,7 @@ from scvi_codegen.runtime.inputs import Array, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import record_states
+from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Ensemble", "integrate_ensemble"]
@@ -141,7 +142,7 @@ class Ensemble:
         unfinished = (self.status == OK) & (self.done < self.steps)
         number = self.every * np.arange(len(self.q), dtype=np.float64)
         return EnsembleTrajectory(
-            t=self.t0 + number * self.h,
+            t=times_after(self.t0, self.h, number)[0],
             q=self.q,
             p=self.p,
             status=np.where(unfinished, INTERRUPTED, self.status),
@@ -253,7 +254,9 @@ class _Alone:
         except StateError:  # a sum of finite terms that overflowed
             work.status[j] = "not finite"
         else:
-            run.resume_at(step, carries)
+            if carries is not None:
+                high, low = times_after(work.t0, work.h, step)
+                run.resume_at(step, (float(high), float(low)), carries)
             self.run = run
 
     def advance_to(self, step: int) -> None:

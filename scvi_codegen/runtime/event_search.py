@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ class EventSearch:
             EventError: where a function is not finite.
             StepFailedError: if a step of a part of h fails.
         """
-        t, q, p = (np.ascontiguousarray(array) for array in (part.t, part.q, part.p))
+        h, t, q, p = map(np.ascontiguousarray, (part.lengths, part.t, part.q, part.p))
         parameters, options = self.binding.pointer(part.parameters), self.binding.options(part.options)
         workspace, report = self.binding.workspace(), self.binding.new("report *")
         filled = self.binding.number("long long *")
@@ -67,7 +68,7 @@ class EventSearch:
             status = self.binding.function("crossings")(
                 self.watch,
                 len(t) - done,
-                part.h,
+                self.binding.pointer(h[done:]),
                 self.binding.pointer(t[done:]),
                 self.binding.pointer(q[done:]),
                 self.binding.pointer(p[done:]),
@@ -83,18 +84,18 @@ class EventSearch:
             self.found.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
             done += int(report.steps)
             if status:
-                raise self._failure(status, report, first + done, part)
+                raise self._failure(status, report, first + done, float(h[done]))
             if self.ended:
                 return done - 1
             if done == len(t) - 1:
                 return done
             self._room *= 2
 
-    def _failure(self, status: int, report: Any, step: int, part: KeptStates) -> Exception:
+    def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
         if self.watch.undefined:
             function = self.stepper.events[self.watch.undefined - 1].function
             return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
-        return step_failure(status, report, step=step, h=part.h)
+        return step_failure(status, report, step=step, h=h)
 
     def crossings(self) -> tuple[Crossings, ...]:
         """What was found, by event."""
@@ -113,31 +114,15 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
         StateError: if states between were not kept.
         EventError, StepFailedError: as :meth:`EventSearch.search`.
     """
-    lengths = np.diff(states.t) / states.h
-    tolerance = grid_tolerance(states)
-    whole = np.abs(lengths - 1.0) <= tolerance
-    if not whole[:-1].all() or (lengths > 1.0 + tolerance).any():
+    lengths, spans, tolerance = states.lengths.copy(), np.diff(states.t), grid_tolerance(states)[:-1]
+    short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
+    if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
         raise StateError(
             "events are looked for between consecutive steps, but this trajectory was kept with every > 1 or t_eval"
         )
+    lengths[:-1][short] = spans[short]  # an event ended the last step
     search = EventSearch(stepper)
     for number in range(len(stepper.events)):
         search.watch.remaining[number] = 0
-    steps = int(whole.sum())
-    search.search(_part(states, slice(steps + 1), states.h))
-    if steps < len(whole):  # an event ended the last step
-        search.search(_part(states, slice(steps, None), float(states.t[-1] - states.t[-2])))
+    search.search(replace(states, lengths=lengths))
     return search.crossings()
-
-
-def _part(states: KeptStates, numbers: slice, h: float) -> KeptStates:
-    """Some of the states, with steps of h."""
-    return KeptStates(
-        t=states.t[numbers],
-        q=states.q[numbers],
-        p=states.p[numbers],
-        h=h,
-        parameters=states.parameters,
-        stepper=states.stepper,
-        options=states.options,
-    )

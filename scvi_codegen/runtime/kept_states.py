@@ -17,11 +17,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeptStates:
-    """What states between these, and crossings, are found from; fields as of :class:`Trajectory`."""
+    """What states between these, and crossings, are found from; other fields as of :class:`Trajectory`.
+
+    Attributes:
+        lengths: (n,) of the step that follows each state, not a number for a state between two steps.
+    """
 
     t: Array
     q: Array
     p: Array
+    lengths: Array
     h: float
     parameters: Array
     stepper: Integrator = field(repr=False)

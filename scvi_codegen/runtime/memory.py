@@ -84,8 +84,8 @@ class Memory:
 
     @property
     def t(self) -> float:
-        """Time t0 + step h."""
-        return float(self._memory.t0 + self._memory.step * self._memory.h)
+        """Time, as carried along: the sum of all steps, rounded."""
+        return _time(self._memory)
 
     @property
     def steps(self) -> int:
@@ -102,12 +102,12 @@ class Memory:
         """(m,) momenta."""
         return np.array(list(self._memory.p))
 
-    def resume_at(self, steps: int, carries: tuple[Array, Array] | None = None) -> None:
-        """Count from ``steps`` done, with what rounding had cut off q and p: how a run made elsewhere goes on here."""
+    def resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
+        """How a run made elsewhere goes on here: after ``steps``, at a time, with what rounding cut off it, q and p."""
         self._memory.step = steps
-        if carries is not None:
-            for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
-                self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
+        self._memory.t, self._memory.t_low = time
+        for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
+            self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
 
     def save(self) -> bytes:
         """All of it, for :meth:`Stepper.restore` on the same kind of machine."""
@@ -151,9 +151,14 @@ class Memory:
         return status, report
 
 
+def _time(memory: Any) -> float:
+    """Of a run; version 0.1, whose text recorded runs may have, carried the start and the number of steps."""
+    return float(memory.t if hasattr(memory, "t") else memory.t0 + memory.step * memory.h)
+
+
 def _check_memory(memory: Any) -> None:
     """Raise :class:`StateError` for bytes that no run has."""
-    numbers = [memory.t0, memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
+    numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
     counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
     sound = np.isfinite(numbers).all() and memory.h != 0.0 and all(0 <= count < 2**53 for count in counts.values())
     if not sound or memory.guess > 2:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import checked_count
-from scvi_codegen.runtime.dense_output import states_at
+from scvi_codegen.runtime.dense_output import lengths_at, states_at
 from scvi_codegen.runtime.event_search import EventSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import SLICE_SECONDS, record_states, trajectory_of
@@ -40,7 +40,7 @@ class Observation:
     def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None) -> None:
         self.run, self.every, self.times = run, checked_count(every, "every", least=1), times
         self.search = EventSearch(run.stepper) if run.stepper.events else None
-        self.states: list[tuple[Array, Array, Array, NDArray[np.int64]]] = []
+        self.states: list[tuple[Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations = 0
 
     def advance(self, steps: int, progress: Callable[[int], None] | None = None) -> Trajectory:
@@ -95,6 +95,7 @@ class Observation:
             np.concatenate([part.q, last["q"]]),
             np.concatenate([part.p, last["p"]]),
             np.append(part.iterations, np.int32(0)),
+            np.append(part.lengths, np.nan),
         )
 
     def _keep(self, part: Trajectory, *, first: bool = False) -> None:
@@ -109,7 +110,7 @@ class Observation:
         wanted = number % self.every == 0
         wanted[0] = first
         wanted[-1] |= ended
-        self.states.append((part.t[wanted], part.q[wanted], part.p[wanted], total[wanted]))
+        self.states.append((part.t[wanted], part.q[wanted], part.p[wanted], part.lengths[wanted], total[wanted]))
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
         assert self.times is not None
@@ -119,13 +120,13 @@ class Observation:
         times = self.times[after & (forward * self.times <= right)]
         q, p = states_at(part, times)
         behind = np.searchsorted(forward * part.t, forward * times, side="right") - 1
-        self.states.append((times, q, p, total[behind]))
+        self.states.append((times, q, p, lengths_at(part, times), total[behind]))
 
     def trajectory(self) -> Trajectory:
         """All that was kept so far."""
-        t, q, p, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
-        return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32))
+        t, q, p, lengths, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
+        return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32), lengths)
 
-    def _made(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]) -> Trajectory:
+    def _made(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], lengths: Array) -> Trajectory:
         crossings = self.search.crossings() if self.search is not None else ()
-        return trajectory_of(self.run, t, q, p, iterations, events=crossings)
+        return trajectory_of(self.run, t, q, p, iterations, lengths=lengths, events=crossings)

@@ -55,14 +55,22 @@ def record_states(
 
 
 def trajectory_of(
-    memory: Memory, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], events: tuple[Crossings, ...] = ()
+    memory: Memory,
+    t: Array,
+    q: Array,
+    p: Array,
+    iterations: NDArray[np.int32],
+    *,
+    lengths: Array | None = None,
+    events: tuple[Crossings, ...] = (),
 ) -> Trajectory:
-    """These states as states of this integration."""
+    """These states as states of this integration, each before a step of h if no lengths are given."""
     return Trajectory(
         t=t,
         q=q,
         p=p,
         iterations=iterations,
+        lengths=np.broadcast_to(memory.h, t.shape) if lengths is None else lengths,
         h=memory.h,
         parameters=memory.parameters,
         stepper=memory.stepper,

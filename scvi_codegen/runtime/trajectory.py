@@ -39,6 +39,8 @@ class Trajectory(KeptStates):
         p: (n, m) momenta.
         iterations: (n,) Newton iterations since the state before, 0 for the first.
         h: step size (negative: backward).
+        lengths: (n,) of the step that follows each state, h for steps that are all the same; not a number for a state
+            between two steps, of ``t_eval`` or where an event ended the run.
         parameters: (k,) values in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
         options: convergence of the stage equations, ``None`` for the defaults.

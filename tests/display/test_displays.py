@@ -138,6 +138,7 @@ class TestTrajectory:
             p=run.p,
             iterations=run.iterations,
             h=run.h,
+            lengths=run.lengths,
             parameters=run.parameters,
             stepper=run.stepper,
         )

@@ -136,8 +136,8 @@ MUTATIONS = (
     text(
         "a run one step ahead in time",
         case("driven/svi"),
-        r"step\.t = run->t0 \+ \(double\)run->step",
-        "step.t = run->t0 + (double)(run->step + 1)",
+        r"step\.t = run->t;",
+        "step.t = run->t + run->h;",
     ),
     text("L added in the energy", case("driven/svi"), r"sum = -value\[0\];", "sum = value[0];"),
     text(

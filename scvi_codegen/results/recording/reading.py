@@ -176,6 +176,7 @@ class RecordedRun:
             q=q,
             p=p,
             iterations=iterations,
+            lengths=np.broadcast_to(self.manifest.h, t.shape),
             h=self.manifest.h,
             parameters=np.array(self.manifest.parameters),
             stepper=self.stepper,

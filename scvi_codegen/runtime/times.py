@@ -1,0 +1,36 @@
+"""Times in two pieces, as runs carry them: t + n h, rounded, and what rounding cut off."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.runtime.inputs import Array
+
+__all__ = ["times_after"]
+
+SPLITTER = 2.0**27 + 1.0
+"""Times a number of 53 bits, it splits off the upper 26 (Dekker 1971)."""
+
+
+def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
+    """T + n h after each number n < 2^53 of steps: rounded correctly but for near ties, and the rest."""
+    mantissa, exponent = math.frexp(h)
+    numbers = np.asarray(steps, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        high, low = (np.ldexp(piece, exponent) for piece in _product(numbers, mantissa))
+        total = t + high
+        part = total - t
+        rest = ((t - (total - part)) + (high - part)) + low
+        time = total + rest
+        return time, rest - (time - total)
+
+
+def _product(x: Array, y: float) -> tuple[Array, Array]:
+    """X y in two pieces, without error (Dekker's product)."""
+    product = x * y
+    x_high, y_high = SPLITTER * x - (SPLITTER * x - x), SPLITTER * y - (SPLITTER * y - y)
+    x_low, y_low = x - x_high, y - y_high
+    return product, ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low

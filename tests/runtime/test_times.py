@@ -1,0 +1,73 @@
+"""Time is carried along: t + n h to the last bit, by runs, ensembles and the arithmetic beside them."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.times import times_after
+
+GRIDS = [(0.0, 0.1), (1e6, 0.1), (-3.7, 1e-3), (0.3, -0.7), (1e-3, 2.0**-20), (1e16, 3.0), (5.0, 1e-17)]
+
+
+@pytest.fixture(scope="module")
+def free() -> Stepper:
+    system = LagrangianSystem.from_text(name="free fall", coordinates=["q"], lagrangian="q_dot**2/2 - q")
+    return compile_stepper(system, SVI(2), flags=PORTABLE_FLAGS)
+
+
+def in_last_places(time: float, t: float, h: float, n: int) -> float:
+    """How far a time is from t + n h, in units of its last place."""
+    return float(abs(Fraction(time) - (Fraction(t) + n * Fraction(h))) / Fraction(math.ulp(time)))
+
+
+@pytest.mark.parametrize(("t", "h"), GRIDS)
+def test_the_time_of_a_run_is_the_sum_of_its_steps_rounded(free, t, h):
+    run = free.integrate([0.0], [0.0], h=h, steps=3_000, t=t)
+    assert max(in_last_places(float(time), t, h, n) for n, time in enumerate(run.t)) <= 0.5 + 1e-9
+
+
+def test_it_still_is_after_a_million_steps(free):
+    run = free.start([0.0], [0.0], h=0.1, t=0.7)
+    run.skip(1_000_000)
+    assert in_last_places(run.t, 0.7, 0.1, 1_000_000) <= 0.5 + 1e-9
+
+
+@pytest.mark.parametrize(("t", "h"), GRIDS)
+def test_times_after_are_rounded_and_leave_the_rest(t, h):
+    numbers = np.array([0, 1, 2, 3, 1000, 10**9 + 7, 2**53 - 1])
+    for n, high, low in zip(numbers.tolist(), *times_after(t, h, numbers), strict=True):
+        assert in_last_places(high, t, h, n) <= 0.5 + 1e-9
+        wrong = abs(Fraction(high) + Fraction(low) - Fraction(t) - n * Fraction(h))
+        assert wrong <= Fraction(math.ulp(high)) / 2**50
+
+
+def test_runs_and_ensembles_have_the_same_times(free):
+    run = free.integrate([0.1], [0.0], h=0.1, steps=500, t=0.3)
+    assert np.array_equal(free.integrate_ensemble([[0.1]], [[0.0]], h=0.1, steps=500, t=0.3).t, run.t)
+
+
+def test_a_run_restored_has_the_time_it_had(free):
+    run = free.start([0.1], [0.0], h=0.1, t=0.3)
+    run.skip(1234)
+    again = free.restore(run.save())
+    for each in (run, again):
+        each.skip(777)
+    assert again.t == run.t
+
+
+def test_states_know_the_step_that_follows(free):
+    run = free.integrate([0.1], [0.0], h=0.25, steps=8, every=2)
+    assert run.lengths.tolist() == [0.25] * 5
+    between = free.integrate([0.1], [0.0], h=0.25, steps=8, t_eval=[0.0, 0.3, 0.5])
+    assert np.array_equal(between.lengths, [0.25, np.nan, 0.25], equal_nan=True)
+    ended = free.integrate([0.1], [0.0], h=0.25, steps=8, events="q")
+    assert ended.lengths[-1] == 0.25
