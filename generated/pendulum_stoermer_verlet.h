@@ -46,11 +46,11 @@ typedef struct {
   double t;             /* start of the last step tried */
 } pendulum_stoermer_verlet_report;
 
-/* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. The carries hold what rounding cut
- * off q and p; what is remembered of the stages of the last step is extrapolated to guess the next. */
+/* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
+ * rounding cut off t, q and p; what is remembered of the stages of the last step is extrapolated to guess the next. */
 typedef struct {
-  double t0, h;
-  long long step; /* completed; the time is t0 + step h */
+  double t, t_low, h;
+  long long step; /* completed */
   double q[1], p[1];
   double carry_q[1], carry_p[1];
   double memory[1];

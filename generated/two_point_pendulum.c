@@ -1014,7 +1014,7 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
 void two_point_pendulum_start(two_point_pendulum_run *run, double t, double h, const double *q, const double *p)
 {
   memset(run, 0, sizeof *run);
-  run->t0 = t;
+  run->t = t;
   run->h = h;
   memcpy(run->q, q, sizeof(double) * M);
   memcpy(run->p, p, sizeof(double) * M);
@@ -1052,13 +1052,22 @@ static void add_compensated(double *x, double *carry, const double *increment)
   }
 }
 
+/* t + t_low += h, in twice the precision: after any number of steps t is their exact sum, rounded. */
+static void add_to_time(double *t, double *t_low, double h)
+{
+  const double sum = *t + h, part = sum - *t;
+  const double rest = ((*t - (sum - part)) + (h - part)) + *t_low;
+  *t = sum + rest;
+  *t_low = rest - (*t - sum);
+}
+
 int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, long long every, const double *parameters,
     const two_point_pendulum_options *options, double *t, double *q, double *p, int *iterations,
     two_point_pendulum_report *report, double *workspace)
 {
   const two_point_pendulum_options standard = two_point_pendulum_default_options();
   state now;
-  step_data step = {run->t0, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1};
+  step_data step = {run->t, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1};
   two_point_pendulum_report unread;
   solver_data data;
   long long stored = 0;
@@ -1071,7 +1080,7 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     const long long before = report->iterations;
     int status;
     step.first = k == 0;
-    report->t = step.t = run->t0 + (double)run->step * run->h;
+    report->t = step.t = run->t;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
     if (status == TWO_POINT_PENDULUM_OK && (!reaches(now.q, dq) || !reaches(now.p, dp)))
@@ -1084,9 +1093,10 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
     add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;
     run->step++;
+    add_to_time(&run->t, &run->t_low, run->h);
     report->steps++;
     if (run->step % every == 0) {
-      t[stored] = run->t0 + (double)run->step * run->h;
+      t[stored] = run->t;
       memcpy(q + stored * M, now.q, sizeof(double) * M);
       memcpy(p + stored * M, now.p, sizeof(double) * M);
       iterations[stored] = (int)run->iterations;

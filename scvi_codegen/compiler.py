@@ -32,6 +32,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.events import with_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
@@ -89,6 +90,8 @@ def compile_stepper(
         return program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
 
     def texts() -> str:
+        with waiting_for(f"deriving the equations of {system.name} by {method.name}"):
+            program()
         return json.dumps([render(program()).to_json(), describe(program(), system, method).to_json()])
 
     @cache

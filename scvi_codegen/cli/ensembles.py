@@ -72,6 +72,7 @@ def integrate_states(
         parameters=states.parameters,
         options=options,
     )
+    work.blocks()  # compiles, while Ctrl-C still ends it
     started, shown, interrupted = time.perf_counter(), 0, False
     with interruptions() as caught, progress_bar(model.step_count) as advance:
 

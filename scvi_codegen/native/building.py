@@ -38,6 +38,8 @@ from scvi_codegen.files.cache import (
     touch,
     trusted_folder,
 )
+from scvi_codegen.native.processes import run_to_end
+from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.source import Source
 
 __all__ = [
@@ -60,6 +62,7 @@ PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
 COMPILE_SECONDS = 600
+NOT_RUN = (126, 127)
 ATTEMPTS = 3
 """To load what another process may remove at any time."""
 _loaded: dict[str, ModuleType] = {}
@@ -232,7 +235,8 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     with tempfile.TemporaryDirectory(prefix=".building-", dir=entry.parent, ignore_cleanup_errors=True) as folder:
         built = Path(folder) / entry.name
         built.mkdir(mode=0o755)
-        _compile(source, compiler, flags, built)
+        with waiting_for(_work(source, compiler, flags)):
+            _compile(source, compiler, flags, built)
         checksum = hashlib.sha256(_library(built).read_bytes()).hexdigest()
         (built / "manifest.json").write_text(json.dumps({"sha256": checksum, "prefix": source.prefix}))
         for file in built.iterdir():
@@ -245,6 +249,12 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
             discard(entry)
             built.replace(entry)
     make_room(entry.parent, entry)
+
+
+def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
+    level = [flag for flag in flags if flag.startswith("-O")]
+    command = " ".join([Path(compiler[0]).name, *compiler[1:], *level])
+    return f"compiling {source.code.count(chr(10)):,} lines of C with {command}"
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
@@ -288,13 +298,11 @@ def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
 
 def _run(command: list[str], folder: Path) -> None:
     try:
-        result = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False
-        )
+        result = run_to_end(command, folder, COMPILE_SECONDS)
     except subprocess.TimeoutExpired as error:
         raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
-    except FileNotFoundError as error:
-        raise BuildError(f"the compiler {command[0]!r} does not run: {error}") from error
+    if result.returncode in NOT_RUN:
+        raise BuildError(f"the compiler {command[0]!r} does not run: {result.stderr.strip()}")
     if result.returncode:
         hint = _header_hint(result.stderr)
         shown = "\n".join(result.stderr.splitlines()[:30])

@@ -101,7 +101,7 @@ class Ensemble:
         Afterwards, also after an exception, :meth:`result` holds what was computed.
         """
         workers = checked_count(threads or os.cpu_count() or 1, "threads", least=1)
-        make, width = self._blocks()
+        make, width = self.blocks()
         firsts = range(0, self.count, width)
         reached, stop = np.zeros(len(firsts)), threading.Event()
 
@@ -128,8 +128,8 @@ class Ensemble:
                 stop.set()
                 pool.shutdown(cancel_futures=True)
 
-    def _blocks(self) -> tuple[Callable[[int], _LaneBlock | _SingleBlock], int]:
-        """How to make the block that begins with a trajectory, and how many trajectories it holds."""
+    def blocks(self) -> tuple[Callable[[int], _LaneBlock | _SingleBlock], int]:
+        """How to make the block that begins with a trajectory, compiled, and how many trajectories it holds."""
         source = self.stepper.ensemble
         if source is None:
             return lambda first: _SingleBlock(self, first), 1

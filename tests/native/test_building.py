@@ -51,16 +51,15 @@ def entries(cache: Path) -> list[Path]:
 
 
 def compiler_runs(monkeypatch) -> list[list[str]]:
-    """A growing list of the commands run from now on, except questions for a version."""
+    """A growing list of the commands run from now on."""
     commands: list[list[str]] = []
-    run = subprocess.run
+    run = building.run_to_end
 
-    def recorded(command, *args, **kwargs):
-        if "--version" not in command:
-            commands.append(command)
-        return run(command, *args, **kwargs)
+    def recorded(command, folder, seconds):
+        commands.append(command)
+        return run(command, folder, seconds)
 
-    monkeypatch.setattr(building.subprocess, "run", recorded)
+    monkeypatch.setattr(building, "run_to_end", recorded)
     return commands
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 
 import scvi_codegen as sc
@@ -35,6 +37,19 @@ def test_what_was_derived_is_not_derived_again(made):
     first, second = (sc.compile_stepper(spring(), sc.SVI(2)) for _ in range(2))
     assert len(made) == 1
     assert (first.source, first.interface, first.ensemble) == (second.source, second.interface, second.ensemble)
+
+
+def test_the_text_of_an_ensemble_is_made_when_it_is_asked_for_and_then_kept(made, tmp_path, monkeypatch):
+    written: list[str] = []
+    render = compiler.render_ensemble
+    monkeypatch.setattr(compiler, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
+    stepper = sc.compile_stepper(spring(), sc.SVI(2))
+    stepper.integrate([1.0], [0.0], h=0.1, steps=3)
+    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 1)
+    kept = pickle.loads(pickle.dumps(stepper))
+    assert kept.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
+    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 2)
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize(

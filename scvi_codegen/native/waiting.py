@@ -1,0 +1,44 @@
+"""Work that may take long says what it is, once it has."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+__all__ = ["told_to", "waiting_for"]
+
+PATIENCE_SECONDS = 2.0
+
+
+def _tell_the_terminal(what: str) -> None:
+    """A line on stderr where a person sees it."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        print(f"scvi-codegen: {what} ...", file=sys.stderr, flush=True)
+
+
+_listener: ContextVar[Callable[[str], None]] = ContextVar("listener", default=_tell_the_terminal)
+
+
+@contextmanager
+def waiting_for(what: str) -> Iterator[None]:
+    """Say what is being done if it takes longer than two seconds."""
+    timer = threading.Timer(PATIENCE_SECONDS, _listener.get(), [what])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def told_to(listener: Callable[[str], None]) -> Iterator[None]:
+    """Have it said to a function, from a thread of its own, instead of on a terminal's stderr."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)

@@ -1,0 +1,121 @@
+"""A compiler that takes long is spoken of, and ends with what waits for it, however that ends."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from scvi_codegen.errors import BuildError
+from scvi_codegen.native import building, waiting
+from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.native.processes import run_to_end
+from scvi_codegen.rendering.source import Source
+
+SLOW_COMPILER = """#!/bin/sh
+sleep 60 &
+echo $! > {folder}/child
+wait
+"""
+"""As gcc, whose work another process does."""
+
+COMPILING = """
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+building.load(Source(prefix="tiny", header="", code="", declarations=""))
+"""
+
+
+@pytest.fixture
+def slow_compiler(tmp_path, monkeypatch) -> Path:
+    """Two words, so that it is asked for no version."""
+    script = tmp_path / "slow-cc"
+    script.write_text(SLOW_COMPILER.format(folder=tmp_path))
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
+    return script
+
+
+def child_of(script: Path) -> int:
+    """The process that the compiler started, once it has."""
+    file, until = script.parent / "child", time.monotonic() + 30
+    while not (file.exists() and file.read_text().strip()):
+        assert time.monotonic() < until, "the compiler was not started"
+        time.sleep(0.02)
+    return int(file.read_text())
+
+
+def is_gone(pid: int) -> bool:
+    """Whether a process ends within moments; one that nobody has reaped has ended."""
+    until = time.monotonic() + 10
+    while time.monotonic() < until:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except FileNotFoundError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
+
+
+@needs_proc
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+def test_what_ends_python_ends_the_compiler_and_its_children(slow_compiler, number):
+    process = subprocess.Popen([sys.executable, "-c", COMPILING], stderr=subprocess.PIPE)
+    child = child_of(slow_compiler)
+    os.kill(process.pid, number)
+    process.communicate(timeout=30)
+    assert process.returncode == -number
+    assert is_gone(child)
+
+
+@needs_proc
+def test_a_compiler_that_takes_too_long_is_ended(slow_compiler, monkeypatch):
+    monkeypatch.setattr(building, "COMPILE_SECONDS", 1)
+    with pytest.raises(BuildError, match="took longer than 1 s"):
+        building.load(Source(prefix="tiny", header="", code="", declarations=""))
+    assert is_gone(child_of(slow_compiler))
+
+
+def test_output_status_and_temporary_files_are_those_of_the_program(tmp_path):
+    result = run_to_end(["sh", "-c", 'echo "$TMPDIR"; echo no >&2; exit 3', "name"], tmp_path, 10)
+    assert (result.stdout, result.stderr, result.returncode) == (f"{tmp_path}\n", "no\n", 3)
+
+
+def told(monkeypatch, seconds: float, patience: float) -> list[str]:
+    """What is said while something takes so many seconds."""
+    monkeypatch.setattr(waiting, "PATIENCE_SECONDS", patience)
+    said: list[str] = []
+    with waiting.told_to(said.append), waiting.waiting_for("deriving"):
+        time.sleep(seconds)
+    return said
+
+
+def test_work_that_takes_long_is_spoken_of_and_other_is_not(monkeypatch):
+    assert told(monkeypatch, 0.3, 0.05) == ["deriving"]
+    assert told(monkeypatch, 0.0, 0.5) == []
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("stream", "shown"), [(Terminal(), "scvi-codegen: {} ...\n"), (io.StringIO(), "")])
+def test_compiling_is_spoken_of_on_a_terminal_alone(slow_compiler, monkeypatch, stream, shown):
+    monkeypatch.setattr(building, "COMPILE_SECONDS", 0.5)
+    monkeypatch.setattr(waiting, "PATIENCE_SECONDS", 0.05)
+    monkeypatch.setattr(sys, "stderr", stream)
+    with pytest.raises(BuildError):
+        building.load(Source(prefix="tiny", header="", code="\n" * 1234, declarations=""), flags=PORTABLE_FLAGS)
+    assert stream.getvalue() == shown.format("compiling 1,234 lines of C with slow-cc -O2")
