@@ -38,7 +38,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.start_up import run_start_up
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
@@ -46,7 +46,7 @@ __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"
 SCHEMA = 2
 """Version of the JSON."""
 
-SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | Table]] = {
+SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     **{name: partial(run_case, name) for name in CASES},
     **{f"ensemble:{name}": partial(run_ensemble, name) for name in ENSEMBLES},
     "drift": run_drift,
@@ -69,7 +69,7 @@ class Report:
     """
 
     machine: Mapping[str, Any]
-    results: tuple[CaseResult | Table, ...]
+    results: tuple[CaseResult | ResultTable, ...]
     interrupted: str = ""
 
     @property
@@ -88,7 +88,7 @@ class Report:
             "schema": SCHEMA,
             "machine": dict(self.machine),
             "cases": [result.data() for result in self.cases],
-            "tables": [result.data() for result in self.results if isinstance(result, Table)],
+            "tables": [result.data() for result in self.results if isinstance(result, ResultTable)],
             "interrupted": self.interrupted,
         }
 
@@ -130,12 +130,12 @@ def benchmark(
 
 def _measured(names: Sequence[str], plan: Plan, say: Say) -> Report:
     description = machine()
-    results: list[CaseResult | Table] = []
+    results: list[CaseResult | ResultTable] = []
     for name in names:
         try:
             results.append(SECTIONS[name](plan, say))
         except KeyboardInterrupt:
             return Report(machine=description, results=tuple(results), interrupted=name)
         except ScviCodegenError as error:
-            results.append(Table(name=name, title=f"failed: {error}", columns={}, rows=()))
+            results.append(ResultTable(name=name, title=f"failed: {error}", columns={}, rows=()))
     return Report(machine=description, results=tuple(results))

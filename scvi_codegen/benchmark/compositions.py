@@ -19,7 +19,7 @@ from scvi_codegen.benchmark.contenders.ours import momenta_of
 from scvi_codegen.benchmark.curves import Point, time_at
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import StoermerVerlet
@@ -44,7 +44,7 @@ RESOLVED = 1e-2
 REPEATS = 3
 
 
-def run_compositions(plan: Plan, say: Say) -> Table:
+def run_compositions(plan: Plan, say: Say) -> ResultTable:
     """Milliseconds of a trajectory for each error, and who is fastest."""
     rows = []
     for name in COMPARED:
@@ -55,7 +55,7 @@ def run_compositions(plan: Plan, say: Say) -> Table:
             say(f"compositions: {name}, {method.name}")
             curves[method.name] = _curve(chosen, method, LONGEST * plan.share)
         rows += [_row(chosen, error, curves) for error in ERRORS]
-    return Table(
+    return ResultTable(
         name="compositions",
         title="milliseconds of a trajectory at equal error",
         columns={"case": "", "span": "g", "error": ".0e"} | {method.name: "" for method in METHODS} | {"fastest": ""},

@@ -11,7 +11,7 @@ import numpy as np
 from scvi_codegen.benchmark.cases import Array, Case, case
 from scvi_codegen.benchmark.contenders.taylor import heyoka_states
 from scvi_codegen.benchmark.plan import Plan, Say
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.runtime.stepper import Stepper
@@ -26,7 +26,7 @@ SAMPLES = 2000
 BLOCKS = 20
 
 
-def run_drift(plan: Plan, say: Say) -> Table:
+def run_drift(plan: Plan, say: Say) -> ResultTable:
     """All cases at all step sizes, SVI(8) and heyoka at its default tolerance."""
     steps = QUICK_STEPS if plan.quick else STEPS
     with_heyoka = "heyoka" in plan.peers and importlib.util.find_spec("heyoka") is not None
@@ -36,7 +36,7 @@ def run_drift(plan: Plan, say: Say) -> Table:
             say(f"drift: {name}, h = {h:g}, {steps} steps")
             rows += drift_rows(case(name), h, steps, with_heyoka=with_heyoka)
     formats = {"case": "", "method": "", "h": "g", "span": ".0f", "seconds": ".2f", "at_the_end": ".1e"}
-    return Table(
+    return ResultTable(
         name="drift",
         title=f"relative energy error over {steps} steps",
         columns=formats | {"largest": ".1e", "drift": ".1e", "uncertainty": ".1e"},

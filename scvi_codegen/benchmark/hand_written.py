@@ -11,7 +11,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases import Array, Case, case
 from scvi_codegen.benchmark.plan import Plan, Say
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
@@ -36,13 +36,13 @@ DECLARATIONS = (
 )
 
 
-def run_hand_written(plan: Plan, say: Say) -> Table:
+def run_hand_written(plan: Plan, say: Say) -> ResultTable:
     """Nanoseconds a step of both, timed in turn, and how far apart they end."""
     rows = []
     for name, h in HAND_WRITTEN.items():
         say(f"hand-written: {name}")
         rows.append(_compare(case(name), h, repeats=3 * plan.repeats, steps=STEPS // 20 if plan.quick else STEPS))
-    return Table(
+    return ResultTable(
         name="hand-written",
         title="generated C against hand-written C of the same method",
         columns={"case": "", "h": "g", "generated_ns": ".0f", "by_hand_ns": ".0f", "ratio": ".2f", "apart": ".1e"}
@@ -64,7 +64,7 @@ def hand_written_source(pendulum: bool) -> Source:
 
 def _constants() -> Iterator[str]:
     """Definitions of the type ``lanes``, of vectors (one row) and of tables, column after column."""
-    c = [(1 + x) / 2 for x in gauss_legendre(STAGES).points]
+    c = gauss_legendre(STAGES).abscissae
     a, (b,) = (integrals(c, ends) for ends in (c, [mp.one]))
     product = matrix_product(a, a)
     yield "typedef double lanes __attribute__((vector_size(64)));"

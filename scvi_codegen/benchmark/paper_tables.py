@@ -19,7 +19,7 @@ import numpy as np
 from scvi_codegen.benchmark.cases import Case, case
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
@@ -39,7 +39,7 @@ TABLES = (
 """Number, case, (q0, v0), h, methods with the seconds printed, degree of collocation and its seconds."""
 
 
-def run_paper_tables(plan: Plan, say: Say) -> Table:
+def run_paper_tables(plan: Plan, say: Say) -> ResultTable:
     """Both tables."""
     rows: list[dict[str, Any]] = []
     for number, name, (q, v), h, methods, degree, seconds in TABLES:
@@ -49,7 +49,7 @@ def run_paper_tables(plan: Plan, say: Say) -> Table:
         named = methods | {COLLOCATION: (SpectralCollocation(degree), seconds)}
         rows += _table(number, chosen, h, named, 3 * plan.rounds)
     formats = {"table": "", "scheme": "", "method": "", "ms": ".3g", "ratio": ".2f", "in_the_paper": ".2f"}
-    return Table(
+    return ResultTable(
         name="tables",
         title="Tables 6 (pendulum, h = 0.5) and 7 (Duffing, h = 0.6) of the paper",
         columns=formats | {"energy_error": ".1e", "position_error": ".1e", "ms_a_digit": ".3g"},

@@ -12,7 +12,7 @@ from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, time_at
 from scvi_codegen.benchmark.measuring import Measurement
 from scvi_codegen.benchmark.tables import finite, lines_of
 
-__all__ = ["LEGEND", "CaseResult", "Row", "header_lines", "rows"]
+__all__ = ["LEGEND", "CaseResult", "ReportRow", "header_lines", "rows"]
 
 BASELINE, FAST, DEFAULT = "heyoka", "fast_math", "tol=default"
 
@@ -57,7 +57,7 @@ class CaseResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class ReportRow:
     """One line of the table. Ratios are times of others at equal error over the time of this method: above 1 it wins.
 
     Attributes:
@@ -80,13 +80,13 @@ class Row:
     best_by_minima: float | None
 
 
-def rows(result: CaseResult) -> list[Row]:
+def rows(result: CaseResult) -> list[ReportRow]:
     """One row a method."""
     made = [_row(result, method) for method in result.methods()]
     return [row for row in made if row is not None]
 
 
-def _row(result: CaseResult, method: str) -> Row | None:
+def _row(result: CaseResult, method: str) -> ReportRow | None:
     good = [found for found in result.measurements if not found.failure]
     own = [found for found in good if found.method == method]
     if not own:
@@ -98,7 +98,7 @@ def _row(result: CaseResult, method: str) -> Row | None:
     error = common_error(points, [found.point for found in best or own]) or math.inf
     reaching = [found for found in own if max(found.error, FLOOR) <= error]
     shown = min(reaching, key=lambda found: found.seconds) if reaching else min(own, key=lambda found: found.error)
-    return Row(
+    return ReportRow(
         method=method,
         measurement=shown,
         at_error=error,
@@ -146,7 +146,7 @@ def _block(result: CaseResult) -> str:
     return "\n  ".join([title, *text, *failures, *notes])
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: ReportRow) -> list[str]:
     found = row.measurement
     return [
         row.method,
@@ -160,7 +160,7 @@ def _cells(row: Row) -> list[str]:
     ]
 
 
-def _row_data(row: Row) -> dict[str, Any]:
+def _row_data(row: ReportRow) -> dict[str, Any]:
     numbers = asdict(row) | {"setting": row.measurement.setting}
     del numbers["measurement"]
     return finite(numbers)

@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 from scvi_codegen.benchmark.plan import Plan, Say
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.native import building
 
 __all__ = ["run_start_up"]
@@ -36,7 +36,7 @@ print(json.dumps([imported - began, done - imported, symbolic, "sympy" in sys.mo
 """
 
 
-def run_start_up(plan: Plan, say: Say) -> Table:
+def run_start_up(plan: Plan, say: Say) -> ResultTable:
     """Medians, cold and cached in turn."""
     found: dict[str, list[dict[str, Any]]] = {"cold": [], "cached": []}
     for number in range(plan.rounds):
@@ -45,7 +45,7 @@ def run_start_up(plan: Plan, say: Say) -> Table:
             for kind, rows in found.items():
                 rows.append(_first_step(folder) | {"cache": kind})
     formats = {"cache": "", "import_ms": ".0f", "first_step_ms": ".0f", "process_ms": ".0f"}
-    return Table(
+    return ResultTable(
         name="start-up",
         title="from the text of Kepler's Lagrangian to the first step, in a fresh process",
         columns=formats | {"sympy_by_import": "", "sympy_by_step": ""},

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Table", "finite", "lines_of"]
+__all__ = ["ResultTable", "finite", "lines_of"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
+class ResultTable:
     """Rows with named entries.
 
     Attributes:

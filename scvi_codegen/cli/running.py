@@ -19,7 +19,7 @@ from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = [
-    "Outcome",
+    "RunOutcome",
     "conserved",
     "final_state",
     "integrate_model",
@@ -31,7 +31,7 @@ SHOWN_COORDINATES = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class RunOutcome:
     """What came of a run.
 
     Attributes:
@@ -51,7 +51,7 @@ class Outcome:
     interrupted: bool
 
 
-def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> Outcome:
+def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> RunOutcome:
     """Run a model with a progress bar, as far as it goes.
 
     Raises:
@@ -78,7 +78,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             seconds += elapsed
             advance(run.steps - before)
             portion = max(1, int(portion * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
-    return Outcome(
+    return RunOutcome(
         trajectory=_joined(pieces),
         run=run,
         preparation=preparation,
@@ -88,7 +88,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     )
 
 
-def summary(model: Model, outcome: Outcome) -> str:
+def summary(model: Model, outcome: RunOutcome) -> str:
     """The run in a few lines; little if not one step was made."""
     run, trajectory, method = outcome.run, outcome.trajectory, model.method
     order = "no order claimed" if method.order is None else f"order {method.order}"
@@ -106,7 +106,7 @@ def summary(model: Model, outcome: Outcome) -> str:
     return "\n".join([*lines, *final_state(run)])
 
 
-def _speed(outcome: Outcome, every: int) -> str:
+def _speed(outcome: RunOutcome, every: int) -> str:
     text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
     watched = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
     if not watched:

@@ -78,9 +78,7 @@ def _cell(cell: str | sympy.Expr) -> Html:
 
 def positions(part: Part) -> Vector:
     """Where on the step they stand, in [0, 1]."""
-    if isinstance(part, Tableau):
-        return part.c
-    return tuple((x + 1) / 2 for x in part.points)
+    return part.c if isinstance(part, Tableau) else part.abscissae
 
 
 def decimal(value: Number) -> str:

@@ -20,7 +20,7 @@ from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Motion", "Numbers", "motion_of", "numbers"]
+__all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
 
 Numbers = NDArray[Any]
 """Arrays of 60-digit numbers."""
@@ -35,7 +35,7 @@ def numbers(values: Any) -> Numbers:
     return np.array([mp.mpf(x) for x in array.ravel()], dtype=object).reshape(array.shape)
 
 
-class Motion:
+class ExactMotion:
     """L or H of a system as a function of numbers, and the motion that follows; parameters have their defaults."""
 
     def __init__(self, system: MechanicalSystem) -> None:
@@ -190,6 +190,6 @@ def _solved(matrix: Numbers, right: Numbers) -> Numbers:
 
 
 @lru_cache(maxsize=64)
-def motion_of(system: MechanicalSystem) -> Motion:
+def exact_motion(system: MechanicalSystem) -> ExactMotion:
     """The motion of a system, its formula differentiated once a process."""
-    return Motion(system)
+    return ExactMotion(system)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import Numbers, motion_of, numbers
+from scvi_codegen.exact.motion import Numbers, exact_motion, numbers
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
@@ -54,7 +54,7 @@ class DerivedStep:
     """The stage equations of a system as functions of numbers; parameters have their default values."""
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
-        self.system, self.stages, self.motion = system, stages, motion_of(system)
+        self.system, self.stages, self.motion = system, stages, exact_motion(system)
         symbols = [(*family.arguments, system.time, *system.parameters) for family in stages.families]
         self.kernels = [Tape(family.results, own) for family, own in zip(stages.families, symbols, strict=True)]
         self.scalars = [

@@ -77,6 +77,12 @@ class MechanicalSystem(ABC):
         return tuple(symbol(coordinate.name + DOT) for coordinate in self.coordinates)
 
     @property
+    def momentum_symbols(self) -> tuple[Symbol, ...]:
+        """The m momenta: of a Lagrangian ``p_`` and the coordinate, with ``_`` before it where that name is taken."""
+        taken = {given.name for given in (*self.coordinates, *self.velocities, *self.parameters)}
+        return self.auxiliaries or tuple(symbol(_free(f"p_{q.name}", taken)) for q in self.coordinates)
+
+    @property
     def constants(self) -> dict[Symbol, float]:
         """Default value by parameter."""
         return dict(zip(self.parameters, self.defaults, strict=True))
@@ -163,6 +169,10 @@ class MechanicalSystem(ABC):
                 f"'{unknown[0]}' in the {what} is neither a coordinate, {kinds}, time nor a parameter{hint} "
                 "Give it a default value among the parameters, or list it as a coordinate"
             )
+
+
+def _free(name: str, taken: set[str]) -> str:
+    return name if name not in taken else _free(f"_{name}", taken)
 
 
 def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[str, float]:

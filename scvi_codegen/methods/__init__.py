@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from typing import Any
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.methods.collocation import (
     TABLEAU_METHODS,
     ChebyshevGauss,
@@ -85,9 +84,7 @@ def method_from_specification(specification: Specification) -> Method:
     arguments: dict[str, Any] = dict(specification)
     name = arguments.pop("method", None)
     if name not in METHODS:
-        near = difflib.get_close_matches(str(name), METHODS, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise MethodError(f"there is no method {name!r} among {', '.join(METHODS)}{hint}")
+        raise MethodError(f"there is no method {name!r}{closest(str(name), METHODS)} Known: {', '.join(METHODS)}")
     accepted = ARGUMENTS[name]
     for argument in arguments:
         if argument not in accepted:

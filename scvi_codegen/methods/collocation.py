@@ -24,7 +24,6 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import (
-    EXTRAPOLATION_DEGREE,
     galerkin_system,
     position_block,
     resolve_nodes,
@@ -32,7 +31,7 @@ from scvi_codegen.methods.galerkin import (
 from scvi_codegen.methods.method import Method, Specification, check_count, lagrangian_scatters
 from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
 from scvi_codegen.tables import tableau as tableaux
-from scvi_codegen.tables.basis import differentiation_matrix, extrapolation, identity_matrix, matrix_product
+from scvi_codegen.tables.basis import differentiation_matrix, identity_matrix, matrix_product, next_step
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.tableau import Tableau
@@ -134,7 +133,7 @@ class RungeKutta(Method):
             position=tableau.A,
             velocity=identity_matrix(size),
             end_position=tableau.b,
-            extrapolation=_extrapolation(tableau.c),
+            extrapolation=next_step(tableau.c),
         )
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
@@ -170,7 +169,7 @@ class SpectralCollocation(Method):
     @property
     def tableau(self) -> Tableau:
         """The equivalent collocation Runge-Kutta tableau (23), on the nodes 1 .. s."""
-        return tableaux.collocation_tableau(tuple((x + 1) / 2 for x in self.node_set.points[1:]))
+        return tableaux.collocation_tableau(self.node_set.abscissae[1:])
 
     @property
     def name(self) -> str:
@@ -259,7 +258,7 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
         end_position=Table.joined(Table.constant(1, 1, 1), _transposed_row(b_column)),
         end_momentum=mp.one,
         end_numbers=("22", "22"),
-        extrapolation=_extrapolation(tableau.c),
+        extrapolation=next_step(tableau.c),
     )
 
 
@@ -351,7 +350,7 @@ def acceleration_gathers(
 
 def acceleration_extrapolation(tableau: Tableau) -> Matrix:
     """The guess for the next step: v0 <- v1 = v0 + sum b_i z_i, accelerations extrapolated."""
-    inner = _extrapolation(tableau.c)
+    inner = next_step(tableau.c)
     size = len(tableau.b)
     return ((mp.one, *tableau.b), *((mp.zero, *inner[i]) for i in range(size)))
 
@@ -363,7 +362,7 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
     none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
     family = residual_family(
         system,
-        tuple((x + 1) / 2 for x in nodes.points[1:]),
+        nodes.abscissae[1:],
         nodal_gathers(system, nodes),
         Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
         Scatter(results=momenta, table=Table.joined(none, last), power=0),
@@ -466,10 +465,6 @@ def _transposed(tableau: Tableau) -> Table:
 
 def _transposed_row(column: Table) -> Table:
     return Table(entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),))
-
-
-def _extrapolation(abscissae: Vector) -> Matrix:
-    return extrapolation(abscissae, 1, min(len(abscissae) - 1, EXTRAPOLATION_DEGREE))
 
 
 def _check_form(form: str) -> None:

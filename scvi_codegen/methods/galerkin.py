@@ -34,7 +34,7 @@ from scvi_codegen.methods.stage_system import (
     stationary_increments,
     stationary_nodal,
 )
-from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values, extrapolation, identity_matrix
+from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values, extrapolation, identity_matrix, next_step
 from scvi_codegen.tables.nodes import Nodes, nodes_by_name
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre, quadrature_by_name
@@ -50,9 +50,6 @@ __all__ = [
     "resolve_nodes",
     "resolve_quadrature",
 ]
-
-EXTRAPOLATION_DEGREE = 8
-"""Highest degree used to guess the next step: the row sums of the extrapolation grow 20-fold a degree."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +186,7 @@ class SVI(Method):
             position=curves.positions(points, rule.abscissae),
             velocity=curves.velocities(points, rule.abscissae),
             end_position=curves.positions(points, (mp.one,))[0],
-            extrapolation=extrapolation(points, 1, min(len(points) - 1, EXTRAPOLATION_DEGREE)),
+            extrapolation=next_step(points),
             block_abscissae=points,
             derivative_weights=rule.unit_derivative_weights,
             derivatives=[curves.velocities(points, rule.abscissae, k + 1) for k in range(len(rule.derivative_weights))],
@@ -415,4 +412,4 @@ def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
 
 def position_block(v: int, nodes: Nodes) -> Block:
     """The unknown Q^v, first guessed on the straight line."""
-    return Block(name=f"Q_{v}", power=0, straight=(mp.one, (nodes.points[v] + 1) / 2))
+    return Block(name=f"Q_{v}", power=0, straight=(mp.one, nodes.abscissae[v]))

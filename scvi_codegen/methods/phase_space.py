@@ -21,12 +21,11 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
-from scvi_codegen.tables.basis import extrapolation, identity_matrix
+from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 __all__ = ["with_auxiliaries"]
 
-EXTRAPOLATION_DEGREE = 8
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """The paper's numbers of the shooting method in phase space."""
 BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E"}
@@ -74,7 +73,7 @@ def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_
     free |= family.scalar.free_symbols if family.scalar is not None else set()
     points = family.abscissae
     guesses = {
-        system.auxiliaries: extrapolation(points, 1, min(len(points) - 1, EXTRAPOLATION_DEGREE)),
+        system.auxiliaries: next_step(points),
         auxiliary_multipliers(system): identity_matrix(len(points)),
     }
     for symbols, guess in guesses.items():

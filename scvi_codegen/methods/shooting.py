@@ -113,7 +113,7 @@ class SCVI(Method):
     def tableau(self) -> Tableau:
         """The collocation tableau (23) on the nodes 1 .. s, or on the abscissae."""
         if self.abscissae is None:
-            return collocation_tableau(tuple((x + 1) / 2 for x in self.node_set.points[1:]))
+            return collocation_tableau(self.node_set.abscissae[1:])
         if isinstance(self.abscissae, str):
             return tableau_by_name(f"{self.abscissae}:{self.degree}")
         return collocation_tableau(self.abscissae)
@@ -300,7 +300,7 @@ def _printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadra
     """(34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
     size, points = len(tableau.b), len(rule)
     position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
-    abscissae = tuple((x + 1) / 2 for x in nodes.points)
+    abscissae = nodes.abscissae
     values = cardinal_values(abscissae, rule.abscissae)
     slopes = cardinal_slopes(abscissae, rule.abscissae)
     none = Table.constant(points, size)
@@ -350,7 +350,7 @@ def _shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) ->
     )
     node = ScalarFamily(
         name="node",
-        abscissae=tuple((x + 1) / 2 for x in nodes.points[1:]),
+        abscissae=nodes.abscissae[1:],
         weights=(mp.one,) * size,
         weight_names=("",) * size,
         gathers=(*nodal_gathers(system, nodes, other_blocks=size), own),
@@ -387,7 +387,7 @@ def _printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
     quadrature = action.point_family([ends(gather.table) for gather in action.gathers])
     node = residual_family(
         system,
-        tuple((x + 1) / 2 for x in nodes.points[1:]),
+        nodes.abscissae[1:],
         nodal_gathers(system, nodes),
         Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
     )

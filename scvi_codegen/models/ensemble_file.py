@@ -20,7 +20,6 @@ parameters.
 from __future__ import annotations
 
 import csv
-import difflib
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import ModelFileError
+from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
 
@@ -206,8 +205,7 @@ def _check_names(model: Model, names: Sequence[str]) -> None:
     known = [*coordinates, *velocities, *momenta, *parameters]
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known[:12])}"
+            hint = f"{closest(name, known)} Known: {', '.join(known[:12])}"
             raise ModelFileError(f"'{name}' is no coordinate, velocity, momentum or parameter of the system{hint}")
     if not set(names).isdisjoint(velocities) and not set(names).isdisjoint(momenta):
         raise ModelFileError("there are both velocities and momenta: give one or the other")

@@ -33,14 +33,13 @@ the names ``p_q``.
 
 from __future__ import annotations
 
-import difflib
 import os
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scvi_codegen.errors import ModelFileError, ScviCodegenError
+from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -266,9 +265,7 @@ def _check_keys(section: Section, known: Iterable[str], what: str, where: str = 
     names = list(known)
     for key in section:
         if key not in names:
-            near = difflib.get_close_matches(key, names, 1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(names)}"
-            raise ModelFileError(f"unknown {what} '{key}' in {where}{hint}")
+            raise ModelFileError(f"unknown {what} '{key}' in {where}{closest(key, names)} Known: {', '.join(names)}")
 
 
 def _in_section(where: str, build: Callable[[], Built]) -> Built:

@@ -36,7 +36,6 @@ __all__ = ["generate_package", "load_package"]
 INTERFACE_FILE = "interface.json"
 FORMAT = 1
 OUTPUTS = 20
-LONGEST_PREFIX = 64
 
 OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
 """Folder names that would collide with ``main.c`` or hide what the package imports."""
@@ -113,7 +112,7 @@ def _write(text: str, file: IO[bytes]) -> None:
 
 def _prefix(folder: Path) -> str:
     """The name of the folder, fit to begin C names and to be imported."""
-    from scvi_codegen.compiler import c_identifier  # here, because it imports SymPy
+    from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # here, because it imports SymPy
 
     try:
         name = folder.resolve().name

@@ -33,6 +33,7 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EventSearch, render_events
+from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["with_events"]
@@ -129,7 +130,7 @@ def _translated(function: Expr) -> Expr:
 
 def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventSearch:
     """Chebyshev's points of the second kind on [0, 1], and from values there to coefficients of powers on [-1, 1]."""
-    points = [-mp.cos(mp.pi * j / DEGREE) if 2 * j != DEGREE else mp.mpf(0) for j in range(DEGREE + 1)]
+    points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))
     return EventSearch(
@@ -137,7 +138,7 @@ def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventS
         dimension=interface.dimension,
         kernel=kernel,
         uses_velocity=uses_velocity,
-        nodes=lower_vector(tuple((1 + x) / 2 for x in points)),
+        nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
         splits=SPLITS,

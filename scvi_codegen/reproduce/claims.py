@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
-    Check,
+    Comparison,
     Experiment,
     Paragraph,
     Result,
-    Table,
+    TableBlock,
     Verdict,
     common_verdict,
 )
@@ -125,17 +125,17 @@ def _listed(results: Mapping[str, Result]) -> str:
     return ", ".join(name for name in EVIDENCE if name not in results)
 
 
-def _evidence(key: str, results: Mapping[str, Result]) -> Iterator[tuple[str, Check]]:
+def _evidence(key: str, results: Mapping[str, Result]) -> Iterator[tuple[str, Comparison]]:
     """Names of experiments with their checks that bear on a claim, in the paper's order."""
     for name in EVIDENCE:
         if name in results:
             yield from ((name, check) for check in results[name].checks if key in check.bears_on)
 
 
-def _check(claim: Claim, evidence: tuple[tuple[str, Check], ...]) -> Check:
+def _check(claim: Claim, evidence: tuple[tuple[str, Comparison], ...]) -> Comparison:
     counted = {verdict: [name for name, check in evidence if check.verdict is verdict] for verdict in Verdict}
     parts = [f"{_counted(len(names), verdict)} ({_unique(names)})" for verdict, names in counted.items() if names]
-    return Check(
+    return Comparison(
         claim=f"{claim.text} ({claim.place})",
         measured=f"Of {len(evidence)} checks {'; '.join(parts)}." if parts else "No check bears on it.",
         verdict=common_verdict(check for _, check in evidence),
@@ -151,8 +151,8 @@ def _unique(names: list[str]) -> str:
     return ", ".join(dict.fromkeys(names))
 
 
-def _summary(found: Mapping[str, tuple[tuple[str, Check], ...]]) -> Table:
-    return Table(
+def _summary(found: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
+    return TableBlock(
         columns=("claim", "place", "checks", *(verdict.value for verdict in Verdict), "verdict"),
         rows=tuple(
             (
@@ -168,8 +168,8 @@ def _summary(found: Mapping[str, tuple[tuple[str, Check], ...]]) -> Table:
     )
 
 
-def _details(found: Mapping[str, tuple[tuple[str, Check], ...]]) -> Table:
-    return Table(
+def _details(found: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
+    return TableBlock(
         name="checks",
         columns=("claim", "experiment", "paper", "measured", "verdict"),
         rows=tuple(
@@ -181,7 +181,7 @@ def _details(found: Mapping[str, tuple[tuple[str, Check], ...]]) -> Table:
     )
 
 
-def _blocks(claim: Claim, evidence: tuple[tuple[str, Check], ...]) -> Iterator[Block]:
+def _blocks(claim: Claim, evidence: tuple[tuple[str, Comparison], ...]) -> Iterator[Block]:
     yield Paragraph(f'"{claim.text}" ({claim.place}): {common_verdict(check for _, check in evidence).value}.')
     for name, check in evidence:
         yield Paragraph(f"{name}, {check.verdict.value}: {check.claim} {check.measured}")

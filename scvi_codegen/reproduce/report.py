@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from scvi_codegen.display.page.environment import page_template, style_sheet
 from scvi_codegen.reproduce.labels import label, linked
-from scvi_codegen.reproduce.laboratory.experiment import Result, Table, Verdict
+from scvi_codegen.reproduce.laboratory.experiment import Result, TableBlock, Verdict
 from scvi_codegen.reproduce.svg import color_variables, inline_svg
 from scvi_codegen.reproduce.writing import draw
 from scvi_codegen.version import __version__
@@ -81,5 +81,5 @@ def _heading(result: Result) -> str:
     return shorter[:1].upper() + shorter[1:] if shorter else result.title
 
 
-def _caption(result: Result, table: Table) -> str:
+def _caption(result: Result, table: TableBlock) -> str:
     return f"Data of {label(result.name)}{table.name and ': '}{table.name.replace('-', ' ')}"

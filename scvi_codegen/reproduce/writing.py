@@ -10,7 +10,15 @@ from typing import IO
 
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.reproduce.laboratory.drawing import STYLE
-from scvi_codegen.reproduce.laboratory.experiment import Block, Formula, Listing, Paragraph, Picture, Result, Table
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Block,
+    Formula,
+    Listing,
+    Paragraph,
+    Picture,
+    Result,
+    TableBlock,
+)
 
 __all__ = ["csv_text", "draw", "statement", "write_result"]
 
@@ -51,7 +59,7 @@ def draw(picture: Picture, kind: str) -> bytes:
     return file.read()
 
 
-def csv_text(table: Table) -> str:
+def csv_text(table: TableBlock) -> str:
     """CSV with a line of headings; floats in full precision."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")

@@ -29,8 +29,12 @@ __all__ = [
     "extrapolation",
     "identity_matrix",
     "matrix_product",
+    "next_step",
     "transpose",
 ]
+
+GUESS_DEGREE = 8
+"""Highest degree used to guess the next step: the row sums of the extrapolation grow 20-fold a degree."""
 
 
 def matrix_product(left: Matrix, right: Matrix) -> Matrix:
@@ -172,6 +176,12 @@ def extrapolation(points: Iterable[Number], shift: Number, degree: int | None = 
     with mp.workdps(guard_digits(numbers) + len(numbers)):
         rows = least_squares_shift(numbers, [point + offset for point in numbers], degree)
     return rounded(rows)
+
+
+def next_step(points: Iterable[Number]) -> Matrix:
+    """Return the extrapolation by 1 of degree at most ``GUESS_DEGREE``: a first guess of the next step's values."""
+    numbers = tuple(points)
+    return extrapolation(numbers, 1, min(len(numbers) - 1, GUESS_DEGREE))
 
 
 def continuation(points: Iterable[Number], degree: int) -> tuple[Matrix, Matrix]:

@@ -7,14 +7,13 @@ method on the three-term recurrence with twenty guard digits: no eigenvalue prob
 
 from __future__ import annotations
 
-import difflib
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, TypeAlias, TypeVar
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 
 __all__ = [
@@ -144,9 +143,7 @@ def family_named(name: str, families: Mapping[str, Item], what: str) -> Item:
     """Return ``families[name]``, or raise ``MethodError`` with the known names and the closest match."""
     if name in families:
         return families[name]
-    close = difflib.get_close_matches(str(name), families, n=1, cutoff=0.4)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise MethodError(f"unknown {what} {name!r}: {hint}the known names are {', '.join(families)}")
+    raise MethodError(f"unknown {what} {name!r}{closest(str(name), families)} Known: {', '.join(families)}")
 
 
 def jacobi_value_and_slope(count: int, alpha: int, beta: int, x: Number) -> tuple[Number, Number]:

@@ -25,6 +25,7 @@ from scvi_codegen.tables.nodes import (
     radau_left_points,
     radau_right_points,
     to_number,
+    to_unit,
 )
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
 
@@ -120,7 +121,7 @@ class Quadrature:
     @property
     def abscissae(self) -> Vector:
         """The points mapped to [0, 1]: c = (x + 1) / 2."""
-        return tuple((1 + point) / 2 for point in self.points)
+        return to_unit(self.points)
 
     @property
     def unit_weights(self) -> Vector:

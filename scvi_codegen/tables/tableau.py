@@ -22,6 +22,7 @@ from scvi_codegen.tables.nodes import (
     chebyshev_lobatto_points,
     checked_count,
     to_number,
+    to_unit,
 )
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, split_name
@@ -244,14 +245,14 @@ def lobatto_iiib(s: int) -> Tableau:
 def chebyshev_gauss(s: int) -> Tableau:
     """Return collocation on the s Chebyshev-Gauss points: symmetric, of order s for even s and s + 1 for odd s."""
     s = checked_count(s, "the number of Chebyshev-Gauss stages", 1, MOST_STAGES)
-    return collocation_tableau([(1 + x) / 2 for x in chebyshev_gauss_points(s)], f"chebyshev-gauss:{s}")
+    return collocation_tableau(to_unit(chebyshev_gauss_points(s)), f"chebyshev-gauss:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(s: int) -> Tableau:
     """Return collocation on the s >= 2 Chebyshev-Lobatto points: symmetric, of order s (even s) or s + 1 (odd s)."""
     s = checked_count(s, "the number of Chebyshev-Lobatto stages", 2, MOST_STAGES)
-    return collocation_tableau([(1 + x) / 2 for x in chebyshev_lobatto_points(s)], f"chebyshev-lobatto:{s}")
+    return collocation_tableau(to_unit(chebyshev_lobatto_points(s)), f"chebyshev-lobatto:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)

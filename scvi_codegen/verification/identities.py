@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import motion_of, numbers
+from scvi_codegen.exact.motion import exact_motion, numbers
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
@@ -85,7 +85,7 @@ def _twins(system: MechanicalSystem, method: Method) -> Iterator[_Twin]:
     elif isinstance(method, SCVI):
         yield from _shooting_twins(method, separable)
     elif isinstance(method, SpectralCollocation):
-        abscissae = [(x + 1) / 2 for x in method.node_set.points[1:]]
+        abscissae = method.node_set.abscissae[1:]
         yield _Twin("collocation at its nodes", CollocationRK(abscissae, form=method.form))
     elif isinstance(method, RungeKutta):
         yield from _tableau_twins(method)
@@ -118,7 +118,7 @@ def _shooting_twins(method: SCVI, separable: bool) -> Iterator[_Twin]:
     if s == 1:
         yield _Twin("SCVI(1) = SVI(1)", SVI(1, rule))
     elif method.variational and method.abscissae is None:
-        abscissae = tuple((x + 1) / 2 for x in method.node_set.points[1:])
+        abscissae = method.node_set.abscissae[1:]
         yield _Twin("its nodes as abscissae", SCVI(s, rule, abscissae=abscissae), ROUNDED)
     elif method.abscissae == "gauss" and rule.name == f"gauss-legendre:{s}" and separable:
         yield _Twin("SCVI on Gauss points = SVI", SVI(s, rule), ROUNDED)
@@ -161,7 +161,7 @@ def _oscillator(method: Method) -> Finding | None:
         return None
     formula, frequency = "(q_dot**2 - w**2*q**2)/2", {"w": method.curves.frequency}
     system = LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian=formula, parameters=frequency)
-    found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), motion_of(system).flow([0.7], [0.4], 1)
+    found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), exact_motion(system).flow([0.7], [0.4], 1)
     return Finding(float(max(abs(found.q[0] - q[0]), abs(found.p[0] - p[0]))), ROUNDED)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.exact.motion import Motion, motion_of
+from scvi_codegen.exact.motion import ExactMotion, exact_motion
 from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
@@ -96,7 +96,7 @@ class Subject:
         return self.system.with_parameters(**self.parameters)
 
     @cached_property
-    def motion(self) -> Motion:
+    def motion(self) -> ExactMotion:
         """The exact motion of :attr:`moved`.
 
         Raises:
@@ -106,7 +106,7 @@ class Subject:
             raise StateError(
                 f"{self.system.dimension} coordinates are more than the {MOST_COORDINATES} followed in 60 digits"
             )
-        return motion_of(self.moved)
+        return exact_motion(self.moved)
 
     @cached_property
     def states(self) -> tuple[State, State]:

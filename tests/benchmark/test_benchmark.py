@@ -26,7 +26,7 @@ from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
 from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
-from scvi_codegen.benchmark.tables import Table
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet
 from scvi_codegen.native import building
@@ -244,7 +244,9 @@ class TestReport:
         assert "broken h=1: ArithmeticError: no" in text
 
     def test_json_schema(self):
-        table = Table(name="t", title="", columns={"a": ".1f", "b": ""}, rows=({"a": math.nan}, {"a": 1.0, "b": "x"}))
+        table = ResultTable(
+            name="t", title="", columns={"a": ".1f", "b": ""}, rows=({"a": math.nan}, {"a": 1.0, "b": "x"})
+        )
         whole = bench.Report(machine=bench.machine(), results=(self.result, table))
         data = json.loads(json.dumps(whole.data(), allow_nan=False))
         assert set(data) == {"schema", "machine", "cases", "tables", "interrupted"}
@@ -330,7 +332,7 @@ class TestCommand:
         def fail(plan, say):
             raise StateError("no")
 
-        done = Table(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
+        done = ResultTable(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
         sections = {"one": lambda plan, say: done, "bad": fail, "two": interrupt, "three": interrupt}
         monkeypatch.setattr(bench, "SECTIONS", sections)
         path = tmp_path / "out.json"

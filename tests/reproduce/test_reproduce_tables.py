@@ -11,7 +11,7 @@ from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.rendering import outline as c_outline
 from scvi_codegen.reproduce import claims
 from scvi_codegen.reproduce.laboratory import full_newton
-from scvi_codegen.reproduce.laboratory.experiment import Check, Result, Verdict
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Result, Verdict
 from scvi_codegen.reproduce.oscillators import two_point_pendulum as two_point
 from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
 from scvi_codegen.reproduce.writing import statement
@@ -145,7 +145,7 @@ def result_with(name: str, *checks: tuple[str, Verdict]) -> Result:
         name=name,
         title="",
         setting=(),
-        checks=tuple(Check(claim="a", measured="b", verdict=verdict, bears_on=(key,)) for key, verdict in checks),
+        checks=tuple(Comparison(claim="a", measured="b", verdict=verdict, bears_on=(key,)) for key, verdict in checks),
     )
 
 

@@ -396,7 +396,7 @@ class TestEnsembleFiles:
             (
                 "a.toml",
                 "[grid]\nq3 = 1",
-                "'q3' is no coordinate, velocity, momentum or parameter of the system; known: q1",
+                "'q3' is no coordinate, velocity, momentum or parameter of the system. Known: q1",
             ),
             ("a.toml", "[grid]\nq1 = []", r"\[grid\] q1 is an empty list"),
             ("a.toml", "[grid]\nq1 = ['x']", r"\[grid\] q1 must be a finite number, not 'x'"),

@@ -16,14 +16,14 @@ from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
 from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, draw_powers, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
-    Check,
+    Comparison,
     Experiment,
     Formula,
     Listing,
     Paragraph,
     Picture,
     Result,
-    Table,
+    TableBlock,
     Verdict,
     holds,
 )
@@ -58,19 +58,19 @@ def figure_4(results: Mapping[str, Result]) -> Result:
             "The caption does not say how many Gauss points; s were taken.",
         ),
         checks=(
-            Check(
+            Comparison(
                 claim="SVI keeps the energy better than SC.",
                 measured=f"The largest errors are {largest[0]:.2e} and {largest[1]:.2e}, that is h^2 < 1 & -1 > -2.",
                 verdict=holds(largest[0] < largest[1]),
                 bears_on=("accuracy",),
             ),
-            Check(claim="SC is stable.", measured="It is not.", verdict=Verdict.FAILS),
+            Comparison(claim="SC is stable.", measured="It is not.", verdict=Verdict.FAILS),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("method", "largest error", "steps"), rows=(("SVI", largest[0], 500), ("SC", largest[1], None))
             ),
-            Table(
+            TableBlock(
                 name="series", columns=("t", "SVI"), rows=tuple(zip(t.tolist(), svi.tolist(), strict=True)), shown=False
             ),
         ),
@@ -105,8 +105,8 @@ def table_8(results: Mapping[str, Result]) -> Result:
         name="table-8",
         title="Iterations",
         setting=("One setting.",),
-        checks=(Check(claim="As in Fig. 4.", measured="See figure-4, not figure-40.", verdict=verdict),),
-        tables=(Table(columns=columns, rows=(row, row), formats={"time of SVI": ".2f"}),),
+        checks=(Comparison(claim="As in Fig. 4.", measured="See figure-4, not figure-40.", verdict=verdict),),
+        tables=(TableBlock(columns=columns, rows=(row, row), formats={"time of SVI": ".2f"}),),
     )
 
 

@@ -19,7 +19,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import motion_of
+from scvi_codegen.exact.motion import exact_motion
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.methods import Gauss, SpectralCollocation
@@ -124,14 +124,14 @@ def broken(error: Exception) -> Finding:
 
 def test_the_exact_motion_is_exact() -> None:
     oscillator = problem("harmonic-oscillator").system
-    q, p = motion_of(oscillator).flow([1.0], [0.0], 2)
+    q, p = exact_motion(oscillator).flow([1.0], [0.0], 2)
     assert abs(q[0] - mp.cos(2)) < mp.mpf("1e-43")
     assert abs(p[0] + mp.sin(2)) < mp.mpf("1e-43")
 
 
 @pytest.mark.parametrize("name", ["relativistic-particle", "double-pendulum"])
 def test_velocities_are_found_where_newton_would_leave_the_domain(name: str) -> None:
-    motion = motion_of(problem(name).system)
+    motion = exact_motion(problem(name).system)
     size = motion.system.dimension
     q, v = np.array([mp.mpf("0.3")] * size), np.array([mp.mpf("0.9")] * size)
     found = motion.velocity(q, motion.momentum(q, v, mp.zero), mp.zero)

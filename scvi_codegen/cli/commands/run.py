@@ -13,7 +13,7 @@ from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, re
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
-from scvi_codegen.cli.running import Outcome, integrate_model, summary
+from scvi_codegen.cli.running import RunOutcome, integrate_model, summary
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -193,7 +193,7 @@ def _run_ensemble(model: Model, path: str, output: str | None, solver: str, opti
         click.echo(f"wrote {output}")
 
 
-def _write_outputs(outcome: Outcome, output: str | None, plot: str | None) -> list[str]:
+def _write_outputs(outcome: RunOutcome, output: str | None, plot: str | None) -> list[str]:
     if output is not None:
         outcome.trajectory.save(output)
     if plot is not None:
@@ -201,7 +201,7 @@ def _write_outputs(outcome: Outcome, output: str | None, plot: str | None) -> li
     return [path for path in (output, plot) if path is not None]
 
 
-def _kept(outcome: Outcome, written: list[str]) -> str:
+def _kept(outcome: RunOutcome, written: list[str]) -> str:
     count = len(outcome.trajectory)
     states = "the initial state was" if count == 1 else f"the {count} states up to there were"
     return f"{states} kept: {' and '.join(written)}" if written else f"{states} not written to a file (-o, --plot)"

@@ -10,7 +10,7 @@ from sympy import Function, Symbol
 from scvi_codegen.derivation.notation import TableEntry
 from scvi_codegen.derivation.page.step_drawing import step_drawing
 from scvi_codegen.display.number_tables import decimal, number_table, short
-from scvi_codegen.display.page.blocks import Cell, Content, Formula, Paragraph, Section, Table
+from scvi_codegen.display.page.blocks import Cell, Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
@@ -54,7 +54,7 @@ def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
     contents: list[Content] = []
     for part in method.parts:
         numbers = number_table(part)
-        contents.append(Table(columns=numbers.columns, rows=numbers.rows, name=numbers.title))
+        contents.append(TableBlock(columns=numbers.columns, rows=numbers.rows, name=numbers.title))
     skipped = {*SHOWN_WITH_PARTS, *("ac" if any(isinstance(part, Tableau) for part in method.parts) else "")}
     for prefix in dict.fromkeys(_indices(entry)[0] for entry in entries):
         if prefix not in skipped:
@@ -74,14 +74,14 @@ def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
     caption = CAPTIONS.get(prefix, f"{prefix}_{{n,j}}: coefficients of the equations")
     if any(len(index) < 2 for index in cells):
         column = tuple((str(index[-1]), cell) for index, cell in sorted(cells.items()))
-        yield Table(columns=("", prefix), rows=column[:MOST_CELLS], name=caption)
+        yield TableBlock(columns=("", prefix), rows=column[:MOST_CELLS], name=caption)
         return
     lines, columns = ({index[k] for index in cells} for k in range(2))
     if max(len(lines), len(columns)) > MOST_CELLS:
         yield Paragraph(f"{caption}: {len(lines)} rows and {len(columns)} columns, not shown.")
         return
     rows = tuple((str(n), *(cells.get((n, column)) for column in sorted(columns))) for n in sorted(lines))
-    yield Table(columns=("n", *(f"j = {column}" for column in sorted(columns))), rows=rows, name=caption)
+    yield TableBlock(columns=("n", *(f"j = {column}" for column in sorted(columns))), rows=rows, name=caption)
 
 
 def _indices(entry: TableEntry) -> tuple[str, tuple[int, ...]]:

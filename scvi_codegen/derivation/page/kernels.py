@@ -9,7 +9,7 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines, operations
-from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section, Table
+from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import SeparableSweep
@@ -53,7 +53,9 @@ def operations_section(program: Program) -> Section:
             "a power such as x^(-3/2) is one call. A kernel of a few formulas may gain nothing: powers are written out "
             "as products there."
         ),
-        Table(columns=columns, rows=rows, formats=dict.fromkeys(columns[1:], "d"), name="Operations of the kernels"),
+        TableBlock(
+            columns=columns, rows=rows, formats=dict.fromkeys(columns[1:], "d"), name="Operations of the kernels"
+        ),
     )
     return Section(name="operations", title="Operation counts", contents=contents)
 

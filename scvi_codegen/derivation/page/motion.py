@@ -8,7 +8,7 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.page.elision import formulas
-from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, Table
+from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -28,7 +28,7 @@ def system_section(system: MechanicalSystem) -> Section:
     ]
     if system.parameters:
         rows = tuple((symbol, value) for symbol, value in system.constants.items())
-        table = Table(columns=("parameter", "default"), rows=rows, formats={"default": ".17g"}, name="Parameters")
+        table = TableBlock(columns=("parameter", "default"), rows=rows, formats={"default": ".17g"}, name="Parameters")
         contents.append(table)
     return Section(name="system", title="The system", contents=tuple(contents))
 

@@ -19,14 +19,14 @@ __all__ = [
     "Listing",
     "Paragraph",
     "Section",
-    "Table",
+    "TableBlock",
 ]
 
 Cell: TypeAlias = float | int | str | sympy.Basic | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
+class TableBlock:
     """Numbers, written as CSV in full precision.
 
     Attributes:
@@ -110,7 +110,7 @@ class Beside:
 
 
 Block: TypeAlias = Paragraph | Formula | Listing
-Content: TypeAlias = Block | Table | Code | Drawing | Beside
+Content: TypeAlias = Block | TableBlock | Code | Drawing | Beside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

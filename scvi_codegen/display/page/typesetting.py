@@ -9,7 +9,7 @@ from markupsafe import Markup, escape
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
 from scvi_codegen.display.mathml import mathml
-from scvi_codegen.display.page.blocks import Cell, Table
+from scvi_codegen.display.page.blocks import Cell, TableBlock
 
 __all__ = ["SPACE", "cell", "column_class", "column_heading", "prose"]
 
@@ -62,7 +62,7 @@ def cell(value: Cell, specification: str | None = None) -> Markup:
     return prose(format(value, specification or ""))
 
 
-def column_class(table: Table, index: int) -> str:
+def column_class(table: TableBlock, index: int) -> str:
     """``"number"`` for what is set to the right, ``"text"`` for what needs several lines."""
     cells = [row[index] for row in table.rows]
     texts = [value for value in cells if isinstance(value, str)]

@@ -24,7 +24,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.symmetry.sampling import Motion, Sample, array_value
+from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, array_value
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 
@@ -76,7 +76,7 @@ Column: TypeAlias = Polynomial | Expr
 
 
 def conserved(
-    system: MechanicalSystem, motion: Motion, columns: Sequence[Column], *, fractions: bool = False
+    system: MechanicalSystem, motion: Rates, columns: Sequence[Column], *, fractions: bool = False
 ) -> list[dict[int, Expr]]:
     """A basis of the conserved combinations of ``columns``: the coefficient of each column that occurs, by its index.
 
@@ -105,7 +105,7 @@ def conserved(
 class _Search:
     """Rates of columns at random points, for random values of the parameters."""
 
-    def __init__(self, motion: Motion, columns: Sequence[Column]) -> None:
+    def __init__(self, motion: Rates, columns: Sequence[Column]) -> None:
         self.motion, self.columns = motion, columns
         self.slopes: dict[int, dict[int, Expr]] = {}
         self.drawn: dict[Symbol, Array] = {}
@@ -226,7 +226,7 @@ def _reduced(rows: Array) -> tuple[Array, list[int]]:
     return np.where(np.abs(rows) > ZERO, rows, 0.0), pivots
 
 
-def _factors(system: MechanicalSystem, motion: Motion) -> list[Expr]:
+def _factors(system: MechanicalSystem, motion: Rates) -> list[Expr]:
     """What coefficients may be products of: parameters, and sums of parameters that occur in the system."""
     constants = set(motion.constants)
     found: list[Expr] = list(motion.constants)

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Motion", "Sample", "array_value", "momentum_symbols", "motion_of"]
+__all__ = ["Rates", "Sample", "array_value", "rates_of"]
 
 Array = NDArray[np.float64]
 
@@ -56,7 +55,7 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class Rates:
     """How a system moves: v and L_q, or H_p and -H_q, as expressions of ``arguments``, time and ``constants``.
 
     Attributes:
@@ -117,7 +116,7 @@ class Motion:
         return Sample(t=values[self.time], state=(*q, *p), rates=(*v, *forces), value=value)
 
 
-def motion_of(system: MechanicalSystem) -> Motion:
+def rates_of(system: MechanicalSystem) -> Rates:
     """The motion of a system, long numbers replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
     if system.auxiliaries:
@@ -129,9 +128,9 @@ def motion_of(system: MechanicalSystem) -> Motion:
     if numbers:
         replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}
         transformed, forces = (tuple(e.xreplace(replaced) for e in part) for part in (transformed, forces))
-    return Motion(
+    return Rates(
         arguments=arguments,
-        momenta=momentum_symbols(system),
+        momenta=system.momentum_symbols,
         transformed=transformed,
         forces=forces,
         hamiltonian=bool(system.auxiliaries),
@@ -146,18 +145,6 @@ def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
     found = set().union(*(expression.atoms(sympy.Rational) for expression in expressions))
     sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}
-
-
-def momentum_symbols(system: MechanicalSystem) -> tuple[Symbol, ...]:
-    """The momenta of a Hamiltonian; for a Lagrangian ``p_`` and the coordinate, with ``_`` before it where taken."""
-    if system.auxiliaries:
-        return system.auxiliaries
-    taken = {given.name for given in (*system.coordinates, *system.velocities, *system.parameters)}
-    return tuple(symbol(_free(f"p_{q.name}", taken)) for q in system.coordinates)
-
-
-def _free(name: str, taken: set[str]) -> str:
-    return name if name not in taken else _free(f"_{name}", taken)
 
 
 def array_value(expression: Any, known: dict[Any, Any]) -> Any:

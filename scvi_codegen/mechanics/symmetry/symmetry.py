@@ -43,7 +43,7 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
 )
 from scvi_codegen.mechanics.symmetry.invariants import Polynomial, conserved
 from scvi_codegen.mechanics.symmetry.names import name_of
-from scvi_codegen.mechanics.symmetry.sampling import momentum_symbols, motion_of
+from scvi_codegen.mechanics.symmetry.sampling import rates_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["Symmetry", "all_symmetries", "check_symmetry", "symmetries"]
@@ -125,7 +125,7 @@ def all_symmetries(system: MechanicalSystem, given: Sequence[Symmetry]) -> tuple
         SystemDefinitionError: if one given is of another system, or has the name of another one.
     """
     found = (*symmetries(system), *given)
-    own = (system.coordinates, momentum_symbols(system))
+    own = (system.coordinates, system.momentum_symbols)
     for symmetry in given:
         if (symmetry.coordinates, symmetry.momenta) != own:
             raise SystemDefinitionError(
@@ -166,11 +166,11 @@ def check_symmetry(
         raise SystemDefinitionError(f"a direction has {system.dimension} components, one for each of {names}")
     xi = tuple(_expression(system, component) for component in direction)
     f = None if gauge is None else _expression(system, gauge)
-    p, q, t = momentum_symbols(system), system.coordinates, system.time
+    p, q, t = system.momentum_symbols, system.coordinates, system.time
     product = sympy.Add(*(a * b for a, b in zip(p, xi, strict=True)), -(f or 0))
     quadratic = system.dimension <= MOST_COORDINATES
     gauges = list(gauge_columns(system.dimension, quadratic=quadratic)) if f is None else []
-    rows = [row for row in conserved(system, motion_of(system), [product, *gauges]) if 0 in row]
+    rows = [row for row in conserved(system, rates_of(system), [product, *gauges]) if 0 in row]
     if not rows:
         raise SystemDefinitionError(_defect(system, xi, f))
     terms = combined({c: x / rows[0][0] for c, x in rows[0].items() if c}, [product, *gauges])
@@ -188,7 +188,7 @@ def check_symmetry(
 
 def _found(system: MechanicalSystem) -> list[Terms]:
     """The momentum maps as polynomials."""
-    motion, curved = motion_of(system), _is_curved(system)
+    motion, curved = rates_of(system), _is_curved(system)
     if system.dimension <= MOST_COORDINATES:
         columns: list[Polynomial] = list(monomial_columns(system.dimension, curved=curved))
     else:
@@ -234,7 +234,7 @@ def _term_text(coefficient: Expr, factors: list[Expr]) -> str:
 
 def _polynomial(system: MechanicalSystem, terms: Terms) -> Expr:
     """In the symbols of the system."""
-    state = (*system.coordinates, *momentum_symbols(system))
+    state = (*system.coordinates, *system.momentum_symbols)
     return sympy.Add(
         *(
             sympy.Mul(coefficient, system.time**monomial.power, *(state[i] for i in monomial.factors))
@@ -251,7 +251,7 @@ def _symmetry(system: MechanicalSystem, terms: Terms) -> Symmetry:
     numbers = [x.as_coeff_Mul()[0] for a, x in terms.items() if degrees[a] == 1 and a.power == 0]
     factor = sign * sympy.ilcm(1, 1, *(number.q for number in numbers if number.is_Rational))
     signed = {monomial: factor * coefficient for monomial, coefficient in terms.items()}
-    J, p = _polynomial(system, signed), momentum_symbols(system)
+    J, p = _polynomial(system, signed), system.momentum_symbols
     slopes = gradient(J, p)
     return Symmetry(
         name=name,

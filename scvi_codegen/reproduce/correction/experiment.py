@@ -14,7 +14,7 @@ from scvi_codegen.reproduce.correction.example import largest_difference, multip
 from scvi_codegen.reproduce.correction.text import body
 from scvi_codegen.reproduce.kepler.step import Structure, structure_of
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,9 +74,9 @@ def _correction(_: Mapping[str, Result]) -> Result:
 Found = Mapping[tuple[int, int], tuple[Structure, Structure]]
 
 
-def _check_derivation() -> Check:
+def _check_derivation() -> Comparison:
     difference, agree = largest_difference(), multipliers_agree()
-    return Check(
+    return Comparison(
         claim="The compiler's variational equations are the derivatives of G = L_d + lambda . E.",
         measured=(
             f"For the pendulum with three points they differ by {difference:.0e} from those of G written down by hand, "
@@ -86,11 +86,11 @@ def _check_derivation() -> Check:
     )
 
 
-def _check_structure(found: Found, variational: bool) -> Check:
+def _check_structure(found: Found, variational: bool) -> Comparison:
     several = {row: pair[variational] for row, pair in found.items() if row[0] > 2}
     defects = [structure.defect for structure in several.values()]
     momenta = [abs(structure.momentum) for structure in several.values()]
-    return Check(
+    return Comparison(
         claim=f"SCVI is symplectic and momentum-preserving ({'in full' if variational else 'as printed'}).",
         measured=(
             f"With three to nine points max |J^T Omega J - Omega| is {min(defects):.1e} to {max(defects):.1e}, the "
@@ -101,10 +101,10 @@ def _check_structure(found: Found, variational: bool) -> Check:
     )
 
 
-def _check_theorem(found: Found, variational: bool) -> Check:
+def _check_theorem(found: Found, variational: bool) -> Comparison:
     orders = {row: pair[variational].order for row, pair in found.items()}
     parts = [f"{order:.1f} ({_promised(*row)})" for row, order in orders.items()]
-    return Check(
+    return Comparison(
         claim=f"The order is at least min(p, q), Theorem 4.1 ({'in full' if variational else 'as printed'}).",
         measured=f"With 2, 3, 4, 5, 6, 7, 9 points, min(p, q) in parentheses: {', '.join(parts)}.",
         verdict=holds(all(order > _promised(*row) - 0.3 for row, order in orders.items())),
@@ -112,23 +112,23 @@ def _check_theorem(found: Found, variational: bool) -> Check:
     )
 
 
-def _check_orders(found: Found) -> Check:
+def _check_orders(found: Found) -> Comparison:
     settled = {points - 1: pair for (points, _), pair in found.items() if 2 < points <= SETTLED}
     printed = ", ".join(f"{pair[0].order:.1f}" for pair in settled.values())
     full = ", ".join(f"{pair[1].order:.1f}" for pair in settled.values())
     as_derived = all(
         abs(pair[0].order - (s - 1)) < 0.3 and abs(pair[1].order - 2 * s) < 0.3 for s, pair in settled.items()
     )
-    return Check(
+    return Comparison(
         claim="The missing term lowers the order from 2s to s - 1, for degree s >= 2 (derived below).",
         measured=f"Degrees 2 to {SETTLED - 1}: as printed {printed}; in full {full}.",
         verdict=holds(as_derived),
     )
 
 
-def _check_two_points(printed: Structure) -> Check:
+def _check_two_points(printed: Structure) -> Comparison:
     agree = two_points_agree()
-    return Check(
+    return Comparison(
         claim="With two points the printed equations are complete (derived below).",
         measured=(
             f"The printed (34d), (34e) {'are' if agree else 'are not'}, term by term, the derivatives of L_d (27a), "
@@ -140,10 +140,10 @@ def _check_two_points(printed: Structure) -> Check:
     )
 
 
-def _table(found: Found) -> Table:
+def _table(found: Found) -> TableBlock:
     names = ("defect", "change of momentum", "order")
     columns = ("points", "Gauss points", *(f"{n}, {form}" for form in ("as printed", "in full") for n in names))
-    return Table(
+    return TableBlock(
         columns=(*columns, "min(p, q)"),
         rows=tuple(
             (*row, *(v for s in pair for v in (s.defect, s.momentum, s.order)), _promised(*row))

@@ -26,7 +26,7 @@ from scvi_codegen.reproduce.kepler.motion import (
     perihelion_turn,
 )
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import trajectory
 
 if TYPE_CHECKING:
@@ -87,9 +87,9 @@ def numbers(scheme: str, degree: int = DEGREE) -> Numbers:
     )
 
 
-def _table() -> Table:
+def _table() -> TableBlock:
     rows = [(scheme, degree, numbers(scheme, degree)) for degree in (5, 6) for scheme in SCHEMES]
-    return Table(
+    return TableBlock(
         columns=("scheme", "degree", "energy", "energy at T", "momentum", "off the ellipse", "turn", "position at T"),
         rows=tuple(
             (scheme, degree, n.energy, n.last_energy, n.momentum, n.orbit, n.turn, n.position)
@@ -98,9 +98,9 @@ def _table() -> Table:
     )
 
 
-def _series(name: str, column: str, values: Mapping[str, Array]) -> Table:
+def _series(name: str, column: str, values: Mapping[str, Array]) -> TableBlock:
     t = _run("SVI")[0]
-    return Table(
+    return TableBlock(
         name=name,
         columns=("t", *(f"{column} {scheme}" for scheme in values)),
         rows=tuple(zip(t.tolist(), *(v.tolist() for v in values.values()), strict=True)),
@@ -115,7 +115,7 @@ def _figure_13(_: Mapping[str, Result]) -> Result:
         title="Kepler two body, orbit",
         setting=SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SVI stays on the exact orbit, SC leaves it.",
                 measured=(
                     f"Largest distance from the ellipse, in semi-major axes: SVI {svi.orbit:.1e}, SC {sc.orbit:.1e}; "
@@ -125,7 +125,7 @@ def _figure_13(_: Mapping[str, Result]) -> Result:
                 verdict=holds(svi.orbit < 1e-4 < sc.orbit),
                 bears_on=("long-time",),
             ),
-            Check(
+            Comparison(
                 claim="SVI is more accurate than SC in phase with the same points and step.",
                 measured=f"Error of the position at T = 2000: SVI {svi.position:.1e}, SC {sc.position:.1e}.",
                 verdict=holds(svi.position < sc.position),
@@ -158,7 +158,7 @@ def _figure_14(_: Mapping[str, Result]) -> Result:
         title="Kepler two body, energy",
         setting=SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SVI preserves the energy very well, while it drifts with SC.",
                 measured=(
                     f"Largest error: SVI {svi.energy:.1e}, SC {sc.energy:.1e}; at T = 2000 SC has "
@@ -182,7 +182,7 @@ def _figure_15(_: Mapping[str, Result]) -> Result:
         title="Kepler two body, momentum",
         setting=SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SVI preserves the momentum very well, while it drifts with SC.",
                 measured=f"Largest error: SVI {svi.momentum:.1e}, which is round-off, SC {sc.momentum:.1e}.",
                 verdict=holds(svi.momentum < ROUNDOFF_OF_A_RUN and sc.momentum > 1e-6),

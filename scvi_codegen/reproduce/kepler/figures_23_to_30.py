@@ -22,7 +22,7 @@ from scvi_codegen.reproduce.kepler import phase_plane as kepler_phase_plane
 from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
 from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, perihelion, perihelion_turn, revolutions
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -82,7 +82,7 @@ def _figure_23(_: Mapping[str, Result]) -> Result:
         title="Orbit of the Kepler problem computed using SCVI with 2 collocation points",
         setting=("Kepler's problem, e = 0.5, from the perihelion, h = pi/20, T = 20000 pi: 400000 steps.", QUADRATURE),
         checks=(
-            Check(
+            Comparison(
                 claim="After 10000 periods the orbit is what it was in the beginning.",
                 measured=(
                     f"The energy lies between {first.lowest:.5f} and {first.highest:.5f} in the first 2150 steps and "
@@ -94,7 +94,7 @@ def _figure_23(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("first step", "last step", "lowest energy", "highest energy", "error of the momentum"),
                 rows=tuple((*s, p.lowest, p.highest, p.momentum) for s, p in zip(SEGMENTS, parts, strict=True)),
                 formats={"first step": "d", "last step": "d", "lowest energy": ".6f", "highest energy": ".6f"},
@@ -186,7 +186,7 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
         title="Kepler problem, orbit of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="The orbital period shrinks by a factor of almost three with SC.",
                 measured=(
                     f"The first revolution takes {sc.first:.3f}, the last {sc.last:.3f}, which is {sc.factor:.2f} "
@@ -195,7 +195,7 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
                 verdict=holds(FACTOR[0] < sc.factor < FACTOR[1]),
                 bears_on=("sc-period",),
             ),
-            Check(
+            Comparison(
                 claim="The period does not change with SCVI.",
                 measured=(
                     f"The first revolution takes {scvi.first:.4f}, the last {scvi.last:.4f}, the exact one "
@@ -205,7 +205,7 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
                 verdict=holds(abs(scvi.last / scvi.first - 1) < 0.01),
                 bears_on=("sc-period", "scvi-structure"),
             ),
-            Check(
+            Comparison(
                 claim="SC with two points is not stable at h = 0.1.",
                 measured=(
                     f"It falls into the centre: the energy is {energy:.2f} for -0.5 at t = {time:.1f}, and the next "
@@ -218,7 +218,7 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("scheme", "first revolution", "last revolution", "2 pi / last", "period of the last energy"),
                 rows=tuple((s, p.first, p.last, p.factor, p.kepler) for s, p in (("SCVI", scvi), ("SC", sc))),
                 formats=dict.fromkeys(("first revolution", "last revolution", "period of the last energy"), ".4f"),
@@ -256,7 +256,7 @@ def _figure_25(_: Mapping[str, Result]) -> Result:
         title="Kepler problem, momentum of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SCVI preserves the momentum; that of SC falls.",
                 measured=(
                     f"Largest error: SCVI {error['SCVI']:.1e}, SC {error['SC']:.2f}; SC ends with "
@@ -292,7 +292,7 @@ def _figure_26(_: Mapping[str, Result]) -> Result:
         title="Kepler problem, energy of SCVI with 2 collocation points and of SC with 3",
         setting=SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="The energy error of SCVI stays bounded, while the energy of SC drifts.",
                 measured=(
                     f"Largest error of SCVI: {early:.2e} in the first half, {late:.2e} in the second. SC ends with "
@@ -325,8 +325,8 @@ def _draw_energies(figure: Figure, t: Array, energies: Mapping[str, Mapping[str,
         axes.legend(loc="upper left", ncols=3)
 
 
-def _series(columns: Mapping[str, Array]) -> Table:
-    return Table(
+def _series(columns: Mapping[str, Array]) -> TableBlock:
+    return TableBlock(
         name="series",
         columns=("t", *columns),
         rows=tuple(zip(_run("SC").t.tolist(), *(series.tolist() for series in columns.values()), strict=True)),

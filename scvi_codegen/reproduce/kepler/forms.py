@@ -18,7 +18,7 @@ from scvi_codegen.methods import SCVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, perihelion, perihelion_turn
 from scvi_codegen.reproduce.kepler.step import structure_of
-from scvi_codegen.reproduce.laboratory.experiment import Check, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, trajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -107,14 +107,14 @@ def _solver(method: Method) -> str:
     return "newton" if isinstance(method, SCVI) else "auto"
 
 
-def structure_table(points: int, gauss: tuple[int, ...]) -> Table:
+def structure_table(points: int, gauss: tuple[int, ...]) -> TableBlock:
     """Symplecticity defect, change of momentum and order of both forms."""
 
     def row(count: int, form: str) -> tuple[str | int | float, ...]:
         found = structure_of(shooting(points, count, form))
         return points, count, form, found.defect, found.momentum, found.order
 
-    return Table(
+    return TableBlock(
         name="structure",
         columns=("points", "Gauss points", "form", "symplecticity defect", "change of momentum in a step", "order"),
         rows=tuple(row(count, form) for count in gauss for form in FORMS),
@@ -122,12 +122,12 @@ def structure_table(points: int, gauss: tuple[int, ...]) -> Table:
     )
 
 
-def structure_check(points: int, gauss: tuple[int, ...], form: str) -> Check:
+def structure_check(points: int, gauss: tuple[int, ...], form: str) -> Comparison:
     """Whether one form is symplectic."""
     found = [structure_of(shooting(points, count, form)) for count in gauss]
     defects = ", ".join(f"{structure.defect:.1e}" for structure in found)
     orders = ", ".join(f"{structure.order:.1f}" for structure in found)
-    return Check(
+    return Comparison(
         claim=f"SCVI is symplectic ({form}).",
         measured=(
             f"One step h = 0.3 with {points} points and {_counts(gauss)} Gauss points: max |J^T Omega J - Omega| = "

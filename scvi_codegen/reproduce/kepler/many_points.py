@@ -26,7 +26,15 @@ from scvi_codegen.reproduce.kepler.forms import (
     structure_table,
 )
 from scvi_codegen.reproduce.laboratory.drawing import draw_error, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,8 +58,8 @@ def _orbits() -> dict[tuple[str, int], Orbit]:
     return {(form, g): orbit_of(shooting(NINE, g, form), STEP, SPAN) for form in FORMS for g in GAUSS}
 
 
-def _many_table() -> Table:
-    return Table(
+def _many_table() -> TableBlock:
+    return TableBlock(
         columns=("form", "Gauss points", "energy error", "momentum error", "turn of the perihelion a revolution"),
         rows=tuple((form, g, *orbit.largest, orbit.turn) for (form, g), orbit in _orbits().items()),
         formats={"Gauss points": "d"},
@@ -69,7 +77,7 @@ def _listed(values: list[float]) -> str:
 def _figure_28(_: Mapping[str, Result]) -> Result:
     orbits = _orbits()
     turns = {form: [abs(orbits[form, g].turn) for g in GAUSS] for form in FORMS}
-    precession = Check(
+    precession = Comparison(
         claim="With 5 Gauss points the orbit precesses and sweeps out an annulus; with 6 and 7 it does not visibly.",
         measured=(
             f"The perihelion turns by {_listed(turns[PRINTED])} rad a revolution as printed, by "
@@ -109,7 +117,7 @@ def _figure_29(_: Mapping[str, Result]) -> Result:
         setting=SETTING,
         checks=(
             *(
-                Check(
+                Comparison(
                     claim=f"SCVI preserves the momentum ({form}).",
                     measured=f"Largest errors with 5, 6, 7 Gauss points: {_listed(errors[form])}.",
                     verdict=holds(max(errors[form]) < EXACT_MOMENTUM),
@@ -117,7 +125,7 @@ def _figure_29(_: Mapping[str, Result]) -> Result:
                 )
                 for form in FORMS
             ),
-            Check(
+            Comparison(
                 claim="More quadrature points make the momentum more accurate.",
                 measured=(
                     f"As printed the error falls {_listed(errors[PRINTED])}, as in the paper's axes; in variational "
@@ -141,7 +149,7 @@ def _figure_30(_: Mapping[str, Result]) -> Result:
         setting=SETTING,
         checks=(
             *(_bounded_check(form, [orbits[form, g].energy for g in GAUSS]) for form in FORMS),
-            Check(
+            Comparison(
                 claim="More quadrature points make the energy more accurate.",
                 measured=(
                     f"Largest errors with 5, 6, 7 Gauss points: {_listed(errors[PRINTED])} as printed, "
@@ -156,10 +164,10 @@ def _figure_30(_: Mapping[str, Result]) -> Result:
     )
 
 
-def _bounded_check(form: str, energies: list[Array]) -> Check:
+def _bounded_check(form: str, energies: list[Array]) -> Comparison:
     """A bounded error is as large in the second half as in the first."""
     growth = [float(np.abs(e[len(e) // 2 :]).max() / np.abs(e[: len(e) // 2]).max()) for e in energies]
-    return Check(
+    return Comparison(
         claim=f"The energy error of SCVI remains bounded ({form}).",
         measured=(
             "The largest error of the second half over that of the first, with 5, 6, 7 Gauss points: "
@@ -170,11 +178,11 @@ def _bounded_check(form: str, energies: list[Array]) -> Check:
     )
 
 
-def _many_series(name: str) -> Table:
+def _many_series(name: str) -> TableBlock:
     orbits = _orbits()
     columns = [getattr(orbit, name).tolist() for orbit in orbits.values()]
     t = orbits[PRINTED, GAUSS[0]].run.t.tolist()
-    return Table(
+    return TableBlock(
         name="series",
         columns=("t", *(f"error {form} {g} Gauss points" for form, g in orbits)),
         rows=tuple(zip(t, *columns, strict=False)),

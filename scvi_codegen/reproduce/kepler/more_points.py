@@ -24,7 +24,7 @@ from scvi_codegen.reproduce.kepler.one_step import (
     superiority,
 )
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,14 +89,14 @@ def _n_refinement(name: str, quantities: tuple[str, str], title: str, _: Mapping
     )
 
 
-def _check_bases(quantities: tuple[str, str]) -> Check:
+def _check_bases(quantities: tuple[str, str]) -> Comparison:
     found = {
         (scheme, quantity): (line[1], paper[1])
         for (scheme, quantity), paper in PAPER_BASES.items()
         if quantity in quantities and (line := bases(scheme, CIRCLE, quantity))
     }
     parts = [f"{s} {q} {base:.2g} (paper {paper:g})" for (s, q), (base, paper) in found.items()]
-    return Check(
+    return Comparison(
         claim="Under N-refinement the errors fall geometrically, like b^N with the bases b of the drawn lines.",
         measured=f"Fitted bases on the circle: {', '.join(parts)}.",
         verdict=holds(all(paper / 2 < base < 2 * paper for base, paper in found.values())),
@@ -104,10 +104,10 @@ def _check_bases(quantities: tuple[str, str]) -> Check:
     )
 
 
-def _check_lines(quantities: tuple[str, str]) -> Check:
+def _check_lines(quantities: tuple[str, str]) -> Comparison:
     """Which eccentricity the lines of the paper belong to."""
     circle, ellipse = (_distance_from_lines(quantities, e) for e in (CIRCLE, ELLIPSE))
-    return Check(
+    return Comparison(
         claim="The lines c b^N run along the errors.",
         measured=(
             f"The typical factor between an error and its line is {circle:.0f} on the circle and {ellipse:.0e} with "
@@ -128,7 +128,7 @@ def _distance_from_lines(quantities: tuple[str, str], e: float) -> float:
     return float(np.exp(np.median(factors)))
 
 
-def _check_superior(quantities: tuple[str, str]) -> Check:
+def _check_superior(quantities: tuple[str, str]) -> Comparison:
     pairs = {(e, q): (_errors("SVI", e, q), _errors("SC", e, q)) for e in (CIRCLE, ELLIPSE) for q in quantities}
     lost = [
         f"of {q} with e = {e:g}, N = {points}"
@@ -140,12 +140,12 @@ def _check_superior(quantities: tuple[str, str]) -> Check:
     return superiority([shares_won(svi, sc) for svi, sc in pairs.values()], otherwise=otherwise)
 
 
-def _bases_table(quantities: tuple[str, str]) -> Table:
+def _bases_table(quantities: tuple[str, str]) -> TableBlock:
     def line(scheme: str, e: float, quantity: str) -> tuple[float | None, float | None]:
         found = bases(scheme, e, quantity)
         return found or (None, None)
 
-    return Table(
+    return TableBlock(
         columns=("e", "scheme", "error of", "c", "b in c b^N", "paper's c", "paper's b"),
         rows=tuple(
             (e, s, q, *line(s, e, q), *PAPER_BASES.get((s, q), (None, None)))
@@ -156,7 +156,7 @@ def _bases_table(quantities: tuple[str, str]) -> Table:
     )
 
 
-def _n_table(quantities: tuple[str, str]) -> Table:
+def _n_table(quantities: tuple[str, str]) -> TableBlock:
     def rows() -> Iterator[tuple[float | None, ...]]:
         for e in (CIRCLE, ELLIPSE):
             columns = [_errors(scheme, e, quantity).tolist() for quantity in quantities for scheme in SCHEMES]
@@ -164,7 +164,7 @@ def _n_table(quantities: tuple[str, str]) -> Table:
                 yield e, points, *(None if error != error else error for error in errors)
 
     names = tuple(f"{quantity} {scheme}" for quantity in quantities for scheme in SCHEMES)
-    return Table(name="errors", columns=("e", "N", *names), rows=tuple(rows()))
+    return TableBlock(name="errors", columns=("e", "N", *names), rows=tuple(rows()))
 
 
 Curves: TypeAlias = Mapping[tuple[float, str], Mapping[str, Array]]

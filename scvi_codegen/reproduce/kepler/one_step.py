@@ -13,7 +13,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, exact_flow, perihelion
-from scvi_codegen.reproduce.laboratory.experiment import Check, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Verdict, holds
 from scvi_codegen.reproduce.laboratory.running import stepper_of
 from scvi_codegen.tables.precision import DIGITS, Number, mp
 from scvi_codegen.tables.tableau import Tableau
@@ -25,7 +25,7 @@ __all__ = [
     "QUANTITIES",
     "ROUNDOFF",
     "SCHEMES",
-    "Errors",
+    "StepErrors",
     "one_step",
     "shares_won",
     "slopes",
@@ -49,7 +49,7 @@ SLOPE_STEPS = ("0.05", "0.025")
 NEGLIGIBLE = mp.mpf(10) ** (5 - DIGITS)
 
 
-class Errors(NamedTuple):
+class StepErrors(NamedTuple):
     """Of the four quantities of Figs. 16-20, absolute values."""
 
     q1: float
@@ -58,11 +58,11 @@ class Errors(NamedTuple):
     energy: float
 
 
-QUANTITIES = Errors._fields
+QUANTITIES = StepErrors._fields
 
 
 @lru_cache(maxsize=4096)
-def one_step(scheme: str, degree: int, e: float, h: float) -> Errors | None:
+def one_step(scheme: str, degree: int, e: float, h: float) -> StepErrors | None:
     """Errors of the compiled step of h from the perihelion; ``None`` where it finds no solution."""
     stepper = stepper_of(SYSTEM, SVI(degree) if scheme == "SVI" else SpectralCollocation(degree), "newton")
     q0, v0 = perihelion(e)
@@ -72,7 +72,7 @@ def one_step(scheme: str, degree: int, e: float, h: float) -> Errors | None:
         return None
     exact, _ = exact_flow(q0, v0, h)
     momentum = float(angular_momentum(q, p)) - math.sqrt(1 - e * e)
-    return Errors(*map(float, np.abs([*(q - exact[0]), momentum, stepper.energy(q, p) + 0.5])))
+    return StepErrors(*map(float, np.abs([*(q - exact[0]), momentum, stepper.energy(q, p) + 0.5])))
 
 
 @lru_cache(maxsize=64)
@@ -132,11 +132,11 @@ def shares_won(svi: Array, sc: Array, *, roundoff: float = ROUNDOFF) -> tuple[in
     return int((svi[counted] < sc[counted]).sum()), int(counted.sum())
 
 
-def superiority(won: list[tuple[int, int]], *, otherwise: str = "") -> Check:
+def superiority(won: list[tuple[int, int]], *, otherwise: str = "") -> Comparison:
     """Conclusion (ii), from counts of :func:`shares_won`; ``otherwise`` says where SVI is not better."""
     smaller, all_ = (sum(column) for column in zip(*won, strict=True))
     mostly = MOSTLY * all_ <= smaller < all_
-    return Check(
+    return Comparison(
         claim="SVI is more accurate than SC with the same number of points and the same step.",
         measured=f"The error of SVI is the smaller one in {smaller} of {all_} comparisons{otherwise}.",
         verdict=Verdict.PARTLY if mostly else holds(smaller == all_),

@@ -16,7 +16,15 @@ from scvi_codegen.methods import SVI, ExplicitEuler, Gauss, SpectralCollocation,
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import kepler, planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_orbit, panels
-from scvi_codegen.reproduce.laboratory.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Cell,
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    holds,
+)
 from scvi_codegen.reproduce.laboratory.running import stepper_of, trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import drift, judged, largest
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -46,7 +54,7 @@ PERIOD = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class PaperRun:
     """A method with its step, and the name of its colour."""
 
     method: Method
@@ -55,10 +63,10 @@ class Run:
 
 
 RUNS = {
-    "explicit Euler": Run(ExplicitEuler(), 0.0025, "Euler"),
-    "Stoermer-Verlet": Run(StoermerVerlet(), 0.1, "Verlet"),
-    "symplectic Runge-Kutta": Run(Gauss(3), 0.25, "SRK"),
-    "Chebyshev collocation": Run(SpectralCollocation(4), 0.25, "SC"),
+    "explicit Euler": PaperRun(ExplicitEuler(), 0.0025, "Euler"),
+    "Stoermer-Verlet": PaperRun(StoermerVerlet(), 0.1, "Verlet"),
+    "symplectic Runge-Kutta": PaperRun(Gauss(3), 0.25, "SRK"),
+    "Chebyshev collocation": PaperRun(SpectralCollocation(4), 0.25, "SC"),
 }
 SAME_AREA = 0.03
 """Relative change of the mean area over three revolutions that counts as none."""
@@ -109,23 +117,23 @@ def _four_methods(_: Mapping[str, Result]) -> Result:
             "The black ellipse is the exact orbit.",
         ),
         checks=(*_checks_of_areas(area), _accuracy(errors), _printed_solution()),
-        tables=(Table(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[3:], ".1e") | {"h": "g"}),),
+        tables=(TableBlock(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[3:], ".1e") | {"h": "g"}),),
         picture=Picture(
             draw=partial(_draw_orbits, {name: (run.q[:, 0], run.q[:, 1]) for name, run in runs.items()}), height=8.0
         ),
     )
 
 
-def _checks_of_areas(area: Mapping[str, float]) -> tuple[Check, Check]:
+def _checks_of_areas(area: Mapping[str, float]) -> tuple[Comparison, Comparison]:
     euler, verlet, srk, sc = (area[name] for name in RUNS)
     return (
-        Check(
+        Comparison(
             claim="Explicit Euler and Chebyshev collocation do not preserve the phase volume; their orbits spiral out.",
             measured=f"The area of the ellipse changes by {euler:+.0%} (Euler) and {sc:+.1%} (collocation).",
             verdict=judged(euler > SAME_AREA, sc > SAME_AREA),
             bears_on=("long-time",),
         ),
-        Check(
+        Comparison(
             claim="Stoermer-Verlet and the symplectic Runge-Kutta method preserve the area of the elliptical orbit.",
             measured=f"It changes by {verlet:+.2%} and {srk:+.2%}; {SAME_AREA:.0%} counts as preserved.",
             verdict=judged(abs(verlet) < SAME_AREA, abs(srk) < SAME_AREA),
@@ -134,16 +142,16 @@ def _checks_of_areas(area: Mapping[str, float]) -> tuple[Check, Check]:
     )
 
 
-def _accuracy(errors: Mapping[str, Array]) -> Check:
+def _accuracy(errors: Mapping[str, Array]) -> Comparison:
     euler, sc = (largest(errors[name]) for name in ("explicit Euler", "Chebyshev collocation"))
-    return Check(
+    return Comparison(
         claim="Chebyshev collocation is much more accurate than explicit Euler with steps 100 times smaller.",
         measured=f"Largest energy error: collocation {sc:.1e}, Euler {euler:.1e}, {euler / sc:.0f} times as much.",
         verdict=holds(euler > 5.0 * sc),
     )
 
 
-def _printed_solution() -> Check:
+def _printed_solution() -> Comparison:
     """Whether (cos t - e, sqrt(1 - e^2) sin t) has the initial velocity and the acceleration of a solution."""
     minor = math.sqrt(1.0 - ECCENTRICITY**2)
     t = np.linspace(0.0, PERIOD, 400)
@@ -151,7 +159,7 @@ def _printed_solution() -> Check:
     residual = -np.array([np.cos(t), minor * np.sin(t)]) + q / np.hypot(*q) ** 3
     time = t - ECCENTRICITY * np.sin(t)
     q2 = largest(q[1] - np.interp(t, time, q[1]))
-    return Check(
+    return Comparison(
         claim="The analytic solution is q1 = cos t - e, q2 = sqrt(1 - e^2) sin t.",
         measured=f"These start with the velocity {minor:.1f} instead of {VELOCITY[1]:.1f} and miss q'' = -q/|q|^3 by "
         f"up to {largest(residual):.1f}. The solution has the eccentric anomaly E, E - e sin E = t, in place of t: the "
@@ -202,18 +210,18 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
             "Third panel: the interpolation of 1/(1 + 16 x^2), Runge's function, with n points.",
         ),
         checks=(
-            Check(
+            Comparison(
                 claim="The quadrature points may or may not be the interpolation points.",
                 measured=f"{common} of 5 Gauss points is a Chebyshev node (the middle), {at_lobatto} of 5 "
                 "Gauss-Lobatto points are Legendre-Gauss-Lobatto nodes.",
                 verdict=judged(common < len(points), at_lobatto == len(points)),
             ),
-            Check(
+            Comparison(
                 claim="The trajectory on a step is the polynomial through Q^0 = q_k, .., Q^s = q_{k+1}.",
                 measured=f"Its end and the compiled step differ by {abs(values[-1] - compiled):.0e}.",
                 verdict=holds(abs(values[-1] - compiled) < 1e-14),
             ),
-            Check(
+            Comparison(
                 claim="Interpolation at Chebyshev and Legendre points converges faster than at equispaced points.",
                 measured=f"Largest error with {RUNGE_COUNTS[-1]} points: "
                 + ", ".join(f"{name} {error:.1e}" for name, error in end.items())
@@ -222,8 +230,8 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            Table(columns=("n", *FAMILIES), rows=rows, formats=dict.fromkeys(FAMILIES, ".1e"), shown=False),
-            Table(
+            TableBlock(columns=("n", *FAMILIES), rows=rows, formats=dict.fromkeys(FAMILIES, ".1e"), shown=False),
+            TableBlock(
                 name="curve",
                 columns=("node", "Q"),
                 rows=tuple(zip(nodes.tolist(), values.tolist(), strict=True)),

@@ -28,7 +28,15 @@ from scvi_codegen.reproduce.kepler.forms import (
 )
 from scvi_codegen.reproduce.kepler.motion import ellipse
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,14 +89,14 @@ def _with_less_eccentricity() -> str:
     return f" With e = {ROUNDER:g}: energy {energy:.1e}, momentum {momentum:.1e}."
 
 
-def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -> Check:
+def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -> Comparison:
     parts = []
     for name in names:
         energy, momentum = orbits[name].largest
         lost = f", lost at t = {orbits[name].lost:.1f}" if orbits[name].lost < orbits[name].end else ""
         parts.append(f"{name}: energy {energy:.1e}, momentum {momentum:.1e}{lost}")
     kept = [not orbits[name].failed and orbits[name].largest[0] < KEPT for name in names]
-    return Check(
+    return Comparison(
         claim=f"The phase trajectories are preserved by {', '.join(names)}.",
         measured=f"Largest errors: {'; '.join(parts)}.{more}",
         verdict=Verdict.PARTLY if any(kept) and not all(kept) else holds(all(kept)),
@@ -96,10 +104,10 @@ def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -
     )
 
 
-def _sc_check(orbit: Orbit) -> Check:
+def _sc_check(orbit: Orbit) -> Comparison:
     half = len(orbit.energy) // 2
     early, late = (float(np.abs(part).max()) for part in (orbit.energy[:half], orbit.energy[half:]))
-    return Check(
+    return Comparison(
         claim="SC does not preserve the phase trajectory.",
         measured=(
             f"Its largest energy error is {early:.3f} in the first half and {late:.3f} in the second, its momentum is "
@@ -110,8 +118,8 @@ def _sc_check(orbit: Orbit) -> Check:
     )
 
 
-def _orbits_table(orbits: Mapping[str, Orbit]) -> Table:
-    return Table(
+def _orbits_table(orbits: Mapping[str, Orbit]) -> TableBlock:
+    return TableBlock(
         columns=("method", "energy error", "momentum error", "energy off by a tenth at t", "last t"),
         rows=tuple(
             (name, *orbit.largest, orbit.lost if orbit.lost < orbit.end else None, orbit.end)

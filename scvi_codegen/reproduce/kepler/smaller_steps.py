@@ -27,7 +27,15 @@ from scvi_codegen.reproduce.kepler.one_step import (
     superiority,
 )
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,7 +98,7 @@ def _h_refinement(name: str, quantities: tuple[str, ...], title: str, _: Mapping
     )
 
 
-def _check_powers() -> Check:
+def _check_powers() -> Comparison:
     """Whether the powers of the paper's lines are those of the circle with N points."""
     _, e, degree = READINGS[0]
     found = {
@@ -99,7 +107,7 @@ def _check_powers() -> Check:
     }
     drawn = {quantity: {round(power) for _, power in lines} for quantity, lines in PAPER_POWERS.items()}
     same = sum(found[quantity] == drawn[quantity] for quantity in drawn)
-    return Check(
+    return Comparison(
         claim="The errors of q1 fall like h^2, h^4, h^6, h^8, h^12, those of q2 like h^3, h^5, h^7, h^10.",
         measured=(
             f"With N points: q1 {_listed(found['q1'])} and q2 {_listed(found['q2'])}; h^11 is a line of SVI with six "
@@ -113,12 +121,12 @@ def _listed(powers: set[int]) -> str:
     return ", ".join(f"h^{power}" for power in sorted(powers))
 
 
-def _check_slopes(quantity: str) -> Check:
+def _check_slopes(quantity: str) -> Comparison:
     """The slopes of both readings; an SVI keeps the momentum in any case."""
     e_and_degrees = [(e, degree(n)) for _, e, degree in READINGS for n in LEGEND]
     exact = all(_slope("SVI", d, e, quantity) is None for e, d in e_and_degrees)
     faster = all((_slope("SVI", d, e, quantity) or 99) > (_slope("SC", d, e, quantity) or 0) for e, d in e_and_degrees)
-    return Check(
+    return Comparison(
         claim=f"The error of the {quantity} falls faster with h for SVI than for SC.",
         measured=f"{_slopes_text(quantity, 0)} with N points; {_slopes_text(quantity, 1)} with N the degree.",
         verdict=holds(exact if quantity == "momentum" else faster),
@@ -136,7 +144,7 @@ def _slopes_text(quantity: str, reading: int) -> str:
     return f"{quantity} {' and '.join(parts)}"
 
 
-def _check_superior_h(quantities: tuple[str, ...]) -> Check:
+def _check_superior_h(quantities: tuple[str, ...]) -> Comparison:
     pairs = [
         (_h_errors("SVI", degree(n), e, q), _h_errors("SC", degree(n), e, q))
         for _, e, degree in READINGS
@@ -148,8 +156,8 @@ def _check_superior_h(quantities: tuple[str, ...]) -> Check:
     return superiority([shares_won(svi, sc) for svi, sc in pairs], otherwise=otherwise)
 
 
-def _slopes_table(quantities: tuple[str, ...]) -> Table:
-    return Table(
+def _slopes_table(quantities: tuple[str, ...]) -> TableBlock:
+    return TableBlock(
         columns=("reading", "N", "degree", "scheme", *(f"slope of {quantity}" for quantity in quantities)),
         rows=tuple(
             (reading, n, degree(n), scheme, *(_slope(scheme, degree(n), e, quantity) for quantity in quantities))
@@ -161,7 +169,7 @@ def _slopes_table(quantities: tuple[str, ...]) -> Table:
     )
 
 
-def _h_table(quantity: str) -> Table:
+def _h_table(quantity: str) -> TableBlock:
     def column(scheme: str, degree: int, e: float) -> list[float | None]:
         return [None if error != error else error for error in _h_errors(scheme, degree, e, quantity).tolist()]
 
@@ -171,7 +179,7 @@ def _h_table(quantity: str) -> Table:
             for n in LEGEND:
                 names.append(f"{scheme} degree {degree(n)} e {e:g}")
                 columns.append(column(scheme, degree(n), e))
-    return Table(
+    return TableBlock(
         name=f"errors-{quantity}", columns=("h", *names), rows=tuple(zip(STEPS, *columns, strict=True)), shown=False
     )
 

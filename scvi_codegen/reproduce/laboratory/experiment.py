@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from scvi_codegen.display.page.blocks import Block, Cell, Formula, Listing, Paragraph, Table
+from scvi_codegen.display.page.blocks import Block, Cell, Formula, Listing, Paragraph, TableBlock
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 __all__ = [
     "Block",
     "Cell",
-    "Check",
+    "Comparison",
     "Experiment",
     "Formula",
     "Listing",
     "Paragraph",
     "Picture",
     "Result",
-    "Table",
+    "TableBlock",
     "Verdict",
     "common_verdict",
     "holds",
@@ -49,7 +49,7 @@ def holds(condition: bool) -> Verdict:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
+class Comparison:
     """One statement of the paper beside what was measured.
 
     Attributes:
@@ -65,7 +65,7 @@ class Check:
     bears_on: tuple[str, ...] = ()
 
 
-def common_verdict(checks: Iterable[Check]) -> Verdict:
+def common_verdict(checks: Iterable[Comparison]) -> Verdict:
     """Of several checks: ``PARTLY`` where they differ, ``SHOWN`` where none decides anything."""
     found = {check.verdict for check in checks} - {Verdict.SHOWN}
     if not found:
@@ -99,8 +99,8 @@ class Result:
     name: str
     title: str
     setting: tuple[str, ...]
-    checks: tuple[Check, ...] = ()
-    tables: tuple[Table, ...] = ()
+    checks: tuple[Comparison, ...] = ()
+    tables: tuple[TableBlock, ...] = ()
     picture: Picture | None = None
     body: tuple[Block, ...] = ()
 

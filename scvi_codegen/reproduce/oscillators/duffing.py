@@ -13,7 +13,15 @@ from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import duffing
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels, thinned
-from scvi_codegen.reproduce.laboratory.experiment import Cell, Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Cell,
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    holds,
+)
 from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
     area_change,
@@ -102,14 +110,14 @@ def _phase(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-11"],
         setting=(*SETTING, "T = 500."),
         checks=(
-            Check(
+            Comparison(
                 claim="Magnified, the phase trajectories of SVI and SRK are very regular, that of SC much less so.",
                 measured="Between neighbours along the curve the distance from the exact curve jumps by at most "
                 f"{rough[svi]:.0e} (SVI), {rough[srk]:.0e} (SRK6) and {rough[sc]:.0e} (SC).",
                 verdict=judged(rough[sc] > 3.0 * rough[svi], rough[sc] > 3.0 * rough[srk]),
                 bears_on=("long-time",),
             ),
-            Check(
+            Comparison(
                 claim="SVI is more accurate in phase than SC with the same points and step.",
                 measured=f"Largest distance from the exact curve: SVI {away[svi]:.1e}, SC {away[sc]:.1e}, "
                 f"SRK6 {away[srk]:.1e}.",
@@ -117,7 +125,7 @@ def _phase(_: Mapping[str, Result]) -> Result:
                 bears_on=("accuracy",),
             ),
         ),
-        tables=(Table(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[1:], ".1e")),),
+        tables=(TableBlock(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[1:], ".1e")),),
         picture=Picture(draw=partial(_draw_phase, orbits, _level_curve()), width=10.0, height=8.6),
     )
 
@@ -158,11 +166,11 @@ def _energy(_: Mapping[str, Result]) -> Result:
     )
 
 
-def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Check, ...]:
+def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Comparison, ...]:
     size = {scheme: largest(error) for scheme, error in errors.items()}
     svi, sc, srk, finer_svi, finer_sc = errors
     return (
-        Check(
+        Comparison(
             claim="SVI achieves significantly higher-order energy accuracy than the 6th-order symplectic Runge-Kutta "
             "method.",
             measured=f"Largest energy error: SVI {size[svi]:.1e}, SRK6 {size[srk]:.1e}, "
@@ -170,13 +178,13 @@ def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Check, ...]:
             verdict=holds(size[srk] > 10.0 * size[svi]),
             bears_on=("efficiency",),
         ),
-        Check(
+        Comparison(
             claim="SVI is more accurate in energy than SC with the same points and step.",
             measured=f"SVI {size[svi]:.1e}, SC {size[sc]:.1e}; degree 6: {size[finer_svi]:.1e}, {size[finer_sc]:.1e}.",
             verdict=judged(size[svi] < size[sc], size[finer_svi] < size[finer_sc]),
             bears_on=("accuracy",),
         ),
-        Check(
+        Comparison(
             claim="SVI and SRK exhibit good long-term energy stability, SC drifts.",
             measured=f"Drift from the first to the last fifth: SVI {drift(errors[svi]):.0e}, SRK6 "
             f"{drift(errors[srk]):.0e}, SC {drift(errors[sc]):.0e}.",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import MethodWarning
 from scvi_codegen.methods import SVI
 from scvi_codegen.reproduce.laboratory.drawing import largest_in_bins
-from scvi_codegen.reproduce.laboratory.experiment import Cell, Table, Verdict
+from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock, Verdict
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -112,21 +112,21 @@ def offset_from_curve(run: Trajectory, *, distance: float = 1e-5) -> Array:
     return offset
 
 
-def energy_table(runs: Mapping[str, Trajectory]) -> Table:
+def energy_table(runs: Mapping[str, Trajectory]) -> TableBlock:
     """Largest energy error, drift and change of the enclosed area of each run, by scheme."""
     rows: list[tuple[Cell, ...]] = []
     for scheme, run in runs.items():
         error = energy_error(run)
         rows.append((scheme, run.stepper.title.partition(": ")[2], largest(error), drift(error), area_change(run)))
-    return Table(
+    return TableBlock(
         columns=("scheme", "method", "largest energy error", "drift of the energy", "change of the phase area"),
         rows=tuple(rows),
         formats={"largest energy error": ".2e", "drift of the energy": ".1e", "change of the phase area": ".1e"},
     )
 
 
-def curves_table(name: str, t: Array, errors: Mapping[str, Array], *, bins: int = 1000) -> Table:
+def curves_table(name: str, t: Array, errors: Mapping[str, Array], *, bins: int = 1000) -> TableBlock:
     """The curves of a picture of errors over time; of long ones the largest |error| in each bin."""
     columns = [largest_in_bins(t, error, bins=bins) for error in errors.values()]
     rows = zip(columns[0][0].tolist(), *(values.tolist() for _, values in columns), strict=True)
-    return Table(name=name, columns=("t", *errors), rows=tuple(map(tuple, rows)), shown=False)
+    return TableBlock(name=name, columns=("t", *errors), rows=tuple(map(tuple, rows)), shown=False)

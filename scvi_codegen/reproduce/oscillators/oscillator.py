@@ -13,7 +13,15 @@ from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import harmonic_oscillator
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of, trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
     curves_table,
@@ -94,20 +102,22 @@ def _phase_trajectories(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-3"],
         setting=(SYSTEM, "h = 1, T = 100.", NINE_POINTS, QUADRATURES, TOLERANCE),
         checks=(
-            Check(
+            Comparison(
                 claim="Plotted every five steps, the phase trajectories of SVI and SC show their differences.",
                 measured=f"The states are off the exact ones by at most {apart['SVI']:.1e} (SVI) and {apart['SC']:.1e} "
                 f"(SC); a line of the picture is {VISIBLE:g} wide, so both lie on the exact states.",
                 verdict=holds(apart["SC"] > VISIBLE),
             ),
-            Check(
+            Comparison(
                 claim="SVI is more accurate in phase than SC with the same points and step.",
                 measured=f"Largest error of a state: SVI {apart['SVI']:.1e}, SC {apart['SC']:.1e}.",
                 verdict=holds(apart["SVI"] < apart["SC"]),
                 bears_on=("accuracy",),
             ),
         ),
-        tables=(Table(columns=("t", "q SVI", "p SVI", "q SC", "p SC"), rows=tuple(map(tuple, rows)), shown=False),),
+        tables=(
+            TableBlock(columns=("t", "q SVI", "p SVI", "q SC", "p SC"), rows=tuple(map(tuple, rows)), shown=False),
+        ),
         picture=Picture(draw=partial(_draw_phase, points)),
     )
 
@@ -134,13 +144,13 @@ def _position_errors(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-4"],
         setting=(SYSTEM, "h = 1, T = 100.", NINE_POINTS, QUADRATURES, TOLERANCE),
         checks=(
-            Check(
+            Comparison(
                 claim="The position error of SC is several orders of magnitude bigger than that of SVI.",
                 measured="Largest errors: " + _listed(sizes) + ".",
                 verdict=judged(*(sizes[sc] > 100.0 * sizes[scheme] for scheme in svi)),
                 bears_on=("accuracy",),
             ),
-            Check(
+            Comparison(
                 claim="The error of SC grows; that of SVI appears to be bounded and remains small.",
                 measured="From t <= 20 to t <= 100 the largest error grows by "
                 + ", ".join(f"{sizes[s] / early[s]:.1f} ({s}, to {sizes[s]:.1e})" for s in METHODS)
@@ -148,7 +158,7 @@ def _position_errors(_: Mapping[str, Result]) -> Result:
                 verdict=judged(*(sizes[s] < 1e-14 or sizes[s] < 2.0 * early[s] for s in svi)),
                 bears_on=("long-time",),
             ),
-            Check(
+            Comparison(
                 claim="The axis of the panel of SVI is scaled by 1e-11; the number of quadrature points is not given.",
                 measured=f"Such an error belongs to 7 Gauss points, one fewer than the degree ({sizes[svi[0]]:.1e}); "
                 f"with 8 and 9 it is {sizes[svi[1]]:.1e} and {sizes[svi[2]]:.1e}, round-off.",
@@ -156,7 +166,7 @@ def _position_errors(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("scheme", "largest position error to t = 20", "to t = 100"),
                 rows=tuple((scheme, early[scheme], sizes[scheme]) for scheme in METHODS),
                 formats={"largest position error to t = 20": ".2e", "to t = 100": ".2e"},
@@ -187,13 +197,13 @@ def _energy_errors(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-5"],
         setting=(SYSTEM, "h = 1, T = 500.", NINE_POINTS, QUADRATURES, TOLERANCE),
         checks=(
-            Check(
+            Comparison(
                 claim="The energy error of SC is much bigger than that of SVI.",
                 measured="Largest energy errors: " + _listed(sizes) + ".",
                 verdict=judged(*(sizes["SC"] > 100.0 * sizes[scheme] for scheme in svi)),
                 bears_on=("accuracy",),
             ),
-            Check(
+            Comparison(
                 claim="The energy error of SC grows much faster than that of SVI.",
                 measured=f"Drift: {', '.join(f'{s}: ' + ('yes' if drifts(errors[s]) else 'no') for s in METHODS)}.",
                 verdict=holds(drifts(errors["SC"]) and not any(drifts(errors[scheme]) for scheme in svi)),
@@ -201,7 +211,7 @@ def _energy_errors(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("scheme", "largest energy error"),
                 rows=tuple(sizes.items()),
                 formats={"largest energy error": ".2e"},
@@ -276,8 +286,8 @@ def _convergence(_: Mapping[str, Result]) -> Result:
         ),
         checks=(_geometric(fits), _bases(fits), _ahead(errors)),
         tables=(
-            Table(columns=("scheme", "N", "error of q", "error of the energy"), rows=rows, formats=formats),
-            Table(
+            TableBlock(columns=("scheme", "N", "error of q", "error of the energy"), rows=rows, formats=formats),
+            TableBlock(
                 name="fits",
                 columns=("scheme", "error of", "C", "K", "printed C", "printed K"),
                 rows=fitted,
@@ -291,14 +301,14 @@ def _convergence(_: Mapping[str, Result]) -> Result:
 Fits = Mapping[str, list[tuple[float, float] | None]]
 
 
-def _geometric(fits: Fits) -> Check:
+def _geometric(fits: Fits) -> Comparison:
     found = {
         f"{what} of {scheme}": fit[1]
         for scheme in fits
         for what, fit in zip(("q", "energy"), fits[scheme], strict=True)
         if fit
     }
-    return Check(
+    return Comparison(
         claim="SVI and SC converge geometrically in the degree.",
         measured=f"Fitted bases K: {', '.join(f'{key}: {base:.2f}' for key, base in found.items())}; the energy of SVI "
         f"with s Gauss points has no error but round-off (at most {largest(_refined('SVI, s Gauss points')[1]):.0e}).",
@@ -307,9 +317,9 @@ def _geometric(fits: Fits) -> Check:
     )
 
 
-def _bases(fits: Fits) -> Check:
+def _bases(fits: Fits) -> Comparison:
     pairs = {scheme: (fit[0][1], PRINTED_BASES[scheme][1]) for scheme, fit in fits.items() if fit[0]}
-    return Check(
+    return Comparison(
         claim="The errors follow 1e14 (0.09)^N (SVI) and 1e10 (0.21)^N (SC), the lines of the legend.",
         measured="Fitted and printed K of q: "
         + ", ".join(f"{scheme}: {base:.3f}, {printed:g}" for scheme, (base, printed) in pairs.items())
@@ -318,7 +328,7 @@ def _bases(fits: Fits) -> Check:
     )
 
 
-def _ahead(errors: Mapping[str, tuple[Array, Array]]) -> Check:
+def _ahead(errors: Mapping[str, tuple[Array, Array]]) -> Comparison:
     """SVI against SC at the degrees that both have, where SC resolves the step and is above round-off."""
     svi, sc = errors["SVI, s+1 Gauss points"], errors["SC"]
     wins, cases = 0, 0
@@ -326,7 +336,7 @@ def _ahead(errors: Mapping[str, tuple[Array, Array]]) -> Check:
         compared = (theirs[: len(ours)] > FITTED[0]) & (theirs[: len(ours)] < FITTED[1])
         wins += int(np.count_nonzero(compared & (ours < theirs[: len(ours)])))
         cases += int(np.count_nonzero(compared))
-    return Check(
+    return Comparison(
         claim="SVI is more accurate than SC in configuration and energy at every N.",
         measured=f"SVI with s + 1 Gauss points is more accurate in {wins} of {cases} errors of SC that lie between "
         f"{FITTED[0]:g} and {FITTED[1]:g}.",

@@ -13,7 +13,15 @@ from scvi_codegen.exact.step import derived_step
 from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_powers, panels
-from scvi_codegen.reproduce.laboratory.experiment import Cell, Check, Experiment, Picture, Result, Table, Verdict
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Cell,
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+)
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
 from scvi_codegen.reproduce.oscillators.one_degree import judged, svi_with_points
 from scvi_codegen.reproduce.oscillators.oscillator import OSCILLATOR, POSITION, SYSTEM, VELOCITY
@@ -104,7 +112,7 @@ def _of_energy(_: Mapping[str, Result]) -> Result:
     return _result("figure-8", "energy", (MORE, EQUAL, FEWER), (_printed_powers("energy"), _ahead("energy", MORE)))
 
 
-def _result(name: str, what: str, shown: tuple[str, ...], checks: tuple[Check, ...]) -> Result:
+def _result(name: str, what: str, shown: tuple[str, ...], checks: tuple[Comparison, ...]) -> Result:
     exact = {(scheme, degree): _exact_errors(scheme, degree)[what] for scheme in (*shown, SC) for degree in DEGREES}
     compiled = {key: _compiled_errors(*key)[what] for key in exact if key[0] != FEWER}
     rows: list[tuple[Cell, ...]] = []
@@ -118,12 +126,12 @@ def _result(name: str, what: str, shown: tuple[str, ...], checks: tuple[Check, .
         setting=SETTING,
         checks=checks,
         tables=(
-            Table(
+            TableBlock(
                 columns=("scheme", "N", "fitted power of h", "constant"),
                 rows=tuple(rows),
                 formats={"fitted power of h": ".2f", "constant": ".1e"},
             ),
-            Table(
+            TableBlock(
                 name="errors",
                 columns=("h", *columns),
                 rows=tuple(zip(STEPS, *(values.tolist() for values in columns.values()), strict=True)),
@@ -136,7 +144,7 @@ def _result(name: str, what: str, shown: tuple[str, ...], checks: tuple[Check, .
     )
 
 
-def _printed_powers(what: str) -> Check:
+def _printed_powers(what: str) -> Comparison:
     """Whether each power of the legend is that of some curve, the quadrature being N Gauss points, or N + 1."""
     fits = {key: fit[1] for key, fit in _powers(what).items() if fit}
     schemes = {
@@ -151,7 +159,7 @@ def _printed_powers(what: str) -> Check:
     if missing:
         outcome = f"Not found with N or N + 1 Gauss points: {_powers_of_h(missing)}"
         outcome += f" (with N - 1: {_powers_of_h(sorted(with_fewer.intersection(missing))) or 'neither'})"
-    return Check(
+    return Comparison(
         claim=f"The errors of N = 2, 4, 6 follow the lines {_powers_of_h(PRINTED[what])} of the legend.",
         measured=f"Fitted powers: {'; '.join(f'{scheme}: {powers}' for scheme, powers in schemes.items())}. {outcome}.",
         verdict=verdict,
@@ -162,13 +170,13 @@ def _powers_of_h(powers: Iterable[int]) -> str:
     return ", ".join(f"h^{power}" for power in powers)
 
 
-def _ahead(what: str, scheme: str) -> Check:
+def _ahead(what: str, scheme: str) -> Comparison:
     """SVI against SC at every degree and step, as the methods are, without round-off."""
     pairs = [(_exact_errors(scheme, n)[what], _exact_errors(SC, n)[what]) for n in DEGREES]
     wins = sum(int(np.count_nonzero(svi < sc)) for svi, sc in pairs)
     lost = sorted({f"{STEPS[k]:.3g}" for svi, sc in pairs for k in np.flatnonzero(svi >= sc)}, key=float)
     cases = len(STEPS) * len(DEGREES)
-    return Check(
+    return Comparison(
         claim=f"SVI is more accurate than SC in {what} with the same number of points and the same step.",
         measured=f"{scheme}, is more accurate in {wins} of {cases} pairs of N and h, from h = {STEPS[0]:g} "
         f"to {STEPS[-1]:.2g}" + (f"; not at h = {', '.join(lost)}." if lost else "."),

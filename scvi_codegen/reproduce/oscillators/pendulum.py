@@ -14,7 +14,7 @@ from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, panels, thinned
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
     area_change,
@@ -103,14 +103,14 @@ def _phase_of_long_run(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-9"],
         setting=LONG_SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SVI and the symplectic Runge-Kutta method preserve the phase area.",
                 measured="Between the first and the last fifth of the run the area inside the states changes by "
                 f"{areas['SVI, degree 3']:.1e} (SVI) and {areas['SRK4']:.1e} (SRK4), relatively.",
                 verdict=holds(max(abs(areas["SVI, degree 3"]), abs(areas["SRK4"])) < SMALL_AREA),
                 bears_on=("long-time",),
             ),
-            Check(
+            Comparison(
                 claim="A drift is observed in the phase trajectory of SC.",
                 measured=f"The area changes by {areas['SC, degree 3']:+.1%} (degree 4: {areas['SC, degree 4']:+.2%}).",
                 verdict=holds(abs(areas["SC, degree 3"]) > 10.0 * SMALL_AREA),
@@ -151,32 +151,32 @@ def _energy_of_long_run(_: Mapping[str, Result]) -> Result:
     )
 
 
-def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Check, ...]:
+def _checks_of_energy(errors: Mapping[str, Array]) -> tuple[Comparison, ...]:
     size = {scheme: largest(error) for scheme, error in errors.items()}
     svi, sc, srk, finer_svi, finer_sc = errors
     drifting = errors[sc]
     return (
-        Check(
+        Comparison(
             claim="SVI and the symplectic Runge-Kutta method preserve the energy very well over the whole time.",
             measured=f"Largest error and drift: SVI {size[svi]:.1e}, {drift(errors[svi]):.0e}; SRK4 {size[srk]:.1e}, "
             f"{drift(errors[srk]):.0e}; SVI of degree 4 {size[finer_svi]:.1e}, {drift(errors[finer_svi]):.0e}.",
             verdict=judged(*(not drifts(errors[scheme]) for scheme in (svi, srk, finer_svi))),
             bears_on=("long-time",),
         ),
-        Check(
+        Comparison(
             claim="The energy error of SC drifts.",
             measured=f"It grows to {size[sc]:.1e} (degree 4: {size[finer_sc]:.1e}), "
             f"{drift(drifting) / drifting[-1]:.0%} of it between the first and the last fifth of the run.",
             verdict=judged(drifts(drifting), drifts(errors[finer_sc])),
             bears_on=("long-time",),
         ),
-        Check(
+        Comparison(
             claim="SVI is more accurate in energy than SC with the same points and step.",
             measured=f"SVI {size[svi]:.1e}, SC {size[sc]:.1e}; degree 4: {size[finer_svi]:.1e}, {size[finer_sc]:.1e}.",
             verdict=judged(size[svi] < size[sc], size[finer_svi] < size[finer_sc]),
             bears_on=("accuracy",),
         ),
-        Check(
+        Comparison(
             claim="SVI achieves a higher accuracy than the 4th-order symplectic Runge-Kutta method.",
             measured=f"Its energy error is {size[srk] / size[svi]:.0f} times smaller.",
             verdict=holds(size[svi] < size[srk]),
@@ -207,14 +207,14 @@ def _phase_with_two_points(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-21"],
         setting=SHORT_SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SCVI preserves the area in phase space, as a symplectic integrator does.",
                 measured=f"The determinant of one step at (0.3, 0.2) is 1 {factors['SCVI']:+.0e} by differences; the "
                 f"area inside the states changes by {areas['SCVI']:.0e} over the run.",
                 verdict=judged(abs(factors["SCVI"]) < 1e-10, abs(areas["SCVI"]) < SMALL_AREA),
                 bears_on=("scvi-structure",),
             ),
-            Check(
+            Comparison(
                 claim="The trajectory of SC decays in phase space.",
                 measured=f"The determinant of one step is 1 {factors['SC']:+.1e}; the area changes by "
                 f"{areas['SC']:+.0%} between the first and the last fifth of the run.",
@@ -236,14 +236,14 @@ def _energy_with_two_points(_: Mapping[str, Result]) -> Result:
         title=TITLES["figure-22"],
         setting=SHORT_SETTING,
         checks=(
-            Check(
+            Comparison(
                 claim="SCVI preserves the energy very well.",
                 measured=f"Largest error {sizes['SCVI']:.1e}, {sizes['SCVI'] / depth:.0e} of the energy above rest; "
                 f"drift {drift(errors['SCVI']):.0e}.",
                 verdict=judged(sizes["SCVI"] < 1e-5 * depth, not drifts(errors["SCVI"])),
                 bears_on=("scvi-structure",),
             ),
-            Check(
+            Comparison(
                 claim="SC performs much more poorly in preserving the energy.",
                 measured=f"It loses {-errors['SC'][-1]:.1e}, {-errors['SC'][-1] / depth:.0%} of the energy above rest.",
                 verdict=holds(sizes["SC"] > 100.0 * sizes["SCVI"]),

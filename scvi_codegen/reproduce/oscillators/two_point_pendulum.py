@@ -16,12 +16,12 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
-    Check,
+    Comparison,
     Experiment,
     Formula,
     Paragraph,
     Result,
-    Table,
+    TableBlock,
     holds,
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
@@ -137,7 +137,7 @@ def section_4_3(results: Mapping[str, Result]) -> Result:
         ),
         checks=(*_symbolic_checks(scheme), *_correction_checks(), _numerical_check(rows)),
         tables=(
-            Table(
+            TableBlock(
                 columns=(
                     "q_k",
                     "p_k",
@@ -176,13 +176,13 @@ def _vanishes(expression: sympy.Expr) -> bool:
     return bool(sympy.expand(expression) == 0)
 
 
-def _symbolic_checks(scheme: Scheme) -> Iterator[Check]:
+def _symbolic_checks(scheme: Scheme) -> Iterator[Comparison]:
     for number, found, printed, claim in (
         ("36", scheme.stage, printed_36(), "(34a) has the form (36)"),
         ("37", scheme.momentum, printed_37(), "(34d) can be rewritten as (37)"),
     ):
         same = _vanishes(found - printed)
-        yield Check(
+        yield Comparison(
             claim=f"For two points {claim}.",
             measured=f"The difference of the derived and the printed ({number}) "
             + ("simplifies to 0." if same else f"is {sympy.simplify(found - printed)}."),
@@ -191,7 +191,7 @@ def _symbolic_checks(scheme: Scheme) -> Iterator[Check]:
     start, end = (
         _vanishes(e) for e in (p + sympy.diff(action(), q) - scheme.momentum, sympy.diff(action(), new) - scheme.end)
     )
-    yield Check(
+    yield Comparison(
         claim="The scheme is symplectic.",
         measured=f"With L_d of (33), p_k = -dL_d/dq_k {'is' if start else 'is not'} (37) and p_(k+1) = dL_d/dq_(k+1) "
         f"{'is' if end else 'is not'} (34e): "
@@ -201,10 +201,10 @@ def _symbolic_checks(scheme: Scheme) -> Iterator[Check]:
     )
 
 
-def _correction_checks() -> Iterator[Check]:
+def _correction_checks() -> Iterator[Comparison]:
     points, weights = exact_rule(gauss_legendre(2)) or ((), ())
     listed = ", ".join(map(str, weights))
-    yield Check(
+    yield Comparison(
         claim="The two-point Gauss formula has w = +-1 and tau = +-1/sqrt(3).",
         measured=f"The points are {', '.join(map(str, points))}; the weights are {listed}, and so they are in the "
         "paper's A_k, G_k and (37).",
@@ -213,7 +213,7 @@ def _correction_checks() -> Iterator[Check]:
     left = q / h - new / h - printed_g()
     rest = sympy.expand(left - printed_37() + 2 * printed_g())
     corrected = _vanishes(left + 2 * printed_g() + p - printed_37())
-    yield Check(
+    yield Comparison(
         claim="(27a) in matrix form is A~Q~ = G, (28).",
         measured=f"With the printed entries A~Q~ - G differs from (37) by {rest} - 2 G; "
         f"A~Q~ = -G - (p_k, 0, .., 0)^T {'is' if corrected else 'is not'} (37).",
@@ -221,9 +221,9 @@ def _correction_checks() -> Iterator[Check]:
     )
 
 
-def _numerical_check(rows: Sequence[Sequence[float]]) -> Check:
+def _numerical_check(rows: Sequence[Sequence[float]]) -> Comparison:
     residual, end, apart = (max(abs(row[i]) for row in rows) for i in (-3, -2, -1))
-    return Check(
+    return Comparison(
         claim="q_(k+1) and v_k follow from (36), (37), then p_(k+1) from (34e).",
         measured=f"{len(rows)} steps of the compiled integrator, h from {rows[0][2]} to {rows[-1][2]}: h times the "
         f"residual of (37) at most {residual:.1e}, error of p_(k+1) at most {end:.1e}; SVI of degree 1 gives the same "

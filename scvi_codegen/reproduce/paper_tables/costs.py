@@ -20,7 +20,15 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import duffing, planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -186,8 +194,8 @@ def _result(setting: Setting) -> Result:
     )
 
 
-def _table(setting: Setting, found: Mapping[str, Cost]) -> Table:
-    return Table(
+def _table(setting: Setting, found: Mapping[str, Cost]) -> TableBlock:
+    return TableBlock(
         columns=(
             "scheme",
             "method",
@@ -244,39 +252,39 @@ def _bars(setting: Setting, found: Mapping[str, Cost]) -> tuple[Bars, ...]:
     )
 
 
-def _checks(setting: Setting, found: Mapping[str, Cost]) -> Sequence[Check]:
+def _checks(setting: Setting, found: Mapping[str, Cost]) -> Sequence[Comparison]:
     srk, svi, sc = (found[scheme] for scheme in ("SRK", "SVI", "SC"))
     ratio, printed = svi.seconds / srk.seconds, setting.seconds["SVI"] / setting.seconds["SRK"]
     share = svi.seconds_a_digit / srk.seconds_a_digit
     by_sc = svi.seconds / sc.seconds
     return (
-        Check(
+        Comparison(
             claim=f"SVI takes less time than SRK at the same step ({printed:.2f} of it).",
             measured=f"SVI takes {ratio:.2f} of the time of SRK ({1e3 * svi.seconds:.2f} and "
             f"{1e3 * srk.seconds:.2f} ms).",
             verdict=_cheaper(ratio),
             bears_on=("svi-cheaper", "efficiency"),
         ),
-        Check(
+        Comparison(
             claim="SVI is more accurate than SRK at the same step.",
             measured=f"Energy error {svi.energy:.1e}, that of SRK {srk.energy:.1e}; error of the final position "
             f"{svi.position:.1e}, that of SRK {srk.position:.1e}.",
             verdict=_both(svi.energy < srk.energy, svi.position < srk.position),
             bears_on=("svi-cheaper", "efficiency"),
         ),
-        Check(
+        Comparison(
             claim="SVI reaches higher accuracy at a lower cost than SRK.",
             measured=f"A correct digit of the final position takes {_of_a_digit(svi)} with SVI and "
             f"{_of_a_digit(srk)} with SRK{f', a ratio of {share:.2f}' if share > 0.0 else ''}.",
             verdict=_cheaper(share),
             bears_on=("svi-cheaper", "efficiency"),
         ),
-        Check(
+        Comparison(
             claim=f"SVI costs more than SC ({setting.seconds['SVI'] / setting.seconds['SC']:.1f} times).",
             measured=f"SVI takes {by_sc:.2f} of the time of SC.",
             verdict=_cheaper(1.0 / by_sc),
         ),
-        Check(
+        Comparison(
             claim="SVI is much more accurate than SC over the long run.",
             measured=f"Energy error {svi.energy:.1e}, that of SC {sc.energy:.1e}; error of the final position "
             f"{svi.position:.1e}, that of SC {sc.position:.1e}.",

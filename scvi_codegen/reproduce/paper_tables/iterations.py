@@ -17,7 +17,15 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import kepler
 from scvi_codegen.reproduce.laboratory.drawing import panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 from scvi_codegen.reproduce.laboratory.full_newton import newton_counts
 from scvi_codegen.reproduce.laboratory.running import SECTION_3, steps_in, trajectory
 
@@ -159,10 +167,10 @@ def _result(number: int) -> Result:
     )
 
 
-def _table(printed: Counts, found: Mapping[str, Counts]) -> Table:
+def _table(printed: Counts, found: Mapping[str, Counts]) -> TableBlock:
     headings = [f"{solver} {what}" for solver in SOLVERS for what in ("max", "total", "energy error", "failure")]
     numbers = ["N", "paper max", "paper total", *(heading for heading in headings if "failure" not in heading)]
-    return Table(
+    return TableBlock(
         columns=("h", "N", "scheme", "paper max", "paper total", *headings),
         rows=tuple(
             (
@@ -189,11 +197,11 @@ def _pairs(found: Counts) -> Iterator[tuple[float, Count, Count]]:
             yield h, count, found[h, degree, "SVI"]
 
 
-def _solver_checks(solver: str, found: Counts) -> Iterator[Check]:
+def _solver_checks(solver: str, found: Counts) -> Iterator[Comparison]:
     totals = [(sc.total, svi.total) for _, sc, svi in _pairs(found) if sc.sound and svi.sound]
     ratios = [svi / sc for sc, svi in totals if sc and svi]
     fewer, equal = sum(ratio < 1.0 for ratio in ratios), sum(ratio == 1.0 for ratio in ratios)
-    yield Check(
+    yield Comparison(
         claim="SVI converges faster than SC.",
         measured=f"Solver '{solver}': of {len(ratios)} settings where both stay bound, SVI needs fewer "
         f"iterations in {fewer} and as many in {equal}; its number is {statistics.median(ratios):.2f} of that of SC "
@@ -206,7 +214,7 @@ def _solver_checks(solver: str, found: Counts) -> Iterator[Check]:
     alone = sum(sc and not svi for sc, svi in converged)
     sc, svi = _sound(found, 0.0)
     sc_large, svi_large = _sound(found, LARGE)
-    yield Check(
+    yield Comparison(
         claim="SVI is more stable than SC, especially with large time-steps.",
         measured=f"Solver '{solver}': of {len(converged)} settings SVI converges at {by_svi} and SC at {by_sc}, at "
         f"{alone} of them alone. The motion stays bound (energy error below 100 %) at {svi} with SVI and {sc} with "
@@ -227,11 +235,11 @@ def _sound(found: Counts, least: float) -> tuple[int, int]:
     return sum(sc for sc, _ in pairs), sum(svi for _, svi in pairs)
 
 
-def _printed_check(number: int, printed: Counts, found: Mapping[str, Counts]) -> Check:
+def _printed_check(number: int, printed: Counts, found: Mapping[str, Counts]) -> Comparison:
     h, degree, _ = EXAMPLE
     ours = "; ".join(f"{_text(found[solver][EXAMPLE])} by '{solver}'" for solver in SOLVERS)
     full = newton_counts(KEPLER, SVI(degree), *_start(ECCENTRICITY[number]), h=h, steps=steps_in(SPAN, h))
-    return Check(
+    return Comparison(
         claim=f"SVI with N = {degree} and h = {h} needs {_text(printed[EXAMPLE])} iterations (largest/all).",
         measured=f"{ours}; Newton's method in full, each step from the straight line, until |dQ| < 1e-14: "
         f"{max(full)}/{sum(full)}.",

@@ -11,7 +11,15 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.rendering.outline import Function, functions_of, outline
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Listing, Paragraph, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Listing,
+    Paragraph,
+    Result,
+    TableBlock,
+    holds,
+)
 
 __all__ = ["EXPERIMENTS"]
 
@@ -168,7 +176,7 @@ def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], rema
             *remark,
         ),
         checks=(
-            Check(
+            Comparison(
                 claim=f"The algorithm has the steps STEP1 to STEP{len(steps)}.",
                 measured=f"{len(found)} of {len(steps)} steps have their counterpart in the C text"
                 + (f"; {lost}." if lost else ", each found by name in the function that has it."),
@@ -176,7 +184,7 @@ def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], rema
             ),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("step", "paper", "here", "functions", "found"),
                 rows=tuple(
                     (

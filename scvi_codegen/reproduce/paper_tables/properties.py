@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, Verdict, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Picture,
+    Result,
+    TableBlock,
+    Verdict,
+    holds,
+)
 from scvi_codegen.tables.tableau import (
     Tableau,
     chebyshev_gauss,
@@ -101,8 +109,8 @@ def table_4(results: Mapping[str, Result]) -> Result:
     )
 
 
-def _property_table(found: Sequence[Properties]) -> Table:
-    return Table(
+def _property_table(found: Sequence[Properties]) -> TableBlock:
+    return TableBlock(
         columns=("family", "stages", "order", *MARKS),
         rows=tuple(
             (one.family, one.stages, one.order, *("yes" if one.marks[name] else "no" for name in MARKS))
@@ -112,7 +120,7 @@ def _property_table(found: Sequence[Properties]) -> Table:
     )
 
 
-def _mark_check(name: str, found: Sequence[Properties]) -> Check:
+def _mark_check(name: str, found: Sequence[Properties]) -> Comparison:
     """Whether the marks of one row are right for every family and number of stages."""
     agreeing, others = 0, []
     for family, (_, _, column) in FAMILIES.items():
@@ -123,7 +131,7 @@ def _mark_check(name: str, found: Sequence[Properties]) -> Check:
         if differing:
             others.append(f"{family} with {_listed(differing)} {'is not' if expected else 'is'}")
     total = sum(one.family in FAMILIES for one in found)
-    return Check(
+    return Comparison(
         claim=f"{_joined(MARKS[name])} methods are {name}" + (", the others are not." if len(MARKS[name]) < 4 else "."),
         measured=f"So it is for {agreeing} of {total} tableaux"
         + (f"; {'; '.join(others)}." if others else f", all families with up to {MOST_STAGES} stages."),
@@ -131,13 +139,13 @@ def _mark_check(name: str, found: Sequence[Properties]) -> Check:
     )
 
 
-def _collocation_check(found: Sequence[Properties]) -> Check:
+def _collocation_check(found: Sequence[Properties]) -> Comparison:
     members = [one for one in found if one.family == "SC"]
     named = {name: [one.stages for one in members if one.marks[name]] for name in MARKS}
     unstable = [one.stages for one in members if not one.marks["A-stable"]]
     orders = ", ".join(str(one.order) for one in members)
     same = not unstable and len(named["symmetric"]) == len(members)
-    return Check(
+    return Comparison(
         claim="What the table says of Chebyshev methods, A-stable and symmetric, is true of the SC of the experiments.",
         measured=f"SC is not A-stable with {_listed(unstable)}; symmetric: {_listed(named['symmetric'])}; symplectic: "
         f"{_listed(named['symplectic'])}; order {orders} for 1 to {len(members)} stages.",
@@ -145,11 +153,11 @@ def _collocation_check(found: Sequence[Properties]) -> Check:
     )
 
 
-def _stability_check(found: Sequence[Properties]) -> Check:
+def _stability_check(found: Sequence[Properties]) -> Comparison:
     svi, sc = (
         [one.stages for one in found if one.family == name and one.marks["A-stable"]] for name in ("Gauss", "SC")
     )
-    return Check(
+    return Comparison(
         claim="SVI shows better stability than Chebyshev collocation methods when using large time-steps (section 5).",
         measured=f"SVI with as many Gauss points as its degree is the Gauss method, A-stable with {_listed(svi)}; SC "
         f"is with {_listed(sc)}.",

@@ -9,12 +9,12 @@ import sympy
 
 from scvi_codegen.reproduce.laboratory.experiment import (
     Block,
-    Check,
+    Comparison,
     Experiment,
     Formula,
     Paragraph,
     Result,
-    Table,
+    TableBlock,
     Verdict,
     holds,
 )
@@ -142,12 +142,12 @@ def _labelled(A: Sequence[Sequence[Any]], b: Sequence[Any], c: Sequence[Any]) ->
     yield from ((f"b_{j}", value) for j, value in enumerate(b, start=1))
 
 
-def _entries_table(number: int, printed: Exact, computed: Tableau) -> Table:
+def _entries_table(number: int, printed: Exact, computed: Tableau) -> TableBlock:
     abscissae, rows = _rows(number)
     texts = [text.replace("v", "w'") for _, text in _labelled(rows[:-1], rows[-1], abscissae)]
     values = [_number(value) for _, value in _labelled(*printed)]
     found = list(_labelled(computed.A, computed.b, computed.c))
-    return Table(
+    return TableBlock(
         columns=("entry", "as printed", "its value", "by (23)", "difference"),
         rows=tuple(
             (label, f"{text}", float(value), float(exact), float(abs(value - exact)))
@@ -157,14 +157,14 @@ def _entries_table(number: int, printed: Exact, computed: Tableau) -> Table:
     )
 
 
-def _entries_check(number: int, printed: Exact, computed: Tableau) -> Check:
+def _entries_check(number: int, printed: Exact, computed: Tableau) -> Comparison:
     table = _entries_table(number, printed, computed)
     wrong = [row for row in table.rows if row[-1] > AGREES]
     named = "; ".join(
         f"{label} is printed {text} = {value:.6f}, it is {right:.6f}" for label, text, value, right, _ in wrong
     )
     count = len(table.rows)
-    return Check(
+    return Comparison(
         claim=f"Table {number} lists the coefficients (23) of the Gauss method with {computed.stages} stages.",
         measured=f"{count - len(wrong)} of {count} printed entries agree to 50 digits"
         + (f"; {named}." if wrong else "."),
@@ -182,10 +182,10 @@ def _numeric(exact: Exact, name: str) -> Tableau:
     )
 
 
-def _order_check(printed: Exact, exact: Exact, s: int) -> Check:
+def _order_check(printed: Exact, exact: Exact, s: int) -> Comparison:
     residuals = list(order_residuals(exact))
     zero, order = sum(residual == 0 for residual in residuals), _numeric(printed, "printed").order
-    return Check(
+    return Comparison(
         claim=f"The method has order {2 * s}.",
         measured=f"{zero} of the {len(residuals)} conditions B({2 * s}), C({s}), D({s}), which together give order "
         f"{2 * s}, hold exactly for the closed form; the entries as printed give order {order}.",
@@ -193,10 +193,10 @@ def _order_check(printed: Exact, exact: Exact, s: int) -> Check:
     )
 
 
-def _symplectic_check(printed: Exact, exact: Exact) -> Check:
+def _symplectic_check(printed: Exact, exact: Exact) -> Comparison:
     residuals = list(symplectic_residuals(exact))
     zero, kept = sum(residual == 0 for residual in residuals), _numeric(printed, "printed").is_symplectic
-    return Check(
+    return Comparison(
         claim="Gauss methods are symplectic.",
         measured=f"{zero} of the {len(residuals)} conditions b_i a_ij + b_j a_ji = b_i b_j hold exactly for the closed "
         f"form; the entries as printed {'satisfy' if kept else 'do not satisfy'} them.",

@@ -18,7 +18,15 @@ import sympy
 from numpy.typing import NDArray
 
 from scvi_codegen.methods import RungeKutta
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Formula, Paragraph, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import (
+    Comparison,
+    Experiment,
+    Formula,
+    Paragraph,
+    Result,
+    TableBlock,
+    holds,
+)
 from scvi_codegen.reproduce.theorems.convergence import quick_stepper
 from scvi_codegen.tables.nodes import nodes_by_name
 from scvi_codegen.tables.precision import Vector, mp
@@ -64,7 +72,7 @@ def abscissae(family: str, s: int) -> Vector:
         return tableau_by_name(f"{family}:{s}").c
     if family == "irregular":
         return tuple(mp.sqrt(mp.mpf(k)) / 3 for k in range(1, s + 1))
-    return tuple((x + 1) / 2 for x in nodes_by_name(NODES[family], s).points[1:])
+    return nodes_by_name(NODES[family], s).abscissae[1:]
 
 
 def fixed_point(step: Field, first: Array) -> Array:
@@ -151,13 +159,13 @@ def _tableaux() -> list[tuple[str, Tableau]]:
     return [(family, collocation_tableau(abscissae(family, s))) for family, s in stages]
 
 
-def _coefficients() -> Table:
+def _coefficients() -> TableBlock:
     rows = [
         (family, tableau.stages, i, float(c), float(b), " ".join(f"{float(a):.17g}" for a in row))
         for family, tableau in _tableaux()
         for i, (c, b, row) in enumerate(zip(tableau.c, tableau.b, tableau.A, strict=True), start=1)
     ]
-    return Table(
+    return TableBlock(
         name="coefficients",
         columns=("abscissae", "s", "i", "c_i", "b_i", "a_i1 .. a_is"),
         rows=tuple(rows),
@@ -194,7 +202,7 @@ def _run(_: Mapping[str, Result]) -> Result:
             "its coefficients in powers of time, the Runge-Kutta method by its stages.",
         ),
         checks=(
-            Check(
+            Comparison(
                 claim="The collocation method (22) is equivalent to the s-stage Runge-Kutta method with (23).",
                 measured=f"In 60 digits the largest difference of {2 * len(rows)} steps is {largest:.1e}; that of "
                 f"compiled {COMPILED_STAGES}-stage methods in double precision is {compiled:.1e}; Radau IA, which is "
@@ -203,7 +211,7 @@ def _run(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            Table(
+            TableBlock(
                 columns=("abscissae", "s", "order", "defect of (23)", "difference, pendulum", "difference, Kepler"),
                 rows=tuple(rows + control),
                 formats=dict.fromkeys(("defect of (23)", "difference, pendulum", "difference, Kepler"), ".1e"),

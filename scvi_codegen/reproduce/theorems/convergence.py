@@ -38,7 +38,7 @@ __all__ = [
     "START",
     "STARTS",
     "TITLES",
-    "Errors",
+    "MapErrors",
     "cell",
     "errors",
     "exact_steps",
@@ -88,7 +88,7 @@ CURVE_STEPS = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class MapErrors:
     """Largest errors in one step; NaN where a method has no such thing or its equations have no solution.
 
     Attributes:
@@ -123,27 +123,27 @@ def exact_steps(name: str, h: float) -> tuple[ExactStep, ...]:
 
 
 @lru_cache(maxsize=4096)
-def errors(name: str, method: Method, h: float) -> Errors:
+def errors(name: str, method: Method, h: float) -> MapErrors:
     """One step of a method against the exact one, the worst of the starts."""
     found = [_errors(quick_stepper(name, method), exact, h) for exact in exact_steps(name, h)]
     worst = np.max([(error.action, error.legendre, error.map) for error in found], axis=0)
-    return Errors(*map(float, worst))
+    return MapErrors(*map(float, worst))
 
 
-def _errors(stepper: Stepper, exact: ExactStep, h: float) -> Errors:
+def _errors(stepper: Stepper, exact: ExactStep, h: float) -> MapErrors:
     q0, p0, q1, p1 = _floats(exact.q0, exact.p0, exact.q1, exact.p1)
     try:
         of_map = _largest(*zip(stepper.step(q0, p0, h), (q1, p1), strict=True))
     except StepFailedError:
         of_map = math.nan
     if not stepper.interface.has_action:
-        return Errors(math.nan, math.nan, of_map)
+        return MapErrors(math.nan, math.nan, of_map)
     try:
         action = stepper.discrete_lagrangian(q0, q1, h)
         minus, plus = stepper.discrete_legendre_minus(q0, q1, h)[1], stepper.discrete_legendre_plus(q0, q1, h)[1]
     except StepFailedError:
-        return Errors(math.nan, math.nan, of_map)
-    return Errors(abs(action - float(exact.action)), _largest((minus, p0), (plus, p1)), of_map)
+        return MapErrors(math.nan, math.nan, of_map)
+    return MapErrors(abs(action - float(exact.action)), _largest((minus, p0), (plus, p1)), of_map)
 
 
 def _floats(*vectors: Sequence[float]) -> tuple[Array, ...]:

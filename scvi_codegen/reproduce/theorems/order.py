@@ -10,13 +10,13 @@ import sympy
 
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.reproduce.laboratory.experiment import (
-    Check,
+    Comparison,
     Experiment,
     Formula,
     Paragraph,
     Picture,
     Result,
-    Table,
+    TableBlock,
     holds,
 )
 from scvi_codegen.reproduce.theorems.convergence import (
@@ -90,7 +90,7 @@ def _orders() -> list[Order]:
     return orders + [_order("kepler", f"{GALERKIN}, {CURTIS}", method) for method in galerkin]
 
 
-def _checks(orders: list[Order]) -> tuple[Check, ...]:
+def _checks(orders: list[Order]) -> tuple[Comparison, ...]:
     shooting = [order for order in orders if order.label in (FULL, FEW, f"{FULL}, {CURTIS}")]
     printed = [order for order in orders if order.label == PRINTED]
     action, of_map, legendre = (
@@ -100,28 +100,28 @@ def _checks(orders: list[Order]) -> tuple[Check, ...]:
     lost = [order.action - order.legendre for order in shooting]
     few = [f"{order.map:.2f}" for order in printed]
     return (
-        Check(
+        Comparison(
             claim="The shooting-based discrete Lagrangian of a collocation method of order p and a quadrature of order "
             "q has order min(p, q) (Theorem 4.1).",
             measured=f"In {len(shooting)} cases the order of L_d is at least min(p, q) {action:+.2f}.",
             verdict=holds(action > -MISS),
             bears_on=("order",),
         ),
-        Check(
+        Comparison(
             claim="So has the variational integrator that it generates.",
             measured=f"The order of the map is at least min(p, q) {of_map:+.2f}. It is better than the bound: min(2s, "
             f"q) to within {missed:.2f}, because the error of L_d is quadratic in the error of the curve.",
             verdict=holds(of_map > -MISS),
             bears_on=("order",),
         ),
-        Check(
+        Comparison(
             claim="By Theorem 2.3.1 of [24], on which this rests, the discrete Legendre transforms along trajectories "
             "have the order of L_d, too.",
             measured=f"They lose a power of h: their orders are lower by {min(lost):.2f} to {max(lost):.2f} than that "
             f"of L_d, and fall to min(p, q) {legendre:+.2f}; the map has the order of L_d all the same.",
             verdict=holds(max(lost) < 0.5),
         ),
-        Check(
+        Comparison(
             claim="(34) as printed is the integrator of this discrete Lagrangian.",
             measured=f"For s = 2 .. 5 its map has orders {', '.join(few[:4])} (pendulum) and {', '.join(few[4:])} "
             "(Kepler), about s - 1 and below min(p, q) = s.",
@@ -186,7 +186,7 @@ def _run(_: Mapping[str, Result]) -> Result:
             "Numbers at the curves of the picture are degrees.",
         ),
         checks=_checks(orders),
-        tables=(Table(columns=columns, rows=rows, formats=dict.fromkeys(columns[7:], ".2f")),),
+        tables=(TableBlock(columns=columns, rows=rows, formats=dict.fromkeys(columns[7:], ".2f")),),
         picture=_picture(),
         body=_body(orders),
     )

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypeAlias
 
 from scvi_codegen.methods import SpectralCollocation
-from scvi_codegen.reproduce.laboratory.experiment import Check, Experiment, Picture, Result, Table, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 from scvi_codegen.reproduce.theorems.convergence import (
     EXACT,
     FEW,
@@ -64,10 +64,10 @@ def _bases(rates: Rates, label: str) -> str:
     return " and ".join(parts)
 
 
-def _geometric_check(rates: Rates, label: str) -> Check:
+def _geometric_check(rates: Rates, label: str) -> Comparison:
     bases = [[rates[name, label, key][1] for key in QUANTITIES] for name in TITLES]
     spread = max(max(three) / min(three) for three in bases)
-    return Check(
+    return Comparison(
         claim=f"Map, Legendre transforms and L_d of {label} converge geometrically together (Theorem 4.2).",
         measured=f"K of L_d, of the Legendre transforms and of the map: {_bases(rates, label)}; the three differ by a "
         f"factor of at most {spread:.2f}.",
@@ -76,12 +76,12 @@ def _geometric_check(rates: Rates, label: str) -> Check:
     )
 
 
-def _printed_check(rates: Rates) -> Check:
+def _printed_check(rates: Rates) -> Comparison:
     printed = {name: rates[name, PRINTED, "map"][1] for name in TITLES}
     own = {name: rates[name, FULL, "map"][1] for name in TITLES}
     listed = " and ".join(f"{printed[name]:.2f} against {own[name]:.3f} ({TITLES[name]})" for name in TITLES)
     exponents = ", ".join(f"{math.log(own[name]) / math.log(printed[name]):.2f}" for name in TITLES)
-    return Check(
+    return Comparison(
         claim="(34) as printed is the map of the discrete Lagrangian (33), to which Theorem 4.2 applies.",
         measured=f"It is another map. It converges geometrically, but K = {listed} for the map of (33), which is the "
         f"printed one's K to the power {exponents}: its error is linear in that of the curve, not quadratic.",
@@ -126,8 +126,8 @@ def _run_rates(_: Mapping[str, Result]) -> Result:
         ),
         checks=(_geometric_check(rates, GALERKIN), _geometric_check(rates, FULL), _printed_check(rates)),
         tables=(
-            Table(columns=("problem", "method", "error of", "C", "K"), rows=rows),
-            Table(
+            TableBlock(columns=("problem", "method", "error of", "C", "K"), rows=rows),
+            TableBlock(
                 name="errors",
                 columns=("problem", "method", "error of", *(f"s = {s}" for s in DEGREES)),
                 rows=series,
@@ -154,11 +154,11 @@ def _parts(name: str, label: str) -> dict[str, list[float]]:
     }
 
 
-def _bound_check(name: str, label: str) -> Check:
+def _bound_check(name: str, label: str) -> Comparison:
     parts = _parts(name, label)
     K = {part: rate(CASES[label], values)[1] for part, values in parts.items()}
     ratios = [error / (a + g) for a, g, error in zip(*parts.values(), strict=True) if error > PLATEAU and a > 0]
-    return Check(
+    return Comparison(
         claim="The error of the L_d of SCVI is at most C K^N, K = max(K_A, K_g) (Theorem 4.3).",
         measured=f"{label}, {TITLES[name]}: K_A = {K['collocation']:.3f} (collocation), K_g = {K['quadrature']:.3f} "
         f"(quadrature), K = {K['L_d']:.3f} (L_d), max(K_A^2, K_g) = {max(K['collocation'] ** 2, K['quadrature']):.3f}; "
@@ -209,7 +209,7 @@ def _run_bounds(_: Mapping[str, Result]) -> Result:
             f"fitted to errors above {PLATEAU:.0e}; a degree is left out where a step has no solution.",
         ),
         checks=tuple(_bound_check(name, label) for label in CASES for name in TITLES),
-        tables=(Table(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[5:], ".1e")),),
+        tables=(TableBlock(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[5:], ".1e")),),
         picture=_bound_picture(),
     )
 
