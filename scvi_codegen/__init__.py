@@ -67,7 +67,11 @@ _HOMES = {
     "advice.motion": ("Motion", "solve_motion"),
     "tables.nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),
     "models.package": ("generate_package", "load_package"),
-    "results.plotting": ("plot_section", "plot_trajectory"),
+    "pictures.animation": ("Film", "animate"),
+    "pictures.conserved": ("plot_energy", "plot_momentum_maps"),
+    "pictures.overview": ("plot_trajectory",),
+    "pictures.paths": ("plot_motion", "plot_phase"),
+    "pictures.section": ("plot_section",),
     "models.problems": ("PROBLEMS", "problem"),
     "tables.quadrature": (
         "Quadrature",

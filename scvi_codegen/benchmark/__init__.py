@@ -115,7 +115,7 @@ def benchmark(
                 f"there is nothing called '{name}' to measure{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}"
             )
     if plot_path is not None:
-        from scvi_codegen.results.plotting import check_plot_path
+        from scvi_codegen.pictures.canvas import check_plot_path
 
         check_plot_path(plot_path)
     report = _measured(names or tuple(SECTIONS), plan or Plan(), say)

@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.report import CaseResult
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.results.plotting import COLORS, STYLE, check_plot_path
+from scvi_codegen.pictures.canvas import COLORS, STYLE, check_plot_path
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -1,1 +1,1 @@
-"""What is made of trajectories: recorded runs, pictures."""
+"""What is made of trajectories: recorded runs."""

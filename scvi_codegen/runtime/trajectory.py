@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from scvi_codegen.pictures.animation import Film
+    from scvi_codegen.pictures.plots import Plots
 
 __all__ = ["Trajectory", "relative_changes"]
 
@@ -143,6 +145,28 @@ class Trajectory(KeptStates):
         except StateError:
             return None
         return energies
+
+    @property
+    def plot(self) -> Plots:
+        """Pictures: ``run.plot()`` shows all at a glance, ``run.plot.energy("energy.png")`` one thing in a file.
+
+        There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``; each returns Matplotlib axes.
+        """
+        from scvi_codegen.pictures.plots import Plots
+
+        return Plots(self)
+
+    def animate(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        seconds: float = 8.0,
+        positions: Callable[[Array], Array] | None = None,
+    ) -> Film:
+        """An animation, which a notebook shows, or a file .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
+        from scvi_codegen.pictures.animation import animate
+
+        return animate(self, path, seconds=seconds, positions=positions)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, atomically.

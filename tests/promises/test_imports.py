@@ -22,7 +22,7 @@ FLOORS = """
     tables files
     formulas display ir
     mechanics rendering
-    methods native
+    methods native pictures
     lowering exact runtime
     compiler results
     derivation models advice verification
@@ -46,7 +46,7 @@ OWNERS = {
     "h5py": "files",
     "jinja2": "display rendering",
     "markupsafe": "display reproduce",
-    "matplotlib": "benchmark reproduce results",
+    "matplotlib": "benchmark pictures reproduce",
     "mpmath": "benchmark display tables",
     "pandas": "files runtime",
     "platformdirs": "files",

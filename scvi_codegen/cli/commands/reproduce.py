@@ -13,11 +13,11 @@ import click
 from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
 from scvi_codegen.cli.wording import counted
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
 from scvi_codegen.reproduce.report import report_html, tally
 from scvi_codegen.reproduce.runner import CATALOGUE, Failure, catalogue, run_experiments, with_needs
 from scvi_codegen.reproduce.writing import write_result
-from scvi_codegen.results.plotting import check_plot_path
 
 __all__ = ["reproduce"]
 

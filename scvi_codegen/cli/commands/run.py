@@ -17,7 +17,8 @@ from scvi_codegen.cli.running import RunOutcome, integrate_model, summary
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.results.plotting import check_plot_path, plot_trajectory
+from scvi_codegen.pictures.canvas import check_plot_path
+from scvi_codegen.pictures.overview import plot_trajectory
 
 __all__ = ["run"]
 

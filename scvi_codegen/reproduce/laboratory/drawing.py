@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.results.plotting import STYLE as TRAJECTORY_STYLE
+from scvi_codegen.pictures.canvas import STYLE as TRAJECTORY_STYLE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

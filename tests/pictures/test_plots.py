@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
 from dataclasses import replace
 
+import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PlotError, StateError
@@ -14,7 +17,11 @@ from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.methods import SVI, StoermerVerlet
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem
-from scvi_codegen.results.plotting import check_plot_path, draw_section, draw_trajectory, plot_section, plot_trajectory
+from scvi_codegen.pictures.canvas import check_plot_path
+from scvi_codegen.pictures.conserved import largest_in_bins, plot_energy, plot_momentum_maps
+from scvi_codegen.pictures.overview import plot_trajectory
+from scvi_codegen.pictures.paths import plot_motion, plot_phase
+from scvi_codegen.pictures.section import plot_section
 from scvi_codegen.runtime.events import Event
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -23,6 +30,12 @@ def trajectory_of(name: str, steps: int = 300, h: float | None = None) -> Trajec
     model = replace(Model.from_problem(problem(name)), method=StoermerVerlet())
     model = replace(model, h=(model.h if h is None else h) / 4)
     return model.start(compile_stepper(model.system, model.method)).record(steps)
+
+
+@pytest.fixture(autouse=True)
+def _closed() -> Iterator[None]:
+    yield
+    pyplot.close("all")
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +63,13 @@ def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
     ],
 )
 def test_each_kind_of_system_gets_its_panels(name, titles):
-    figure = draw_trajectory(trajectory_of(name))
+    figure = plot_trajectory(trajectory_of(name))[0].figure
     assert [axes.get_title() for axes in figure.axes if axes.get_title()] == titles
     assert figure.axes[len(titles) - 1].get_yscale() == "log"
 
 
 def test_bodies_are_named_in_the_legend():
-    figure = draw_trajectory(trajectory_of("outer-solar-system"))
+    figure = plot_trajectory(trajectory_of("outer-solar-system"))[0].figure
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["sun", "jupiter", "saturn", "uranus", "neptune", "pluto"]
 
@@ -76,11 +89,9 @@ def test_an_exactly_conserved_energy_can_be_drawn(tmp_path):
 
 
 def test_energy_error_is_the_largest_of_each_bin():
-    from scvi_codegen.results.plotting import _largest_in_bins
-
     error = np.zeros(60_000)
     error[777] = 3.0
-    t, largest = _largest_in_bins(np.arange(60_000.0), error)
+    t, largest = largest_in_bins(np.arange(60_000.0), error)
     assert len(t) == 600
     assert np.nanmax(largest) == 3.0
     assert np.isnan(largest).sum() == 599
@@ -113,10 +124,10 @@ def test_other_suffixes_and_missing_matplotlib_are_errors_before_the_run(monkeyp
 
 
 def test_a_picture_that_fails_leaves_nothing_behind(kepler, tmp_path, monkeypatch):
-    def fail(trajectory: Trajectory) -> None:
+    def fail(trajectory: Trajectory, axes: object) -> None:
         raise RuntimeError("no picture")
 
-    monkeypatch.setattr("scvi_codegen.results.plotting.draw_trajectory", fail)
+    monkeypatch.setattr("scvi_codegen.pictures.overview._draw", fail)
     with pytest.raises(RuntimeError, match="no picture"):
         plot_trajectory(kepler, tmp_path / "orbit.png")
     assert list(tmp_path.iterdir()) == []
@@ -137,8 +148,7 @@ def orbits() -> list[Trajectory]:
 
 
 def test_a_section_has_the_states_at_the_crossings(orbits, tmp_path):
-    figure = draw_section(orbits, ("y", "p_y"), event=1)
-    (axes,) = figure.axes
+    axes = plot_section(orbits, axes=("y", "p_y"), event=1)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
     assert axes.get_title() == "Henon-Heiles system: x = 0, rising"
     for line, orbit in zip(axes.get_lines(), orbits, strict=True):
@@ -157,3 +167,52 @@ def test_a_section_has_the_states_at_the_crossings(orbits, tmp_path):
 def test_a_section_says_what_it_lacks(orbits, arguments, words, tmp_path):
     with pytest.raises(StateError, match=words):
         plot_section(orbits[0], tmp_path / "section.png", **arguments)
+
+
+class TestOnePicture:
+    def test_it_is_drawn_on_the_axes_given_and_returned(self, kepler, orbits):
+        _, given = pyplot.subplots(2, 2)
+        assert plot_motion(kepler, ax=given[0, 0]) is given[0, 0]
+        assert plot_energy(kepler, ax=given[0, 1]) is given[0, 1]
+        assert plot_phase(kepler, axes=("q2", "p_q1"), ax=given[1, 0]) is given[1, 0]
+        assert plot_section(orbits, axes=("y", "p_y"), ax=given[1, 1]) is given[1, 1]
+        assert all(axes.lines for axes in given.flat)
+
+    def test_without_axes_it_is_a_figure_that_a_notebook_shows(self, kepler):
+        axes = kepler.plot.energy()
+        assert pyplot.gcf() is axes.figure
+        assert mpl.rcParams["axes.grid"] is False
+
+    def test_with_a_path_it_is_a_file_and_no_figure_stays(self, kepler, tmp_path):
+        kepler.plot.momentum_maps(tmp_path / "maps.svg")
+        assert "angular momentum" in (tmp_path / "maps.svg").read_text(encoding="utf-8")
+        assert pyplot.get_fignums() == []
+
+    def test_a_phase_portrait_has_a_curve_an_orbit(self, orbits):
+        axes = plot_phase(orbits, axes=("y", "p_y"))
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
+        drawn = [line for line in axes.lines if len(line.get_xdata()) > 2]
+        for line, orbit in zip(drawn, orbits, strict=True):
+            assert np.array_equal(line.get_xydata(), np.stack([orbit.q[:, 1], orbit.p[:, 1]], axis=1))
+
+    def test_energies_of_several_share_an_axis_that_holds_them(self, orbits):
+        axes = plot_energy(orbits)
+        low, high = axes.get_ylim()
+        values = np.concatenate([line.get_ydata() for line in axes.lines])
+        assert len(axes.lines) == 2
+        assert low <= np.nanmin(values) <= np.nanmax(values) <= high
+
+    def test_momentum_maps_are_named_and_their_changes_drawn(self, kepler):
+        axes = plot_momentum_maps(kepler)
+        labels = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert labels == list(kepler.stepper.momentum_map_names)
+        largest = np.abs(kepler.momentum_errors()).max(axis=0)
+        assert [np.nanmax(line.get_ydata()) for line in axes.lines] == list(largest)
+
+    def test_what_cannot_be_drawn_is_said(self, kepler, orbits):
+        with pytest.raises(StateError, match="no symmetry of 'Henon-Heiles system' is known"):
+            plot_momentum_maps(orbits[0])
+        with pytest.raises(StateError, match="'z' is neither a coordinate nor a momentum"):
+            plot_phase(kepler, axes=("q1", "z"))
+        with pytest.raises(StateError, match="no trajectory"):
+            plot_phase([])

@@ -1,0 +1,176 @@
+"""Motions that move: an animation for a notebook, or a file that shows it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scvi_codegen.errors import PlotError, StateError
+from scvi_codegen.files.atomic import replaced
+from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
+from scvi_codegen.pictures.motion import Array, Motion
+from scvi_codegen.pictures.shapes import Shape, shape_of
+
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.axes import Axes
+
+__all__ = ["FILMS", "Film", "animate"]
+
+FILMS = (".gif", ".html", ".mp4")
+FRAMES_PER_SECOND = 25
+TRAIL = 0.15
+"""Part of the film that a trail lasts."""
+TRAIL_POINTS = 400
+MARGIN = 0.06
+SIZE = 4.8
+"""Inches."""
+
+
+def animate(
+    trajectory: Motion,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    seconds: float = 8.0,
+    positions: Callable[[Array], Array] | None = None,
+) -> Film:
+    """An animation of a trajectory: bodies, pendulums, chains, or a point in the plane of its coordinates.
+
+    Bodies are found by the names of their coordinates (x, y or sun_x, sun_y, ..), pendulums by their energy at rest,
+    with rods as long as parameters called l, or l1, l2, .., say. Other numbered coordinates are a chain.
+
+    Args:
+        trajectory: what moves; its states at equal times are the frames, as many as fit.
+        path: a file .gif, .html or .mp4 (with ffmpeg); ``None`` for none.
+        seconds: how long the animation lasts.
+        positions: (n, k, 2) or (n, k, 3) places of k points from q (n, m), in place of what is found.
+
+    Returns:
+        The film, which a notebook shows.
+
+    Raises:
+        StateError: for another suffix, a length that is not positive, or positions of a wrong shape.
+        PlotError: without matplotlib, or without ffmpeg for .mp4.
+    """
+    if path is not None:
+        check_plot_path(path, FILMS)
+    if not 0.0 < seconds < float("inf"):
+        raise StateError(f"seconds must be a positive number, not {seconds!r}")
+    film = Film(trajectory, shape_of(trajectory, positions), float(seconds))
+    if path is not None:
+        film.save(path)
+    return film
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """An animation, drawn when it is shown or saved.
+
+    Attributes:
+        trajectory: what moves.
+        shape: how a state is drawn.
+        seconds: how long it lasts.
+    """
+
+    trajectory: Motion
+    shape: Shape
+    seconds: float
+
+    @cached_property
+    def frames(self) -> Any:
+        """(k,) numbers of the states shown."""
+        times = np.abs(self.trajectory.t - self.trajectory.t[0])
+        count = min(len(times), max(1, round(self.seconds * FRAMES_PER_SECOND)))
+        return np.searchsorted(times, np.linspace(0.0, times[-1], count) * (1.0 + 1e-12), side="right") - 1
+
+    @cached_property
+    def animation(self) -> FuncAnimation:
+        """Matplotlib's, for what is not here."""
+        from matplotlib.animation import FuncAnimation
+        from matplotlib.figure import Figure
+
+        with style():
+            figure = Figure(figsize=(SIZE, SIZE), layout="constrained")
+            scene = _Scene(figure, self.trajectory, self.shape)
+            interval = 1000.0 * self.seconds / len(self.frames)
+            return FuncAnimation(figure, scene.show, frames=self.frames, interval=interval, blit=False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file .gif, .html or .mp4, whole or not at all; errors as of :func:`animate`."""
+        check_plot_path(path, FILMS)
+        from matplotlib.animation import writers
+
+        kind = Path(path).suffix.lower()
+        if kind == ".mp4" and not writers.is_available("ffmpeg"):
+            raise PlotError("films of the kind .mp4 need ffmpeg, which is not installed; .gif and .html do not")
+        with style(), replaced(path) as made:
+            if kind == ".html":
+                made.write_text(self.animation.to_jshtml(), encoding="utf-8")
+            else:
+                self.animation.save(made, writer="pillow" if kind == ".gif" else "ffmpeg")
+
+    def _repr_html_(self) -> str:
+        with style():
+            html: str = self.animation.to_jshtml()
+        return html
+
+
+class _Scene:
+    """Axes with points, a line through them, and trails, set to a state at a time."""
+
+    def __init__(self, figure: Any, motion: Motion, shape: Shape) -> None:
+        self.motion, self.shape = motion, shape
+        self.places = shape.points(motion.q, motion.p)
+        dimension = self.places.shape[2]
+        self.axes: Axes = figure.add_subplot(projection="3d" if dimension == 3 else None)
+        self._set_limits(dimension)
+        nothing: list[list[float]] = [[]] * dimension
+        self.trails = [self.axes.plot(*nothing, color=color(k), linewidth=1.0, alpha=0.5)[0] for k in shape.trails]
+        marks: list[Any] = [slice(None)] if shape.joined else list(range(self.places.shape[1]))
+        names = shape.names or ("",) * len(marks)
+        line = "o-" if shape.joined else "o"
+        self.marks = [
+            (which, self.axes.plot(*nothing, line, color=color(k), markersize=5, linewidth=1.2, label=name)[0])
+            for k, (which, name) in enumerate(zip(marks, names, strict=True))
+        ]
+        if shape.names:
+            self.axes.legend(loc="upper right", fontsize=8)
+
+    def _set_limits(self, dimension: int) -> None:
+        flat = self.places.reshape(-1, dimension)
+        flat = flat[np.isfinite(flat).all(axis=1)]
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        half = (high - low) / 2
+        if self.shape.equal:
+            half[:] = half.max()
+        half = np.where(half > 0.0, half, 1.0) * (1.0 + 2 * MARGIN)
+        for letter, label, middle, size in zip("xyz", self.shape.labels, (low + high) / 2, half, strict=False):
+            self.axes.set(**{f"{letter}lim": (middle - size, middle + size), f"{letter}label": label})
+        if self.shape.equal:
+            self.axes.set_aspect("equal")
+
+    def show(self, frame: int) -> list[Any]:
+        """The state of that number, and the trails that lead to it."""
+        first = max(0, frame - round(TRAIL * len(self.places)))
+        rows = np.arange(first, frame + 1)[:: max(1, (frame - first) // TRAIL_POINTS)]
+        for k, trail in zip(self.shape.trails, self.trails, strict=True):
+            _set(trail, np.concatenate([self.places[rows, k], self.places[frame : frame + 1, k]]))
+        for which, mark in self.marks:
+            _set(mark, np.atleast_2d(self.places[frame, which]))
+        interface = self.motion.stepper.interface
+        self.axes.set_title(plain(f"{interface.system}, t = {self.motion.t[frame]:.4g}"))
+        return [*self.trails, *(mark for _, mark in self.marks)]
+
+
+def _set(line: Any, points: Array) -> None:
+    """Have a line go through (n, 2) or (n, 3) points."""
+    if points.shape[1] == 3:
+        line.set_data_3d(*points.T)
+    else:
+        line.set_data(*points.T)

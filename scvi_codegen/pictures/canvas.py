@@ -1,0 +1,108 @@
+"""Where pictures are drawn: axes given or new, in one style, and files that are written whole."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from scvi_codegen.errors import PlotError, StateError
+from scvi_codegen.files.atomic import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["COLORS", "PICTURES", "STYLE", "check_plot_path", "color", "new_figure", "panel", "plain", "save", "style"]
+
+PICTURES = (".png", ".svg")
+COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#b8860b", "#7a4fa3", "#2b8c9e", "#8c564b", "#555555")
+STYLE = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "lines.linewidth": 1.0,
+    "legend.frameon": False,
+    "svg.hashsalt": "scvi-codegen",
+    "svg.fonttype": "none",
+    "figure.dpi": 100,
+}
+
+
+def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PICTURES) -> None:
+    """Raise now what writing a picture would raise after a long run.
+
+    Raises:
+        StateError: for a suffix that is none of ``suffixes``.
+        PlotError: without matplotlib.
+    """
+    if Path(path).suffix.lower() not in suffixes:
+        known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
+        raise StateError(f"a picture is saved as {known}, not as {str(path)!r}")
+    _check_matplotlib()
+
+
+def _check_matplotlib() -> None:
+    if importlib.util.find_spec("matplotlib") is None:
+        raise PlotError("pictures need matplotlib, which is not installed: pip install 'scvi-codegen[plot]'")
+
+
+def style() -> Any:
+    """The context in which pictures are drawn and written."""
+    _check_matplotlib()
+    import matplotlib as mpl
+
+    return mpl.rc_context(STYLE)
+
+
+def new_figure(path: str | os.PathLike[str] | None, size: tuple[float, float]) -> Figure:
+    """Of ``size`` inches; one that pyplot knows, and a notebook shows, unless it goes to a file."""
+    if path is None:
+        from matplotlib import pyplot
+
+        figure: Figure = pyplot.figure(figsize=size, layout="constrained")
+        return figure
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
+@contextmanager
+def panel(
+    path: str | os.PathLike[str] | None, ax: Axes | None, size: tuple[float, float] = (5.6, 4.4)
+) -> Iterator[Axes]:
+    """Axes to draw on, those given or new ones; what is drawn goes to ``path`` if there is one."""
+    if path is not None:
+        check_plot_path(path)
+    with style():
+        drawn = new_figure(path, size).add_subplot() if ax is None else ax
+        yield drawn
+        if path is not None:
+            save(drawn.get_figure(root=True), path)
+
+
+def save(figure: Any, path: str | os.PathLike[str]) -> None:
+    """A figure into a file, whole or not at all, with equal bytes for equal figures."""
+    kind = Path(path).suffix.lower().removeprefix(".")
+    metadata = {"Date": None} if kind == "svg" else {"Software": None}
+
+    def write(file: IO[bytes]) -> None:
+        figure.savefig(file, format=kind, dpi=150, metadata=metadata)
+
+    write_atomically(path, write)
+
+
+def color(number: int) -> str:
+    """Of curve ``number``."""
+    return COLORS[number % len(COLORS)]
+
+
+def plain(text: str) -> str:
+    """Text of which nothing is taken for a formula."""
+    return text.replace("$", r"\$")

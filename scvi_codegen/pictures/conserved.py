@@ -1,0 +1,94 @@
+"""What a motion should keep, and how well it does: energy and momentum maps over time."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.pictures.canvas import color, panel
+from scvi_codegen.pictures.motion import Array, Motion, Motions, several
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["draw_energy_error", "largest_in_bins", "plot_energy", "plot_momentum_maps"]
+
+BINS = 600
+
+
+def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
+    """Draw the energy error |H - H_0| / |H_0| over time (not divided where H_0 = 0), a colour a trajectory.
+
+    Args:
+        trajectories: one or several.
+        path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
+
+    Raises:
+        StateError, PlotError: as :func:`~scvi_codegen.pictures.paths.plot_motion`.
+    """
+    with panel(path, ax) as drawn:
+        draw_energy_error(drawn, several(trajectories)[0])
+        for number, motion in enumerate(several(trajectories)[1:], 1):
+            _draw_error(drawn, motion.t, _energy_error(motion)[0], number)
+    return drawn
+
+
+def plot_momentum_maps(
+    trajectory: Motion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
+) -> Axes:
+    """Draw how much each momentum map has changed over time, relative to the largest size of its terms.
+
+    Args:
+        trajectory: of a system with symmetries.
+        path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
+
+    Raises:
+        StateError, PlotError: as :func:`~scvi_codegen.pictures.paths.plot_motion`; StateError without a symmetry.
+    """
+    names = trajectory.stepper.interface.map_names
+    if not names:
+        raise StateError(f"no symmetry of '{trajectory.stepper.interface.system}' is known: it has no momentum maps")
+    errors = np.abs(trajectory.momentum_errors())
+    with panel(path, ax) as drawn:
+        for number, name in enumerate(names):
+            _draw_error(drawn, trajectory.t, errors[:, number], number, name)
+        drawn.set(xlabel="t", title="relative change of momentum maps")
+        drawn.legend()
+    return drawn
+
+
+def draw_energy_error(axes: Axes, motion: Motion) -> None:
+    """The curve of a single motion, with its title."""
+    error, scaled = _energy_error(motion)
+    _draw_error(axes, motion.t, error, 0)
+    axes.set(xlabel="t", title="relative energy error" if scaled else "energy error")
+
+
+def _energy_error(motion: Motion) -> tuple[Array, bool]:
+    energy = motion.energy()
+    scale = abs(energy[0])
+    return np.abs(energy - energy[0]) / (scale or 1.0), bool(scale)
+
+
+def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | None = None) -> None:
+    """The largest of each bin, on a logarithmic axis that holds what was drawn before too."""
+    times, largest = largest_in_bins(t, error)
+    axes.plot(times, largest, color=color(number), linewidth=0.9, label=label)
+    axes.set_yscale("log")
+    drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
+    positive = drawn[np.isfinite(drawn) & (drawn > 0.0)]
+    if not positive.size:
+        positive = np.array([1e-16])
+    low = 10.0 ** np.floor(np.log10(positive.min()) - 0.3)
+    axes.set_ylim(low, max(10.0 ** np.ceil(np.log10(positive.max()) + 0.3), 10.0 * low))
+
+
+def largest_in_bins(t: Array, error: Array) -> tuple[Array, Array]:
+    """(k,) times and the largest error from each to the next; zeros, which a log axis cannot show, become NaN."""
+    size = max(1, len(t) // BINS)
+    starts = np.arange(0, len(t), size)
+    largest: Any = np.maximum.reduceat(error, starts)
+    return t[starts], np.where(largest > 0.0, largest, np.nan)

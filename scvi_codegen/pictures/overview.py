@@ -1,0 +1,55 @@
+"""A trajectory at a glance: where it goes, and how well it keeps its energy."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from scvi_codegen.mechanics.symmetry.bodies import bodies
+from scvi_codegen.pictures.canvas import COLORS, check_plot_path, new_figure, plain, save, style
+from scvi_codegen.pictures.conserved import draw_energy_error
+from scvi_codegen.pictures.motion import Motion
+from scvi_codegen.pictures.paths import draw_paths, path_panels
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_trajectory"]
+
+
+def plot_trajectory(trajectory: Motion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
+    """Draw the motion on the left, the relative energy error over time on the right.
+
+    Args:
+        trajectory: what to draw.
+        path: a file for the picture, .png or .svg, written whole or not at all; equal trajectories give equal bytes.
+
+    Returns:
+        The axes, from left to right.
+
+    Raises:
+        StateError: for another suffix.
+        PlotError: without matplotlib.
+    """
+    if path is not None:
+        check_plot_path(path)
+    count = 1 + path_panels(trajectory)
+    with style():
+        figure = new_figure(path, (4.6 * count, 4.4))
+        axes: tuple[Axes, ...] = tuple(figure.subplots(1, count))
+        _draw(trajectory, axes)
+        if path is not None:
+            save(figure, path)
+    return axes
+
+
+def _draw(trajectory: Motion, axes: tuple[Axes, ...]) -> None:
+    interface, figure = trajectory.stepper.interface, axes[0].figure
+    draw_paths(axes[:-1], trajectory)
+    draw_energy_error(axes[-1], trajectory)
+    named = len(bodies(interface.coordinates))
+    if 1 < named <= len(COLORS):
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=named)
+    for panel in axes:
+        panel.locator_params(axis="x", nbins=5)
+    figure.suptitle(plain(interface.title), fontsize=11)

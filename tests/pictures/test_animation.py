@@ -1,0 +1,151 @@
+"""Animations: what moves is found, frames are states at equal times, files are whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from samples import compile_quickly
+
+import scvi_codegen as sc
+from scvi_codegen.errors import PlotError, StateError
+from scvi_codegen.pictures.shapes import shape_of
+
+pytest.importorskip("matplotlib")
+
+
+def run_of(name: str, steps: int = 40, **parameters: float) -> sc.Trajectory:
+    given = sc.problem(name)
+    stepper = compile_quickly(given.system.with_parameters(**parameters), sc.SVI(2))
+    p = given.p if given.velocity is None else stepper.momentum(given.q, given.velocity)
+    return stepper.integrate(given.q, p, h=given.step / 4, steps=steps)
+
+
+def run_with(lagrangian: str, coordinates: list[str], **parameters: float) -> sc.Trajectory:
+    system = sc.LagrangianSystem.from_text(
+        name="mine", coordinates=coordinates, parameters=parameters, lagrangian=lagrangian
+    )
+    m = len(coordinates)
+    return compile_quickly(system, sc.SVI(2)).integrate([0.1] * m, [0.2] * m, h=0.01, steps=5)
+
+
+class TestShapes:
+    def test_a_double_pendulum_hangs_from_the_origin_by_its_rods(self):
+        run = run_of("double-pendulum", l1=2.0, l2=0.5)
+        shape = shape_of(run)
+        (places,) = shape.points(np.array([[np.pi / 2, 0.0]]), np.zeros((1, 2)))
+        assert np.allclose(places, [[0.0, 0.0], [2.0, 0.0], [2.0, -0.5]])
+        assert shape.joined
+        every = shape.points(run.q, run.p)
+        assert np.allclose(np.linalg.norm(np.diff(every, axis=1), axis=2), [2.0, 0.5])
+
+    def test_a_pendulum_measured_from_above_stands_at_zero(self):
+        run = run_with("m*l**2*q_dot**2/2 - m*g*l*cos(q)", ["q"], m=1.0, l=3.0, g=9.81)
+        (places,) = shape_of(run).points(np.array([[0.0]]), np.zeros((1, 1)))
+        assert np.allclose(places, [[0.0, 0.0], [0.0, 3.0]])
+
+    @pytest.mark.parametrize(
+        ("lagrangian", "coordinates"),
+        [
+            ("q_dot**2/2 - q**2/2", ["q"]),
+            ("q_dot**2/2 + cos(2*q)", ["q"]),
+            ("q_dot**2/2", ["q"]),
+            ("(a_1_dot**2 + a_2_dot**2)/2 + cos(a_1) + cos(a_2)", ["a_1", "a_2"]),
+            ("(a_1_dot**2 + a_2_dot**2 + a_1_dot*a_2_dot)/2 + cos(a_1) + cos(a_1 + a_2)", ["a_1", "a_2"]),
+            ("(a_1_dot**2 + a_2_dot**2 + a_1_dot*a_2_dot)/2 + cos(a_1) - cos(a_2)", ["a_1", "a_2"]),
+            ("(a_dot**2 + b_dot**2 + a_dot*b_dot)/2 + cos(a) + cos(b)", ["a", "b"]),
+        ],
+        ids=["spring", "two wells", "free", "apart", "angles between", "up and down", "no numbers"],
+    )
+    def test_what_only_looks_like_pendulums_is_none(self, lagrangian, coordinates):
+        assert not shape_of(run_with(lagrangian, coordinates)).joined
+
+    def test_bodies_are_points_with_names(self):
+        shape = shape_of(run_of("outer-solar-system", 2))
+        assert shape.names == ("sun", "jupiter", "saturn", "uranus", "neptune", "pluto")
+        assert shape.points(np.arange(18.0)[np.newaxis], np.zeros((1, 18))).shape == (1, 6, 3)
+
+    def test_chains_stand_side_by_side(self):
+        shape = shape_of(run_of("fput-chain", 2))
+        (places,) = shape.points(np.arange(8.0)[np.newaxis], np.zeros((1, 8)))
+        assert shape.joined
+        assert np.array_equal(places, np.stack([np.arange(1.0, 9.0), np.arange(8.0)], axis=1))
+
+    def test_one_coordinate_moves_in_its_phase_plane_and_two_in_theirs(self):
+        oscillator, kepler = run_of("harmonic-oscillator"), run_of("kepler")
+        assert np.array_equal(
+            shape_of(oscillator).points(oscillator.q, oscillator.p)[:, 0], np.hstack([oscillator.q, oscillator.p])
+        )
+        assert np.array_equal(shape_of(kepler).points(kepler.q, kepler.p)[:, 0], kepler.q)
+
+
+class TestFilm:
+    def test_frames_are_the_states_at_equal_times(self):
+        run = run_of("kepler", 1000)
+        frames = run.animate(seconds=2.0).frames
+        assert (len(frames), frames[0], frames[-1]) == (50, 0, 1000)
+        assert np.ptp(np.diff(run.t[frames])) <= 1.001 * run.h
+
+    def test_each_frame_shows_its_state(self):
+        run = run_of("double-pendulum")
+        film = run.animate()
+        film.animation._init_draw()
+        for frame in (3, 40):
+            film.animation._func(frame)
+            (axes,) = film.animation._fig.axes
+            rods = axes.lines[-1].get_xydata()
+            x = np.cumsum(np.sin(run.q[frame]))
+            assert np.allclose(rods, np.stack([[0, *x], [0, *-np.cumsum(np.cos(run.q[frame]))]], axis=1))
+            assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.4g}"
+
+    @pytest.mark.parametrize("name", ["charged-particle", "fput-chain", "planar-pendulum", "outer-solar-system"])
+    def test_a_notebook_shows_it(self, name):
+        shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()
+        assert shown.count("data:image/png") == 4
+
+    def test_a_film_goes_backward_as_its_run_does(self):
+        run = run_of("kepler", 10)
+        back = run.stepper.integrate(run.q[-1], run.p[-1], h=-run.h, steps=10)
+        assert list(back.animate(seconds=1.0).frames) == list(range(11))
+
+    def test_files_are_whole_films(self, tmp_path):
+        run = run_of("kepler", 4)
+        run.animate(tmp_path / "film.gif", seconds=0.2)
+        run.animate(tmp_path / "film.html", seconds=0.2)
+        from PIL import Image
+
+        with Image.open(tmp_path / "film.gif") as film:
+            assert film.n_frames == 5
+        assert "<script" in (tmp_path / "film.html").read_text(encoding="utf-8")
+        assert sorted(file.name for file in tmp_path.iterdir()) == ["film.gif", "film.html"]
+
+    def test_places_may_be_given(self):
+        run = run_of("spherical-pendulum", 3)
+
+        def bob(q: np.ndarray) -> np.ndarray:
+            theta, phi = q.T
+            rod = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), -np.cos(theta)
+            return np.stack(rod, axis=1)[:, np.newaxis]
+
+        film = run.animate(positions=bob, seconds=0.2)
+        film.animation._init_draw()
+        assert film.animation._fig.axes[0].name == "3d"
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ({"path": "film.png"}, r"\.gif, \.html or \.mp4"),
+            ({"seconds": 0.0}, "seconds must be a positive number"),
+            ({"positions": lambda q: q}, r"shape \(n, k, 2\) or \(n, k, 3\)"),
+        ],
+    )
+    def test_what_is_wrong_is_said(self, arguments, words):
+        with pytest.raises(StateError, match=words):
+            run_of("kepler").animate(**arguments)
+
+    def test_without_ffmpeg_a_film_that_needs_it_is_refused(self, monkeypatch, tmp_path):
+        from matplotlib.animation import writers
+
+        monkeypatch.setattr(writers, "is_available", lambda name: False)
+        with pytest.raises(PlotError, match="ffmpeg"):
+            run_of("kepler").animate(tmp_path / "film.mp4")
+        assert list(tmp_path.iterdir()) == []
