@@ -98,6 +98,9 @@ class Film:
         with style():
             figure = Figure(figsize=(SIZE, SIZE), layout="constrained")
             scene = _Scene(figure, self.trajectory, self.shape)
+            scene.show(0)
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")  # it stays where it is, and need not be found for every frame
             interval = 1000.0 * self.seconds / len(self.frames)
             return FuncAnimation(figure, scene.show, frames=self.frames, interval=interval, blit=False)
 
@@ -164,7 +167,7 @@ class _Scene:
         for which, mark in self.marks:
             _set(mark, np.atleast_2d(self.places[frame, which]))
         interface = self.motion.stepper.interface
-        self.axes.set_title(plain(f"{interface.system}, t = {self.motion.t[frame]:.4g}"))
+        self.axes.set_title(plain(f"{interface.system}, t = {self.motion.t[frame]:.6g}"))
         return [*self.trails, *(mark for _, mark in self.marks)]
 
 

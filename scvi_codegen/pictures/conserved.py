@@ -56,7 +56,7 @@ def plot_momentum_maps(
         for number, name in enumerate(names):
             _draw_error(drawn, trajectory.t, errors[:, number], number, name)
         drawn.set(xlabel="t", title="relative change of momentum maps")
-        drawn.legend()
+        drawn.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
     return drawn
 
 

@@ -95,7 +95,7 @@ class TestFilm:
             rods = axes.lines[-1].get_xydata()
             x = np.cumsum(np.sin(run.q[frame]))
             assert np.allclose(rods, np.stack([[0, *x], [0, *-np.cumsum(np.cos(run.q[frame]))]], axis=1))
-            assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.4g}"
+            assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.6g}"
 
     @pytest.mark.parametrize("name", ["charged-particle", "fput-chain", "planar-pendulum", "outer-solar-system"])
     def test_a_notebook_shows_it(self, name):
