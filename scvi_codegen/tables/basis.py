@@ -17,7 +17,7 @@ from operator import mul
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.tables.nodes import checked_count, to_number
-from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
+from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp, settled
 from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = [
@@ -55,7 +55,7 @@ def transpose(matrix: Matrix) -> Matrix:
 
 def rounded(matrix: Iterable[Iterable[Number]]) -> Matrix:
     """Return the matrix in tuples, each entry rounded to the current precision."""
-    return tuple(tuple(+entry for entry in row) for row in matrix)
+    return tuple(tuple(map(settled, row)) for row in matrix)
 
 
 def guard_digits(points: Sequence[Number]) -> int:

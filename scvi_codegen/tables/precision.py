@@ -11,14 +11,22 @@ from typing import Any, TypeAlias
 
 from mpmath import MPContext
 
-__all__ = ["DIGITS", "Matrix", "Number", "Vector", "mp"]
+__all__ = ["DIGITS", "Matrix", "Number", "Vector", "mp", "settled"]
 
 DIGITS = 60
 mp = MPContext()
 mp.dps = DIGITS
+
+ZERO = mp.mpf(10) ** -40
+"""Entries of tables on a step of length 1 that are smaller are 0 but for the 60th digit of what they came from."""
 
 Number: TypeAlias = Any
 """An ``mp.mpf`` of this context (mpmath ships no types)."""
 
 Vector: TypeAlias = tuple[Number, ...]
 Matrix: TypeAlias = tuple[Vector, ...]
+
+
+def settled(value: Number) -> Number:
+    """An entry of a table, rounded to the current precision; exactly 0 where it is 0 but for rounding."""
+    return +value if abs(value) > ZERO else mp.zero

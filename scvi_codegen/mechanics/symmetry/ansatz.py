@@ -6,7 +6,6 @@ In index notation: the state is q_0 .. q_(m-1), p_0 .. p_(m-1), entries 0 .. 2 m
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement
 from typing import TypeAlias
@@ -100,9 +99,8 @@ def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list
 def bodies_of(system: MechanicalSystem) -> tuple[Body, ...]:
     """Bodies by names such as jupiter_x, x_jupiter or x1; two or three coordinates with other names are one body."""
     names = [q.name for q in system.coordinates]
-    swapped = [re.sub(r"^([xyz])_?(\w+)$", r"\2_\1", name) for name in names]
     alone = (Body(name="", columns=tuple(range(len(names)))),) if 2 <= len(names) <= 3 else ()
-    return bodies(names) or bodies(swapped) or alone
+    return bodies(names) or alone
 
 
 def planes_of(found: Sequence[Body]) -> list[tuple[int, int]]:
