@@ -1,15 +1,19 @@
 """The whole tour: a system and a method go in, a stepper comes out.
 
     MechanicalSystem, Method
-      -> symmetry  Symmetry        what is conserved (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
-      -> derive    StepEquations   the equations as the paper prints them, to look at
-      (:mod:`scvi_codegen.derivation.equations`) -> solvers   Sweep           a solver without a matrix, where there is
-      one (:mod:`scvi_codegen.lowering.solvers`) -> lower     Program         kernels, tables, loops: C without syntax
-      (:mod:`scvi_codegen.lowering.program`) -> render    Source          header and source text, from ``templates/``
-      (:mod:`scvi_codegen.rendering.text`)
-         (with events, the search for them behind it: :mod:`scvi_codegen.rendering.events`)
-      -> build     module          compiled, bound and cached (:mod:`scvi_codegen.native.building`)
+      -> discretise  StageSystem   points, kernel and tables: the equations of one step
+                                   (:mod:`scvi_codegen.methods.discretise`)
+      -> sweep_of    Sweep         how they are solved without a matrix, where there is a way; splitting_of: explicitly
+                                   (:mod:`scvi_codegen.lowering.solvers.choice`)
+      -> symmetries  Symmetry      what is conserved (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
+      -> lower       Program       kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering.program`)
+      -> render      Source        header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering.text`);
+                                   with events, the search for them behind it (:mod:`scvi_codegen.rendering.events`)
+      -> build       module        compiled, bound and cached (:mod:`scvi_codegen.native.building`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.stepper`)
+
+Beside the way: :func:`scvi_codegen.derivation.equations.derive` writes the equations out as the paper prints them, and
+:func:`scvi_codegen.exact.step.derived_step` solves them in 60 digits; both read a ``StageSystem`` of their own.
 
 Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
 kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so the second time is quick.
@@ -29,7 +33,7 @@ from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.waiting import waiting_for
@@ -165,13 +169,23 @@ def program_of(
         lanes: whether there may be a solver with vector lanes.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
+    stages = discretise(system, method)
     splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
     swept = lanes and solver in ("auto", "fixed-point") and splitting is None
-    sweep = sweep_of(system, method) if swept else None
+    sweep = sweep_of(system, stages) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
-    newton = solver in ("auto", "newton") and not (splitting and isinstance(method, Composition))
+    newton = solver in ("auto", "newton") and (method.implicit or not splitting)
     tracked = all_symmetries(system, symmetries)
-    return lower(system, method, prefix=name, sweep=sweep, splitting=splitting, newton=newton, symmetries=tracked)
+    return lower(
+        system,
+        method,
+        stages,
+        prefix=name,
+        sweep=sweep,
+        splitting=splitting,
+        newton=newton,
+        symmetries=tracked,
+    )
 
 
 def describe(program: Program, system: MechanicalSystem, method: Method) -> Interface:

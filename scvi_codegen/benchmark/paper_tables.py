@@ -21,7 +21,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
+from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.options import SolverOptions

@@ -8,12 +8,13 @@ from functools import lru_cache
 import sympy
 
 from scvi_codegen.derivation.notation import TableEntry
-from scvi_codegen.methods.collocation import RungeKutta
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem, Table
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule, exact_tableau
 from scvi_codegen.tables.precision import Number
+from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.radicals import radical_basis, recognised
+from scvi_codegen.tables.tableau import Tableau
 
 __all__ = ["entries", "table_entries"]
 
@@ -56,14 +57,12 @@ def _basis(method: Method) -> tuple[sympy.Expr, ...]:
 
 def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
     """The exact points, weights and coefficients behind the method's tables."""
-    if isinstance(method, RungeKutta):
-        exact = exact_tableau(method.tableau)
-        yield None if exact is None else [x for row in exact[0] for x in row] + list(exact[1]) + list(exact[2])
-        return
-    nodes = getattr(method, "node_set", None)
-    if nodes is not None:
-        yield exact_points(nodes)
-    rule = getattr(method, "rule", None)
-    if rule is not None:
-        exact_points_and_weights = exact_rule(rule)
-        yield None if exact_points_and_weights is None else [x for part in exact_points_and_weights for x in part]
+    for part in method.parts:
+        if isinstance(part, Tableau):
+            exact = exact_tableau(part)
+            yield None if exact is None else [x for row in exact[0] for x in row] + list(exact[1]) + list(exact[2])
+        elif isinstance(part, Quadrature):
+            rule = exact_rule(part)
+            yield None if rule is None else [x for group in rule for x in group]
+        else:
+            yield exact_points(part)

@@ -28,7 +28,6 @@ from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import SpectralCollocation
-from scvi_codegen.methods.exactness import is_exact
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.methods.stage_system import Block, PointFamily, StageSystem, Table
@@ -130,7 +129,7 @@ class StepEquations:
         if self.symmetries:
             yield "\nconserved (momentum maps of symmetries)"
         for symmetry in self.symmetries:
-            yield f"  {symmetry}{'' if is_exact(symmetry, self.method) else '  (not guaranteed by this method)'}"
+            yield f"  {symmetry}{'' if self.method.exactness.keeps(symmetry) else '  (not guaranteed by this method)'}"
 
     def __repr__(self) -> str:
         count = len(self.equations)

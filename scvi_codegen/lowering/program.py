@@ -29,9 +29,7 @@ from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.exactness import is_exact
-from scvi_codegen.methods.method import Method, check_regular
-from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.precision import Matrix
 
@@ -41,6 +39,7 @@ __all__ = ["lower"]
 def lower(
     system: MechanicalSystem,
     method: Method,
+    stages: StageSystem,
     *,
     prefix: str,
     sweep: Sweep | None = None,
@@ -52,14 +51,13 @@ def lower(
 
     Args:
         system, method: what is lowered.
+        stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
         prefix: a C identifier.
         sweep: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.sweep_of`).
         splitting: the explicit solver that replaces both
         (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`). newton: whether Newton's iteration is emitted;
         with it the discrete Legendre transforms. symmetries: whose momentum maps are emitted.
     """
-    check_regular(method, system)
-    stages = with_auxiliaries(system, method.stage_system(system))
     mass = forms_of(system).legendre_slopes
     families = tuple(lowered_family(system, family) for family in stages.families)
     met = [*mass, *_meetings(families if newton else ())]
@@ -86,7 +84,7 @@ def lower(
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(
-            MomentumMap(name=_comment(each.name), formula=_comment(each.formula), exact=is_exact(each, method))
+            MomentumMap(name=_comment(each.name), formula=_comment(each.formula), exact=method.exactness.keeps(each))
             for each in symmetries
         ),
         momentum_kernel=_momentum_kernel(system, symmetries),

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import Parameter, signature
 from typing import Any
 
 from scvi_codegen.errors import MethodError, closest
-from scvi_codegen.methods.collocation import (
+from scvi_codegen.methods.collocation import SpectralCollocation
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.method import Method, Specification
+from scvi_codegen.methods.runge_kutta import (
     TABLEAU_METHODS,
     ChebyshevGauss,
     ChebyshevLobatto,
@@ -17,12 +22,9 @@ from scvi_codegen.methods.collocation import (
     RadauIA,
     RadauIIA,
     RungeKutta,
-    SpectralCollocation,
 )
-from scvi_codegen.methods.composition import Composition
-from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
-from scvi_codegen.methods.method import Method, Specification
 from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.methods.stoermer_verlet import StoermerVerlet
 
 __all__ = [
     "METHODS",
@@ -52,26 +54,17 @@ METHODS: dict[str, Callable[..., Method]] = {
     **TABLEAU_METHODS,
     "collocation": CollocationRK,
     "stoermer-verlet": StoermerVerlet,
-    "composition": Composition,
+    "composition": Composition.of,
     "explicit-euler": ExplicitEuler,
 }
-"""Constructors by the name used in model files and on the command line."""
+"""Constructors by the name used in model files and on the command line; their signatures say what they take."""
 
-ARGUMENTS: dict[str, tuple[str, ...]] = {
-    "svi": ("degree", "quadrature", "nodes", "space"),
-    "scvi": ("degree", "quadrature", "nodes", "variational", "abscissae"),
-    "sc": ("degree", "nodes", "form"),
-    **dict.fromkeys(TABLEAU_METHODS, ("stages", "form")),
-    "collocation": ("abscissae", "form"),
-    "stoermer-verlet": (),
-    "composition": ("order",),
-    "explicit-euler": ("form",),
-}
-REQUIRED = {
-    **dict.fromkeys(("svi", "scvi", "sc"), "degree"),
-    **dict.fromkeys(TABLEAU_METHODS, "stages"),
-    "collocation": "abscissae",
-    "composition": "order",
+ARGUMENTS: dict[str, tuple[str, ...]] = {name: tuple(signature(make).parameters) for name, make in METHODS.items()}
+"""What each takes, by name."""
+
+REQUIRED: dict[str, tuple[str, ...]] = {
+    name: tuple(key for key, value in signature(make).parameters.items() if value.default is Parameter.empty)
+    for name, make in METHODS.items()
 }
 
 
@@ -94,8 +87,7 @@ def method_from_specification(specification: Specification) -> Method:
             raise MethodError(f"{argument} must be an integer, not {arguments[argument]!r}")
     if not isinstance(arguments.get("abscissae", ""), str | list | tuple):
         raise MethodError(f"abscissae must be a list of numbers or a name, not {arguments['abscissae']!r}")
-    if name in REQUIRED and REQUIRED[name] not in arguments:
-        raise MethodError(f"{name} needs {REQUIRED[name]!r}")
-    if name == "composition":
-        return Composition(arguments["order"])
+    for argument in REQUIRED[name]:
+        if argument not in arguments:
+            raise MethodError(f"{name} needs {argument!r}")
     return METHODS[name](**arguments)

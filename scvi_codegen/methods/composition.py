@@ -17,6 +17,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.method import Method, Specification
 from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
 from scvi_codegen.tables.basis import identity_matrix
@@ -75,6 +76,21 @@ class Composition(Method):
     def __post_init__(self) -> None:
         if self.composition_order not in FIRST_HALVES:
             raise MethodError(f"there are compositions of order 2, 8 and 10, not {self.composition_order!r}")
+
+    @classmethod
+    def of(cls, order: int) -> Composition:
+        """The composition of an order."""
+        return cls(order)
+
+    @property
+    def exactness(self) -> Exactness:
+        """That of Stoermer-Verlet."""
+        return Exactness(curve=1, quadrature=2, gauge=1)
+
+    @property
+    def implicit(self) -> bool:
+        """No."""
+        return False
 
     @property
     def fractions(self) -> Vector:

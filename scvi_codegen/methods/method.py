@@ -1,4 +1,11 @@
-"""What every method is: frozen data that knows its properties and gives its stage equations for a system."""
+"""What every method is: frozen data that knows its properties and gives its stage equations for a system.
+
+A method is a frozen dataclass of :class:`Method` in a file of its own and a line in ``METHODS``
+(:mod:`scvi_codegen.methods`). It must give a name, a title, its order, whether it is symmetric and symplectic, a
+specification, and two readings of its equations, which may be one: as compiled, and as the paper prints them. What else
+others ask of it (solvers, certificates, momentum maps) has an answer here that claims nothing, which it may better.
+Nobody outside of this folder asks what kind of method it is.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +20,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.stage_system import PointFamily, Scatter, StageSystem, dyadic
 from scvi_codegen.tables.precision import Number, Vector, mp
 from scvi_codegen.tables.tableau import MOST_STAGES
@@ -51,6 +59,34 @@ class Method(ABC):
     def needs_regular(self) -> bool:
         """Whether momenta must be determined by velocities: for a Hamiltonian, d2H/dp2 regular."""
         return False
+
+    @property
+    def needs_lagrangian(self) -> bool:
+        """Whether a Hamiltonian will not do."""
+        return False
+
+    @property
+    def exactness(self) -> Exactness:
+        """Which momentum maps are conserved to round-off; by default none is claimed."""
+        return Exactness()
+
+    @property
+    def fractions(self) -> Vector:
+        """Sizes of the leapfrog steps, as fractions of h, that the step consists of where L is separable; or none.
+
+        With some the method is explicit there.
+        """
+        return ()
+
+    @property
+    def implicit(self) -> bool:
+        """Whether there are equations to solve; not for methods that are nothing but leapfrog steps."""
+        return True
+
+    @property
+    def frequency(self) -> float | None:
+        """In radians a step, where the curves are fitted to one: then nothing is promised for h to 0."""
+        return None
 
     @property
     @abstractmethod

@@ -36,6 +36,7 @@ __all__ = [
     "Row",
     "ScalarFamily",
     "Scatter",
+    "Shape",
     "StageSystem",
     "Table",
     "dyadic",
@@ -172,6 +173,12 @@ class PointFamily:
         return sum((scatter.results for scatter in self.scatters), ())
 
 
+class Shape:
+    """Base of what a solver without a matrix must know of stage equations: :mod:`scvi_codegen.methods.shapes`."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageSystem:
     """The equations of one step of one method for one system, points and tables not yet multiplied out.
@@ -184,7 +191,7 @@ class StageSystem:
         end_momentum: coefficient of p0 in p1.
         end_numbers: the paper's numbers of the equations for q1 and p1.
         extrapolation: (B, B) matrix from the unknowns of one step to a guess for the next, or ``None``.
-        block_abscissae: (B,) where on the step the unknowns are the curve's velocities, or empty where they are not.
+        shape: what a solver without a matrix must know of the equations, or ``None``: only Newton's iteration is left.
     """
 
     blocks: tuple[Block, ...]
@@ -194,7 +201,7 @@ class StageSystem:
     end_momentum: Number
     end_numbers: tuple[str, str]
     extrapolation: Matrix | None = None
-    block_abscissae: Vector = ()
+    shape: Shape | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,7 +263,7 @@ def stationary_increments(
     end_position: Sequence[Number],
     rows: tuple[Row, ...],
     extrapolation: Matrix | None,
-    block_abscissae: Vector = (),
+    shape: Shape | None = None,
 ) -> StageSystem:
     """The variational method of G(q0, z, mu, q1) = S(q0, z) + mu . (q0 + h sum_b beta_b z_b - q1), unknowns velocities.
 
@@ -283,7 +290,7 @@ def stationary_increments(
         end_momentum=mp.one,
         end_numbers=("q1", "p1"),
         extrapolation=extrapolation,
-        block_abscissae=block_abscissae,
+        shape=shape,
     )
 
 

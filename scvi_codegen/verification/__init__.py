@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.stepper import Stepper
@@ -119,7 +118,7 @@ def _newton(
     """Newton's solver alone, where the artefact has it; the artefact itself where that is all it has."""
     if solver == "newton":
         return stepper
-    if solver != "auto" or isinstance(method, Composition):
+    if solver != "auto" or not method.implicit:
         return None
     return compile_stepper(system, method, solver="newton", flags=flags)
 

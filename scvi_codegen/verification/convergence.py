@@ -13,10 +13,8 @@ from typing import Any
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.exact.motion import Numbers
 from scvi_codegen.methods import method_from_specification
-from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.tables.precision import Number, mp
-from scvi_codegen.tables.spaces import Trigonometric
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
 from scvi_codegen.verification.subject import State, Subject
 
@@ -92,7 +90,7 @@ def _expected(method: Method) -> tuple[int | None, bool, bool] | None:
 
 
 def _order(subject: Subject) -> Finding | None:
-    if _fits_one_frequency(subject.method):
+    if subject.method.frequency is not None:
         return None
     order = subject.method.order
     measured, error = _measured_order(subject)
@@ -100,11 +98,6 @@ def _order(subject: Subject) -> Finding | None:
         return Finding(error, float(FLOOR), "a step is exact")
     least = order - SLACK if order else LEAST_ORDER
     return Finding(measured, least, f"where a step errs by {error:.1e}", at_least=True)
-
-
-def _fits_one_frequency(method: Method) -> bool:
-    """Curves fitted to a frequency in radians a step are not meant for h to 0: they may lack even straight lines."""
-    return isinstance(method, SVI) and isinstance(method.curves, Trigonometric)
 
 
 def _measured_order(subject: Subject) -> tuple[float | None, float]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import partial, singledispatch
 
 import numpy as np
 
@@ -15,11 +15,17 @@ from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.collocation import CollocationRK, Gauss, RungeKutta, SpectralCollocation
-from scvi_codegen.methods.composition import Composition
-from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    CollocationRK,
+    Composition,
+    Gauss,
+    Method,
+    RungeKutta,
+    SpectralCollocation,
+    StoermerVerlet,
+)
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import (
     Quadrature,
@@ -29,7 +35,7 @@ from scvi_codegen.tables.quadrature import (
     gauss_lobatto,
     gauss_radau,
 )
-from scvi_codegen.tables.spaces import Polynomials, Trigonometric
+from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.subject import Subject
 
@@ -37,6 +43,7 @@ __all__ = ["identity_checks"]
 
 EQUAL, ROUNDED = 1e-30, 1e-13
 """Of equations in 60 digits; of equations whose tables are rounded together to 52 bits."""
+OTHER_FORM = "position form is phase-space form for constant mass"
 LARGEST_TWIN = 6
 """Coordinates up to which Legendre's transform is taken symbolically."""
 
@@ -62,7 +69,7 @@ class _Twin:
 def identity_checks(subject: Subject) -> Iterator[Check]:
     """Those that apply to the method and the system."""
     promise = "the same step by another path"
-    for twin in _twins(subject.moved, subject.method):
+    for twin in _twins(subject.method, forms_of(subject.moved).separable):
         measure = partial(_compared, subject, subject.moved, twin.method, twin.bound)
         yield from checked(f"identity: {twin.name}", promise, measure)
     yield from checked("identity: from H as from L", promise, partial(_legendre_twin, subject))
@@ -78,27 +85,27 @@ def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound:
     return Finding(float(max(apart)), bound, method.name)
 
 
-def _twins(system: MechanicalSystem, method: Method) -> Iterator[_Twin]:
-    separable = forms_of(system).separable
-    if isinstance(method, SVI):
-        yield from _galerkin_twins(method, separable)
-    elif isinstance(method, SCVI):
-        yield from _shooting_twins(method, separable)
-    elif isinstance(method, SpectralCollocation):
-        abscissae = method.node_set.abscissae[1:]
-        yield _Twin("collocation at its nodes", CollocationRK(abscissae, form=method.form))
-    elif isinstance(method, RungeKutta):
-        yield from _tableau_twins(method)
-    if isinstance(method, SpectralCollocation | RungeKutta) and separable:
-        yield _Twin("position form is phase-space form for constant mass", _other_form(method))
-    if isinstance(method, StoermerVerlet) and separable:
+@singledispatch
+def _twins(method: Method, separable: bool) -> Iterator[_Twin]:
+    """Methods that take the same step, where the system is separable or not; of a method that has none here, none."""
+    return iter(())
+
+
+@_twins.register
+def _(method: StoermerVerlet, separable: bool) -> Iterator[_Twin]:
+    if separable:
         yield _Twin("SVI of degree 1 with the trapezoidal rule", SVI(1, "gauss-lobatto:2"), ROUNDED)
         yield _Twin("kick, drift, kick", Composition(2), ROUNDED)
-    if isinstance(method, Composition) and method.composition_order == 2:
+
+
+@_twins.register
+def _(method: Composition, separable: bool) -> Iterator[_Twin]:
+    if method.composition_order == 2:
         yield _Twin("Lobatto IIIA-IIIB", StoermerVerlet(), ROUNDED)
 
 
-def _galerkin_twins(method: SVI, separable: bool) -> Iterator[_Twin]:
+@_twins.register
+def _(method: SVI, separable: bool) -> Iterator[_Twin]:
     s, rule = method.degree, method.rule
     if not isinstance(method.curves, Polynomials) or rule.derivative_weights:
         return
@@ -113,7 +120,8 @@ def _galerkin_twins(method: SVI, separable: bool) -> Iterator[_Twin]:
             yield _Twin("SVI(1, trapezoidal rule) = Stoermer-Verlet", StoermerVerlet(), ROUNDED)
 
 
-def _shooting_twins(method: SCVI, separable: bool) -> Iterator[_Twin]:
+@_twins.register
+def _(method: SCVI, separable: bool) -> Iterator[_Twin]:
     s, rule = method.degree, method.rule
     if s == 1:
         yield _Twin("SCVI(1) = SVI(1)", SVI(1, rule))
@@ -124,7 +132,16 @@ def _shooting_twins(method: SCVI, separable: bool) -> Iterator[_Twin]:
         yield _Twin("SCVI on Gauss points = SVI", SVI(s, rule), ROUNDED)
 
 
-def _tableau_twins(method: RungeKutta) -> Iterator[_Twin]:
+@_twins.register
+def _(method: SpectralCollocation, separable: bool) -> Iterator[_Twin]:
+    abscissae = method.node_set.abscissae[1:]
+    yield _Twin("collocation at its nodes", CollocationRK(abscissae, form=method.form))
+    if separable:
+        yield _Twin(OTHER_FORM, replace(method, form=_other(method.form)))
+
+
+@_twins.register
+def _(method: RungeKutta, separable: bool) -> Iterator[_Twin]:
     family, _, stages = method.tableau.name.partition(":")
     if family in POINTS:
         points = POINTS[family](int(stages)).abscissae
@@ -132,20 +149,19 @@ def _tableau_twins(method: RungeKutta) -> Iterator[_Twin]:
     if family == "gauss" and method.form == "phase-space":
         s = int(stages)
         yield _Twin("Gauss(s) = SVI(s, s Gauss points)", SVI(s))
+    if separable:
+        yield _Twin(OTHER_FORM, replace(method, form=_other(method.form)))
 
 
-def _other_form(method: SpectralCollocation | RungeKutta) -> Method:
-    form = "position" if method.form == "phase-space" else "phase-space"
-    if isinstance(method, SpectralCollocation):
-        return SpectralCollocation(method.degree, method.node_set, form)
-    return RungeKutta(method.tableau, form)
+def _other(form: str) -> str:
+    return "position" if form == "phase-space" else "phase-space"
 
 
 def _legendre_twin(subject: Subject) -> Finding | None:
     """The step of the Hamiltonian of a Lagrangian, or the other way round."""
     system, method = subject.moved, subject.method
     singular = isinstance(system, HamiltonianSystem) and not system.is_regular
-    if singular or (isinstance(method, SVI) and method.rule.derivative_weights):
+    if singular or method.needs_lagrangian:
         return None
     if system.dimension > LARGEST_TWIN:
         raise StateError(f"Legendre's transform is taken for {LARGEST_TWIN} coordinates at most")
@@ -155,11 +171,11 @@ def _legendre_twin(subject: Subject) -> Finding | None:
 
 def _oscillator(method: Method) -> Finding | None:
     """Of curves fitted to a frequency, whatever the system; with the quadrature that is made for them."""
-    if not isinstance(method, SVI) or not isinstance(method.curves, Trigonometric):
+    if not isinstance(method, SVI) or method.frequency is None:
         return None
     if method.quadrature != method.curves.default_rule(method.degree):
         return None
-    formula, frequency = "(q_dot**2 - w**2*q**2)/2", {"w": method.curves.frequency}
+    formula, frequency = "(q_dot**2 - w**2*q**2)/2", {"w": method.frequency}
     system = LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian=formula, parameters=frequency)
     found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), exact_motion(system).flow([0.7], [0.4], 1)
     return Finding(float(max(abs(found.q[0] - q[0]), abs(found.p[0] - p[0]))), ROUNDED)

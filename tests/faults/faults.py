@@ -10,8 +10,7 @@ import sympy
 from sabotage import Case, Make, Sabotage, changed_result
 
 from scvi_codegen.ir.kernel import Operation
-from scvi_codegen.lowering.solvers import choice
-from scvi_codegen.methods import SVI, RungeKutta, shooting
+from scvi_codegen.methods import SVI, RungeKutta, shooting_stages
 from scvi_codegen.tables.precision import mp
 
 
@@ -68,6 +67,10 @@ def scaled_first(factor: Any) -> Make:
     return lambda values: (values[0] * factor, *values[1:])
 
 
+def doubled(entries: Any) -> Any:
+    return {place: 2 * entry for place, entry in entries.items()}
+
+
 def reversed_rows(rows: Any) -> Any:
     return tuple(rows[::-1])
 
@@ -118,9 +121,8 @@ def of_another_system(original: Any) -> Any:
 
 def as_printed(sabotage: Sabotage) -> None:
     """The chain-rule term of the discrete Lagrangian lost everywhere, as in the paper."""
-    sabotage.replace(shooting, "_shooting_nodal", lambda _: shooting._printed_nodal)
-    sabotage.replace(shooting, "_shooting_increments", lambda _: shooting._printed_increments)
-    sabotage.replace_here(choice, "shooting_sweep", lambda _: choice.printed_sweep)
+    sabotage.replace(shooting_stages, "shooting_nodal", lambda _: shooting_stages.printed_nodal)
+    sabotage.replace(shooting_stages, "shooting_increments", lambda _: shooting_stages.printed_increments)
 
 
 def power_rule_halved(original: Any) -> Any:

@@ -12,6 +12,7 @@ from certified_cases import case
 from faults import (
     Mutation,
     as_printed,
+    doubled,
     eight_digits,
     eight_digits_text,
     function,
@@ -29,18 +30,20 @@ from faults import (
     wrong_rule,
     wrong_tableau,
 )
-from sabotage import changed_result, of_entries
+from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import derivatives
-from scvi_codegen.lowering import program as lowering
+from scvi_codegen.ir import arithmetic, rounding
+from scvi_codegen.lowering import families
 from scvi_codegen.lowering.solvers import collocation as collocation_sweep
-from scvi_codegen.lowering.solvers import coupled, separable
+from scvi_codegen.lowering.solvers import separable
 from scvi_codegen.mechanics import forms as mechanics
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import (
-    collocation,
+    acceleration_stages,
     composition,
-    shooting,
+    runge_kutta,
+    shooting_stages,
     stage_system,
 )
 from scvi_codegen.methods import method as method_room
@@ -57,67 +60,67 @@ MUTATIONS = (
         "numbers printed with 8 digits", case("pendulum/svi"), c_printer, "print_number", lambda _: eight_digits_text
     ),
     function("minus signs lost", case("double/svi"), c_printer, "_print", without_negation),
-    function("tables rounded to 8 digits", case("double/svi"), lowering, "lower_matrix", of_entries(eight_digits)),
+    function("tables rounded to 8 digits", case("double/svi"), rounding, "lower_matrix", of_entries(eight_digits)),
     function(
         "weights rounded to 8 digits",
         case("cart/svi"),
-        lowering,
+        rounding,
         "lower_vector",
         changed_result(lambda found: tuple(map(eight_digits, found))),
     ),
     function(
         "parameters exchanged",
         case("double/svi"),
-        lowering,
+        arithmetic,
         "lower_kernel",
         lambda original: lambda name, *, parameters, **named: original(name, parameters=parameters[::-1], **named),
     ),
     function(
         "powers from the third on one too low",
         case("driven/svi"),
-        lowering._Graph,
+        arithmetic._Graph,
         "_whole",
         lambda original: lambda self, x, n: original(self, x, n - 1 if n > 2 else n),
     ),
     function(
         "r^-5 for r^-3",
         case("kepler/svi-3"),
-        lowering,
+        arithmetic,
         "INVERSE_ROOTS",
         lambda own: {**own, sympy.Integer(-3): "inverse_root_5"},
     ),
     function(
         "a power of h too much in a gather",
         case("double/svi"),
-        lowering,
+        families,
         "_gather_loop",
         changed_result(lambda loop: replace(loop, power=loop.power + 1) if loop.name.endswith("_1") else loop),
     ),
     function(
         "a power of h missing in a scatter",
         case("double/svi"),
-        lowering,
+        families,
         "_scatter_loop",
         changed_result(lambda loop: replace(loop, power=loop.power - 1) if loop.name.endswith("_0") else loop),
     ),
     function(
         "a slope five per cent off",
         case("double/svi"),
-        lowering,
+        families,
         "_slope_blocks",
         slopes(lambda k, slope: slope * sympy.Rational(21, 20) if k == 0 else slope),
     ),
     function(
         "a slope lost",
         case("double/sc"),
-        lowering,
+        families,
         "_slope_blocks",
         slopes(lambda k, slope: sympy.S.Zero if k == 1 else slope),
     ),
     function(
         "the slope of H_p off",
         case("vortices/svi"),
-        lowering,
+        families,
         "_slope_blocks",
         slopes(lambda k, slope: slope * sympy.Rational(11, 10) if k == 1 else slope),
     ),
@@ -172,19 +175,15 @@ MUTATIONS = (
         "matrix_product",
         lambda original: lambda a, b: original(transposed(a), b) if len(a) > 1 else original(a, b),
     ),
-    here(
-        "the mass of the sweeps doubled",
-        case("double/svi"),
-        coupled,
-        "jacobian",
-        changed_result(lambda entries: {place: 2 * entry for place, entry in entries.items()}),
+    function(
+        "the mass of the sweeps doubled", case("double/svi"), mechanics.Forms, "lower_mass", changed_property(doubled)
     ),
-    here(
+    function(
         "the mass at the nodes doubled",
         case("double/gauss-position"),
-        collocation_sweep,
-        "mass_entries",
-        changed_result(lambda entries: {place: 2 * entry for place, entry in entries.items()}),
+        mechanics.Forms,
+        "lower_mass",
+        changed_property(doubled),
     ),
     function(
         "L_q and L_v exchanged at both ends",
@@ -250,21 +249,21 @@ MUTATIONS = (
     here(
         "momentum by A for A^T",
         case("kepler/sc-phase-space"),
-        collocation,
+        runge_kutta,
         "_transposed",
         changed_result(lambda table: replace(table, entries=transposed(table.entries), names=transposed(table.names))),
     ),
     here(
         "A for A^2",
         case("double/gauss-position"),
-        collocation,
+        acceleration_stages,
         "matrix_product",
         lambda original: lambda a, b: original(a, b) if len(a) == 1 else a,
     ),
     here(
         "A for A^2 in the multipliers",
         case("double/scvi"),
-        shooting,
+        shooting_stages,
         "cardinal_integrals",
         of_entries(lambda x: x * (1 + mp.mpf("1e-8"))),
     ),
@@ -314,9 +313,9 @@ MUTATIONS = (
     function(
         "a force 1e-6 off",
         case("double/gauss-position"),
-        mechanics,
+        mechanics.Forms,
         "force",
-        changed_result(scaled_first(1 + sympy.Rational(1, 10**6))),
+        changed_property(scaled_first(1 + sympy.Rational(1, 10**6))),
     ),
     function(
         "another potential, consistently", case("double/svi"), stage_system.ScalarFamily, "slopes", of_another_system

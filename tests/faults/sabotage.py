@@ -21,7 +21,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method
 from scvi_codegen.verification import Certificate, verify
 
-__all__ = ["Case", "Make", "Sabotage", "certified", "changed_result", "of_entries"]
+__all__ = ["Case", "Make", "Sabotage", "certified", "changed_property", "changed_result", "of_entries"]
 
 Make = Callable[[Any], Any]
 
@@ -79,6 +79,11 @@ def changed_result(change: Make) -> Make:
         return lambda *arguments, **named: change(original(*arguments, **named))
 
     return make
+
+
+def changed_property(change: Make) -> Make:
+    """Of a property that is kept one whose value is changed."""
+    return lambda own: property(lambda self: change(own.func(self)))
 
 
 def of_entries(change: Make) -> Make:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from samples import sweep
 
-from scvi_codegen.lowering.solvers.choice import sweep_of
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -40,22 +40,22 @@ def difference(left, right):
 
 @pytest.mark.parametrize("method", [*POSITION, *PRINTED], **named)
 def test_every_coupled_system_has_an_iteration_on_accelerations(sample, method):
-    kinds = {sweep_of(sample(name).system, method).kind for name in COUPLED}
+    kinds = {sweep(sample(name).system, method).kind for name in COUPLED}
     assert kinds == {"collocation"}
 
 
 def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample):
     system = sample("kepler").system
-    assert {sweep_of(system, method).kind for method in POSITION} == {"separable"}
-    assert {sweep_of(system, method).kind for method in PRINTED} == {"collocation"}
-    assert sweep_of(system, SCVI(1, variational=False)).kind == "separable"
+    assert {sweep(system, method).kind for method in POSITION} == {"separable"}
+    assert {sweep(system, method).kind for method in PRINTED} == {"collocation"}
+    assert sweep(system, SCVI(1, variational=False)).kind == "separable"
 
 
 def test_more_points_than_lanes_are_left_to_newton(sample):
     system = sample("double-pendulum").system
-    assert sweep_of(system, SpectralCollocation(32)) is not None
-    assert sweep_of(system, SpectralCollocation(33)) is None
-    assert sweep_of(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
+    assert sweep(system, SpectralCollocation(32)) is not None
+    assert sweep(system, SpectralCollocation(33)) is None
+    assert sweep(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
 
 
 @pytest.mark.parametrize("name", ["pumped-cart-pole", "relativistic-particle"])

@@ -15,12 +15,12 @@ import pytest
 import sympy
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from samples import lowered
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
-from scvi_codegen.lowering.program import lower
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import double_pendulum, duffing, fput_chain, kepler
@@ -144,18 +144,18 @@ CATALOGUE = ["planar-pendulum", "duffing", "kepler", "double-pendulum", "spheric
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(2), Gauss(2)], ids=lambda m: m.name)
 def test_kernels_of_systems_have_the_values_and_slopes_of_their_formulas(name, method):
     system = problem(name).system
-    program = lower(system, method, prefix="p")
+    program = lowered(system, method)
     points = random.Random(name)
-    for family, lowered in zip(method.stage_system(system).families, program.families, strict=True):
+    for family, own in zip(method.stage_system(system).families, program.families, strict=True):
         symbols = (*family.arguments, system.time, *system.parameters)
         point = {symbol: sympy.Rational(points.randint(1, 30), 64) for symbol in symbols}
         point |= {symbol: 1 + value for symbol, value in point.items() if symbol in system.parameters}
         numbers = [float(point[symbol]) for symbol in symbols]
         m = len(family.arguments)
         expected = [float(exact(e, point)) for e in (*family.results, *slopes_in_order(family))]
-        found = interpret(lowered.slope, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
+        found = interpret(own.slope, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
-        values = interpret(lowered.value, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
+        values = interpret(own.value, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(values, expected[: len(values)], rtol=1e-12, atol=1e-14)
 
 
@@ -212,7 +212,7 @@ def test_whole_powers_are_products_and_other_powers_are_calls():
 @pytest.mark.parametrize("family", [SVI, SCVI, SpectralCollocation, Gauss], ids=lambda family: family.__name__)
 @pytest.mark.parametrize("system", [double_pendulum(), duffing()], ids=lambda system: system.name)
 def test_symbolic_cost_does_not_grow_with_the_degree(family, system):
-    small, large = (lower(system, family(degree), prefix="p") for degree in (2, 12))
+    small, large = (lowered(system, family(degree)) for degree in (2, 12))
     assert large.kernels == small.kernels
     assert large.blocks > small.blocks
 
@@ -249,7 +249,7 @@ def test_functions_without_a_c_counterpart_are_refused():
 
 
 def test_lowering_is_reproducible():
-    first, second = (lower(double_pendulum(), SCVI(3), prefix="p") for _ in range(2))
+    first, second = (lowered(double_pendulum(), SCVI(3)) for _ in range(2))
     assert first == second
     assert str(first) == str(second)
 
@@ -323,4 +323,4 @@ def test_printed_numbers_read_back_as_the_same_double(number):
 
 def test_the_whole_catalogue_lowers():
     for name in PROBLEMS:
-        assert lower(problem(name).system, SVI(2), prefix="p").kernels
+        assert lowered(problem(name).system, SVI(2)).kernels

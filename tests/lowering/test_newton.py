@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from samples import lowered
 
 from scvi_codegen import (
     SCVI,
@@ -18,7 +19,6 @@ from scvi_codegen import (
 )
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.ir.program import WORTH_REMEMBERING
-from scvi_codegen.lowering.program import lower
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.text import workspace_size
 from scvi_codegen.runtime.stepper import Stepper
@@ -91,7 +91,7 @@ def test_rows_are_exchanged_within_the_band(method):
 
 
 def test_memory_grows_with_the_length_of_a_chain_not_with_its_square():
-    sizes = [workspace_size(lower(fput_chain(n), SVI(8), prefix="p")) for n in (32, 64, 128)]
+    sizes = [workspace_size(lowered(fput_chain(n), SVI(8))) for n in (32, 64, 128)]
     assert sizes[2] - sizes[1] == pytest.approx(2 * (sizes[1] - sizes[0]), rel=1e-3)
     assert sizes[2] < 10**5
 

@@ -10,11 +10,27 @@ import numpy as np
 from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.lowering.program import lower
+from scvi_codegen.lowering.solvers.choice import sweep_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.stepper import Stepper
+
+
+def lowered(system: MechanicalSystem, method: Method) -> Program:
+    """The program with Newton's iteration alone."""
+    return lower(system, method, discretise(system, method), prefix="p")
+
+
+def sweep(system: MechanicalSystem, method: Method) -> Sweep | None:
+    """The fixed-point iteration, if there is one."""
+    return sweep_of(system, discretise(system, method))
 
 
 def driven_duffing() -> LagrangianSystem:

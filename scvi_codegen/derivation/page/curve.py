@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import singledispatch
 
 import sympy
 from sympy import Function, Symbol
@@ -11,11 +12,15 @@ from scvi_codegen.derivation.notation import TableEntry
 from scvi_codegen.derivation.page.step_drawing import step_drawing
 from scvi_codegen.display.number_tables import decimal, number_table, short
 from scvi_codegen.display.page.blocks import Cell, Content, Formula, Paragraph, Section, TableBlock
-from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
-from scvi_codegen.methods.composition import Composition
-from scvi_codegen.methods.galerkin import SVI, StoermerVerlet
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    Composition,
+    Method,
+    RungeKutta,
+    SpectralCollocation,
+    StoermerVerlet,
+)
 from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
@@ -93,39 +98,62 @@ def _shown(entry: TableEntry) -> Cell:
     return entry.exact if short(entry.exact) else decimal(entry.value)
 
 
+@singledispatch
 def _curve(method: Method) -> Iterator[Content]:
-    if isinstance(method, SVI) and isinstance(method.curves, Polynomials):
+    """What is said of the curve of a method, if anything is."""
+    return iter(())
+
+
+@_curve.register
+def _(method: SVI) -> Iterator[Content]:
+    if isinstance(method.curves, Polynomials):
         yield from _nodal(method.degree)
-        yield from _action("25")
-    elif isinstance(method, SVI):
+    else:
         yield Paragraph(
             f"Curves of the space '{method.curves.name}', given by their velocities V_j at "
             f"{method.curves.dimension(method.degree)} points. The discrete Lagrangian is the quadrature of L along "
             "the curve, and stationary in what is inside:"
         )
-        yield from _action("25")
-    elif isinstance(method, SCVI):
-        yield from _shooting(method)
-    elif isinstance(method, SpectralCollocation) and method.form == "position":
+    yield from _action("25")
+
+
+@_curve.register
+def _(method: SpectralCollocation) -> Iterator[Content]:
+    if method.form == "position":
         yield from _nodal(method.degree)
         yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s; node 0 carries no equation.")
-    elif isinstance(method, RungeKutta | SpectralCollocation):
-        where = "Hamilton's equations" if method.form == "phase-space" else "(q, v)"
-        yield Paragraph(
-            f"Stages of a Runge-Kutta method on {where}, (22): positions at c_i are q_k and the velocities of the "
-            "stages, weighted by the tableau."
-        )
-    elif isinstance(method, StoermerVerlet):
-        yield Paragraph(
-            "The Lobatto IIIA-IIIB pair of two stages, at both ends of the step. For constant masses it is the "
-            "leapfrog scheme: half a kick, a drift, half a kick."
-        )
-    elif isinstance(method, Composition):
-        count = len(method.fractions)
-        yield Paragraph(
-            f"{count} leapfrog step{'s' * (count > 1)} of sizes gamma_j h one after the other: kicks by forces and "
-            "drifts with constant velocity in turn."
-        )
+    else:
+        yield _stages(method.form)
+
+
+@_curve.register
+def _(method: RungeKutta) -> Iterator[Content]:
+    yield _stages(method.form)
+
+
+def _stages(form: str) -> Paragraph:
+    where = "Hamilton's equations" if form == "phase-space" else "(q, v)"
+    return Paragraph(
+        f"Stages of a Runge-Kutta method on {where}, (22): positions at c_i are q_k and the velocities of the "
+        "stages, weighted by the tableau."
+    )
+
+
+@_curve.register
+def _(method: StoermerVerlet) -> Iterator[Content]:
+    yield Paragraph(
+        "The Lobatto IIIA-IIIB pair of two stages, at both ends of the step. For constant masses it is the "
+        "leapfrog scheme: half a kick, a drift, half a kick."
+    )
+
+
+@_curve.register
+def _(method: Composition) -> Iterator[Content]:
+    count = len(method.fractions)
+    yield Paragraph(
+        f"{count} leapfrog step{'s' * (count > 1)} of sizes gamma_j h one after the other: kicks by forces and "
+        "drifts with constant velocity in turn."
+    )
 
 
 def _nodal(degree: int) -> Iterator[Content]:
@@ -145,7 +173,8 @@ def _action(number: str) -> Iterator[Content]:
     yield Formula(h / 2 * sympy.Sum(Symbol("w_n") * L, (n, 1, g)), Symbol("L_d"), number)
 
 
-def _shooting(method: SCVI) -> Iterator[Content]:
+@_curve.register
+def _(method: SCVI) -> Iterator[Content]:
     if method.abscissae is None:
         yield from _nodal(method.degree)
         yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s, E_i = 0 (34a), v_0 at its start.")

@@ -16,8 +16,8 @@ from scvi_codegen.derivation.page.sums import end_formulas, row_formulas
 from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.rendering.outline import Function, reached
 
@@ -35,7 +35,7 @@ def functions_section(
     system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Function]
 ) -> Section:
     """From the loop over the steps down: formulas or words at the left, C at the right."""
-    stages = with_auxiliaries(system, method.stage_system(system))
+    stages = discretise(system, method)
     kernels = {kernel.name for kernel in kernels_of(program)}
     start = f"{program.prefix}_advance"
     pairs = [

@@ -13,48 +13,33 @@ from collections.abc import Sequence
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.sweeps import Splitting, Sweep
+from scvi_codegen.lowering.solvers.base import Problem, Solver
 from scvi_codegen.lowering.solvers.collocation import position_sweep, printed_sweep
 from scvi_codegen.lowering.solvers.coupled import coupled_sweep
 from scvi_codegen.lowering.solvers.hamiltonian import hamiltonian_sweep
 from scvi_codegen.lowering.solvers.separable import separable_sweep
 from scvi_codegen.lowering.solvers.shooting import shooting_sweep
-from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
-from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
-from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.collocation import RungeKutta, SpectralCollocation
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["check_solver", "sweep_of"]
+__all__ = ["FIXED_POINTS", "check_solver", "sweep_of"]
 
-
-def sweep_of(system: MechanicalSystem, method: Method) -> Sweep | None:
-    """The fixed-point iteration of a method for a system, or ``None`` where there is none.
-
-    Of a Hamiltonian its own, but for separable ones and where the method has none for it: then the one of its
-    Lagrangian, if there is one. The step is the same (35f).
-    """
-    twin = lagrangian_twin(system)
-    if system.auxiliaries and not (twin and forms_of(twin).separable):
-        tables = velocity_tables(system, method)
-        own = hamiltonian_sweep(system, tables) if tables else None
-        if own is not None:
-            return own
-    return None if twin is None else _lagrangian_sweep(twin, method)
+FIXED_POINTS: tuple[Solver, ...] = (
+    separable_sweep,
+    hamiltonian_sweep,
+    coupled_sweep,
+    position_sweep,
+    printed_sweep,
+    shooting_sweep,
+)
+"""The first that serves is taken: the quickest."""
 
 
-def _lagrangian_sweep(system: LagrangianSystem, method: Method) -> Sweep | None:
-    if isinstance(method, SCVI) and method.degree > 1:
-        return shooting_sweep(system, method) if method.variational else printed_sweep(system, method)
-    separable = forms_of(system).separable
-    if isinstance(method, RungeKutta | SpectralCollocation) and method.form == "position" and not separable:
-        return position_sweep(system, method.tableau)
-    tables = velocity_tables(system, method)
-    if tables is None:
-        return None
-    return separable_sweep(system, tables) if separable else coupled_sweep(system, tables)
+def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
+    """The fixed-point iteration of the stage equations of a system, or ``None`` where there is none."""
+    problem = Problem(system, stages.shape)
+    return next((sweep for solver in FIXED_POINTS if (sweep := solver(problem)) is not None), None)
 
 
 def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:

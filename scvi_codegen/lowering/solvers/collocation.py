@@ -13,20 +13,26 @@ from collections.abc import Iterable
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import CollocationSweep, PrintedEnds
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.base import Problem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.methods.shapes import Accelerations, PrintedCurve
 from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values
 from scvi_codegen.tables.precision import Number
+from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
 __all__ = ["position_sweep", "printed_sweep"]
 
 
-def position_sweep(system: MechanicalSystem, tableau: Tableau) -> CollocationSweep | None:
+def position_sweep(problem: Problem) -> CollocationSweep | None:
     """The fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
+    system, shape = problem.lagrangian, problem.shape
+    if system is None or not isinstance(shape, Accelerations):
+        return None
+    tableau = shape.tableau
     lanes = lane_count(len(tableau.b))
     if lanes > MOST_LANES:
         return None
@@ -40,24 +46,27 @@ def position_sweep(system: MechanicalSystem, tableau: Tableau) -> CollocationSwe
     )
 
 
-def printed_sweep(system: MechanicalSystem, method: SCVI) -> CollocationSweep | None:
+def printed_sweep(problem: Problem) -> CollocationSweep | None:
     """The fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
-    lanes = lane_count(max(method.degree, len(method.rule)))
+    system, shape = problem.lagrangian, problem.shape
+    if system is None or not isinstance(shape, PrintedCurve):
+        return None
+    lanes = lane_count(max(len(shape.tableau.b), len(shape.rule)))
     if lanes > MOST_LANES:
         return None
     return CollocationSweep(
         lanes=lanes,
-        nodes=node_tables(method.tableau, lanes),
-        points=point_tables(system, method.tableau, method.rule, lanes),
+        nodes=node_tables(shape.tableau, lanes),
+        points=point_tables(system, shape.tableau, shape.rule, lanes),
         kernel=_node_kernel(system),
         mass_entries=tuple(forms_of(system).lower_mass),
-        ends=_printed_ends(method, lanes),
+        ends=_printed_ends(shape.tableau, shape.rule, lanes),
     )
 
 
-def _printed_ends(method: SCVI, lanes: int) -> PrintedEnds:
+def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds:
     """Weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
-    rule, nodes = method.rule, (0, *method.tableau.c)
+    nodes = (0, *tableau.c)
     values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_slopes))
 
     def weighted(numbers: Iterable[Number]) -> tuple[float, ...]:

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import CoupledSweep
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.base import Problem
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
-from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
+from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.basis import transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
@@ -25,8 +26,13 @@ __all__ = ["coupled_sweep", "over", "weighted_tables"]
 FRACTION_BITS = 51
 
 
-def coupled_sweep(system: MechanicalSystem, tables: VelocityTables) -> CoupledSweep | None:
-    """The fixed-point iteration of a system; ``None`` with too many points."""
+def coupled_sweep(problem: Problem) -> CoupledSweep | None:
+    """The fixed-point iteration of a Lagrangian; ``None`` with too many points."""
+    system, tables = problem.lagrangian, velocity_tables(problem.shape)
+    return _sweep(system, tables) if system and tables else None
+
+
+def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | None:
     points, blocks = len(tables.abscissae), len(tables.blocks)
     lanes = lane_count(max(points, blocks))
     if lanes > MOST_LANES:

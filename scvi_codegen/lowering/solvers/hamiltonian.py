@@ -10,19 +10,23 @@ from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import HamiltonianSweep
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.base import Problem
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
-from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
+from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["hamiltonian_sweep"]
 
 
-def hamiltonian_sweep(system: MechanicalSystem, tables: VelocityTables) -> HamiltonianSweep | None:
+def hamiltonian_sweep(problem: Problem) -> HamiltonianSweep | None:
     """The fixed-point iteration of a Hamiltonian; ``None`` with too many points, or other points than velocities."""
+    system = problem.system
+    tables = velocity_tables(problem.shape) if system.auxiliaries else None
+    if tables is None or tables.velocity:
+        return None
     lanes = lane_count(len(tables.abscissae))
-    if lanes > MOST_LANES or tables.velocity:
+    if lanes > MOST_LANES:
         return None
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
     forms = forms_of(system)

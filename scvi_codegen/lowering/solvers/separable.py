@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import SeparableSweep
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.base import Problem
 from scvi_codegen.lowering.solvers.padding import (
     MOST_LANES,
     guess_tables,
@@ -21,17 +22,32 @@ from scvi_codegen.lowering.solvers.padding import (
     pad_split_matrix,
     pad_vector,
 )
-from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables
+from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, tableau_tables, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.shapes import Accelerations
 from scvi_codegen.tables.basis import matrix_product
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["separable_sweep"]
 
 
-def separable_sweep(system: MechanicalSystem, tables: VelocityTables) -> SeparableSweep | None:
-    """The fixed-point iteration of a separable system; ``None`` with too many points."""
+def separable_sweep(problem: Problem) -> SeparableSweep | None:
+    """The fixed-point iteration of a separable system; ``None`` of others, and with too many points.
+
+    Position form and phase-space form are the same there.
+    """
+    system, shape = problem.lagrangian, problem.shape
+    if system is None or not forms_of(system).separable:
+        return None
+    if isinstance(shape, Accelerations):
+        tables: VelocityTables | None = tableau_tables(shape.tableau.c, shape.tableau.A, shape.tableau.b)
+    else:
+        tables = velocity_tables(shape)
+    return _sweep(system, tables) if tables else None
+
+
+def _sweep(system: LagrangianSystem, tables: VelocityTables) -> SeparableSweep | None:
     lanes = lane_count(len(tables.abscissae))
     if lanes > MOST_LANES:
         return None

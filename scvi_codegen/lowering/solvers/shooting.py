@@ -13,11 +13,12 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import ShootingSweep
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.base import Problem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.shooting import SCVI
+from scvi_codegen.methods.shapes import ShotCurve
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
 
 __all__ = ["shooting_sweep"]
@@ -26,9 +27,12 @@ LARGEST_DIMENSION = 8
 """Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
 
 
-def shooting_sweep(system: MechanicalSystem, method: SCVI) -> ShootingSweep | None:
+def shooting_sweep(problem: Problem) -> ShootingSweep | None:
     """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
-    tableau, rule = method.tableau, method.rule
+    system, shape = problem.lagrangian, problem.shape
+    if system is None or not isinstance(shape, ShotCurve):
+        return None
+    tableau, rule = shape.tableau, shape.rule
     lanes = lane_count(max(len(tableau.b), len(rule)))
     if lanes > MOST_LANES or system.dimension > LARGEST_DIMENSION:
         return None

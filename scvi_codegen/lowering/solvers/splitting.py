@@ -8,8 +8,7 @@ from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.composition import Composition, kicks_and_drifts
-from scvi_codegen.methods.galerkin import StoermerVerlet
+from scvi_codegen.methods.composition import kicks_and_drifts
 from scvi_codegen.methods.method import Method
 from scvi_codegen.tables.precision import mp
 
@@ -18,12 +17,9 @@ __all__ = ["splitting_of"]
 
 def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """The sequence of kicks and drifts, or ``None`` where the method is implicit."""
-    if isinstance(method, StoermerVerlet):
-        method = Composition(2)
-    twin = lagrangian_twin(system) if isinstance(method, Composition) else None
+    twin = lagrangian_twin(system) if method.fractions else None
     if twin is None or not forms_of(twin).separable:
         return None
-    assert isinstance(method, Composition)  # or there would be no twin
     kicks, drifts = kicks_and_drifts(method.fractions)
     forms = forms_of(twin)
     return Splitting(

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.collocation import phase_space_system
-from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_system import Shape
 from scvi_codegen.tables.basis import matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["VelocityTables", "velocity_tables"]
+__all__ = ["VelocityTables", "tableau_tables", "velocity_tables"]
 
 CONSISTENT = 1e-12
 
@@ -47,19 +44,20 @@ class VelocityTables:
     variational: bool
 
 
-def velocity_tables(system: MechanicalSystem, method: Method) -> VelocityTables | None:
-    """Those of a method for a system, or ``None`` where its equations have another shape."""
-    stages = _velocity_stages(system, method)
-    if stages is None:
+def velocity_tables(shape: Shape | None) -> VelocityTables | None:
+    """Those of stage equations of that shape, or ``None`` of others, and where the velocities do not determine them."""
+    if not isinstance(shape, Velocities):
         return None
-    family = stages.families[0]
-    if family.scalar is not None:
-        return _variational_tables(family, stages)
-    A = tuple(line[1:] for line in family.gathers[0].table.entries)
-    b = stages.end_position.entries[0][1:]
+    if shape.variational:
+        return _variational_tables(shape)
+    return tableau_tables(shape.abscissae, shape.position, shape.weights)
+
+
+def tableau_tables(abscissae: Vector, A: Matrix, b: Vector) -> VelocityTables:
+    """Those of a Runge-Kutta method in phase space."""
     return VelocityTables(
-        abscissae=family.abscissae,
-        blocks=family.abscissae,
+        abscissae=abscissae,
+        blocks=abscissae,
         position=A,
         momentum=A,
         end_position=b,
@@ -70,43 +68,29 @@ def velocity_tables(system: MechanicalSystem, method: Method) -> VelocityTables 
     )
 
 
-def _velocity_stages(system: MechanicalSystem, method: Method) -> StageSystem | None:
-    """Stage equations with one family whose kernel is (L_q, L_v) and whose unknowns are velocities."""
-    if getattr(method, "form", None) == "position":
-        return phase_space_system(system, method.tableau) if forms_of(system).separable else None  # type: ignore[attr-defined]
-    stages = method.stage_system(system)
-    family = stages.families[0]
-    plain = len(stages.families) == 1 and len(family.gathers) == len(family.scatters) == 2
-    return stages if plain else None
-
-
-def _variational_tables(family: PointFamily, stages: StageSystem) -> VelocityTables | None:
+def _variational_tables(shape: Velocities) -> VelocityTables | None:
     """The adjoint pair; where the velocities are not those at the points, the equations projected on the curve."""
-    beta = stages.end_position.entries[0][1:]
+    beta, weights = shape.end, shape.weights
     if any(x == 0 for x in beta):
         return None
-    position = tuple(line[1:] for line in family.gathers[0].table.entries)
-    velocity = tuple(line[1:] for line in family.gathers[1].table.entries)
-    rest = tuple(tuple(b - x for x in column) for b, column in zip(beta, transpose(position), strict=True))
+    rest = tuple(tuple(b - x for x in column) for b, column in zip(beta, transpose(shape.position), strict=True))
     projection: Matrix = ()
-    if _is_identity(velocity):
+    if _is_identity(shape.velocity):
         adjoint: Matrix = tuple(tuple(x / b for x in line) for b, line in zip(beta, rest, strict=True))
-        blocks = family.abscissae
     else:
-        inverse = _inverse_stiffness(velocity, family.weights)
+        inverse = _inverse_stiffness(shape.velocity, weights)
         if inverse is None or max(abs(mp.fdot(line, beta) - 1) for line in inverse) > CONSISTENT:
             return None
         adjoint = matrix_product(inverse, rest)
-        projection = _columns_scaled(matrix_product(inverse, transpose(velocity)), family.weights)
-        blocks = stages.block_abscissae
+        projection = _columns_scaled(matrix_product(inverse, transpose(shape.velocity)), weights)
     return VelocityTables(
-        abscissae=family.abscissae,
-        blocks=blocks,
-        position=position,
-        momentum=_columns_scaled(adjoint, family.weights),
+        abscissae=shape.abscissae,
+        blocks=shape.blocks if projection else shape.abscissae,
+        position=shape.position,
+        momentum=_columns_scaled(adjoint, weights),
         end_position=beta,
-        end_momentum=family.weights,
-        velocity=velocity if projection else (),
+        end_momentum=weights,
+        velocity=shape.velocity if projection else (),
         projection=projection,
         variational=True,
     )

@@ -13,7 +13,7 @@ Symmetries hold for all values of the parameters; one that needs special values 
 as numbers. With more than ``MOST_COORDINATES`` coordinates only cyclic ones, and translations, rotations and boosts of
 all coordinates together, are tried. A direction that is known otherwise is checked by :func:`check_symmetry`.
 
-Which are kept exactly, to round-off, by which method: :func:`~scvi_codegen.methods.exactness.is_exact`.
+Which are kept exactly, to round-off, by which method: :func:`~scvi_codegen.methods.exactness.Exactness.keeps`.
 """
 
 from __future__ import annotations

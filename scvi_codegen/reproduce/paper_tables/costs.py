@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods.collocation import Gauss, SpectralCollocation
+from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import duffing, planar_pendulum

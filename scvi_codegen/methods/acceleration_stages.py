@@ -1,0 +1,152 @@
+"""Equations with unknowns v0 and z_i = h (acceleration at c_i): Euler-Lagrange equations at the stages of a tableau.
+
+V_i = v0 + sum_j a_ij z_j,       q_i = q0 + h sum_j a_ij V_j,       E(q_i, V_i, z_i / h, t_i) = 0.    (18)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from scvi_codegen.mechanics.forms import accelerations, forms_of
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.shapes import Accelerations
+from scvi_codegen.methods.stage_system import (
+    Block,
+    Gather,
+    PointFamily,
+    Row,
+    Scatter,
+    StageSystem,
+    Table,
+)
+from scvi_codegen.tables.basis import (
+    matrix_product,
+    next_step,
+)
+from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
+from scvi_codegen.tables.tableau import Tableau
+
+__all__ = [
+    "VELOCITY_BLOCK",
+    "acceleration_extrapolation",
+    "acceleration_gathers",
+    "acceleration_unknowns",
+    "position_system",
+    "residual_family",
+    "single_point",
+]
+
+VELOCITY_BLOCK = Block(name="v_0", power=1, straight=(mp.zero, mp.one))
+
+
+def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
+    """(22) on (q, v): unknowns v0 and z_i = h a_i; v0 from p0 by the Legendre transform, p1 from v1."""
+    b, size = tableau.b, len(tableau.b)
+    momenta = forms_of(system).momentum
+    ones, none = Table.constant(1, 1, 1), Table.constant(1, size)
+    b_row = Table(entries=(b,), names=(tuple(f"b_{i}" for i in range(1, size + 1)),))
+    end_row = Table.joined(ones, ones, Table.named("bA", matrix_product((b,), tableau.A)))
+    start = single_point(system, "start", mp.zero, Table.joined(ones, Table.constant(1, 1), none))
+    end = single_point(system, "end", mp.one, end_row)
+    end_velocity = Gather(arguments=system.velocities, table=Table.joined(Table.constant(1, 1), ones, b_row), power=-1)
+    end = replace(end, gathers=(end.gathers[0], end_velocity))
+    minus = Table.constant(1, 1, -1)
+    start_table = Table.joined(minus, none, minus)
+    end_table = Table.joined(Table.constant(1, 1), none, ones)
+    inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
+    collocation = residual_family(
+        system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
+    )
+    return StageSystem(
+        blocks=acceleration_unknowns(size),
+        rows=(
+            Row(number="p0", kind="Legendre", momentum=mp.one),
+            *(Row(number="18", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        families=(
+            replace(start, scatters=(Scatter(results=momenta, table=start_table, power=0),)),
+            collocation,
+            replace(end, scatters=(Scatter(results=momenta, table=end_table, power=0),)),
+        ),
+        end_position=end_row,
+        end_momentum=mp.one,
+        end_numbers=("22", "p1"),
+        extrapolation=acceleration_extrapolation(tableau),
+        shape=Accelerations(tableau),
+    )
+
+
+def residual_family(
+    system: MechanicalSystem,
+    abscissae: Vector,
+    gathers: tuple[Gather, ...],
+    residual: Scatter,
+    *others: Scatter,
+) -> PointFamily:
+    """Collocation nodes of weight 1 with the Euler-Lagrange residual as kernel, scattered as ``residual`` says."""
+    return PointFamily(
+        name="node",
+        abscissae=abscissae,
+        weights=(mp.one,) * len(abscissae),
+        weight_names=("",) * len(abscissae),
+        gathers=gathers,
+        scatters=(replace(residual, results=forms_of(system).euler_lagrange), *others),
+    )
+
+
+def acceleration_unknowns(size: int) -> tuple[Block, ...]:
+    """The blocks v0, z_1 .. z_s of a curve given by its initial velocity and scaled accelerations."""
+    return (
+        VELOCITY_BLOCK,
+        *(Block(name=f"z_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+    )
+
+
+def acceleration_gathers(
+    system: MechanicalSystem, A: Matrix, *, other_blocks: int = 0
+) -> tuple[Gather, Gather, Gather]:
+    """Position, velocity and acceleration at the stages from (q0, v0, z_1 .. z_s).
+
+    V_i = v0 + sum_j a_ij z_j and q_i = q0 + h sum_j a_ij V_j; the coefficient of v0 is the row sum of A, which is c_i
+    for collocation but not for every tableau.
+    """
+    size = len(A)
+    ones, zeros, padding = Table.constant(size, 1, 1), Table.constant(size, 1), Table.constant(size, other_blocks)
+    sums = Table.named("c", [(mp.fsum(line),) for line in A])
+    drift = Table(entries=sums.entries, names=tuple((name.rpartition("_")[0],) for (name,) in sums.names))
+    double = Table.named("aa", matrix_product(A, A))
+    return (
+        Gather(arguments=system.coordinates, table=Table.joined(ones, drift, double, padding), power=0),
+        Gather(arguments=system.velocities, table=Table.joined(zeros, ones, Table.named("a", A), padding), power=-1),
+        Gather(
+            arguments=accelerations(system),
+            table=Table.joined(zeros, zeros, Table.identity(size), padding),
+            power=-2,
+        ),
+    )
+
+
+def acceleration_extrapolation(tableau: Tableau) -> Matrix:
+    """The guess for the next step: v0 <- v1 = v0 + sum b_i z_i, accelerations extrapolated."""
+    inner = next_step(tableau.c)
+    size = len(tableau.b)
+    return ((mp.one, *tableau.b), *((mp.zero, *inner[i]) for i in range(size)))
+
+
+def single_point(
+    system: MechanicalSystem, name: str, abscissa: Number, position: Table, *, velocity_block: int = 0
+) -> PointFamily:
+    """One point whose velocity is the block ``velocity_block`` alone; scatters are added by the caller."""
+    columns = len(position.entries[0])
+    velocity = Table.named("", [[int(b == velocity_block + 1) for b in range(columns)]])
+    return PointFamily(
+        name=name,
+        abscissae=(abscissa,),
+        weights=(mp.one,),
+        weight_names=("",),
+        gathers=(
+            Gather(arguments=system.coordinates, table=position, power=0),
+            Gather(arguments=system.velocities, table=velocity, power=-1),
+        ),
+        scatters=(),
+    )

@@ -1,0 +1,50 @@
+"""What several methods are given, resolved and checked: nodes, quadrature, space of curves."""
+
+from __future__ import annotations
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.tables.nodes import Nodes, nodes_by_name
+from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre, quadrature_by_name
+from scvi_codegen.tables.spaces import CurveSpace, Polynomials, space_by_name
+
+__all__ = ["resolve_nodes", "resolve_quadrature", "resolve_space"]
+
+
+def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quadrature:
+    """A quadrature given as an object, a name or not at all (then ``degree`` Gauss points)."""
+    if quadrature is None:
+        return gauss_legendre(degree)
+    if isinstance(quadrature, str):
+        return quadrature_by_name(quadrature)
+    if not isinstance(quadrature, Quadrature):
+        raise MethodError(f"a quadrature is wanted, or a name such as 'gauss-legendre:{degree}', not {quadrature!r}")
+    return quadrature
+
+
+def resolve_space(space: CurveSpace | str | None) -> CurveSpace:
+    """A space given as an object, a name or not at all (then polynomials)."""
+    if space is None:
+        return Polynomials()
+    if isinstance(space, str):
+        return space_by_name(space)
+    if not isinstance(space, CurveSpace):
+        raise MethodError(f"a space of curves is wanted, or a name such as 'splines:2', not {space!r}")
+    return space
+
+
+def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
+    """Nodes given as an object, a name or not at all (then Chebyshev-Lobatto), checked to contain both ends."""
+    if nodes is None:
+        nodes = "chebyshev-lobatto"
+    if isinstance(nodes, str):
+        nodes = nodes_by_name(nodes, degree)
+    if not isinstance(nodes, Nodes):
+        raise MethodError(f"nodes are wanted, or a name such as 'chebyshev-lobatto', not {nodes!r}")
+    if nodes.degree != degree:
+        raise MethodError(f"nodes of degree {nodes.degree} do not fit a curve of degree {degree}")
+    if not nodes.contains_ends:
+        raise MethodError(
+            f"the nodes '{nodes.name}' lack an end point of the step, but Q^0 = q0 and Q^s = q1 must be node values; "
+            "use chebyshev-lobatto, legendre-lobatto or equispaced"
+        )
+    return nodes

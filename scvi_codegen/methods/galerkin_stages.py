@@ -1,0 +1,145 @@
+"""The equations of Galerkin methods: stationary quadratures of L along curves, (25)-(27).
+
+Compiled, a curve is given by the values V_b of its velocity at s points: Q = q0 + h sum_b a_nb V_b. In the paper's
+notation it is the polynomial through the positions Q^v at the nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+from scvi_codegen.mechanics.forms import curve_rates, forms_of
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import unit_sum
+from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_system import (
+    Block,
+    Gather,
+    Row,
+    ScalarFamily,
+    StageSystem,
+    Table,
+    dyadic,
+    stationary_increments,
+)
+from scvi_codegen.tables.basis import (
+    cardinal_slopes,
+    cardinal_values,
+)
+from scvi_codegen.tables.nodes import Nodes
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature
+
+__all__ = ["galerkin_system", "nodal_quadrature_family", "position_block"]
+
+
+def galerkin_system(
+    system: MechanicalSystem,
+    *,
+    abscissae: Vector,
+    weights: Vector,
+    position: Matrix,
+    velocity: Matrix,
+    end_position: Vector,
+    extrapolation: Matrix,
+    blocks: Vector = (),
+    derivative_weights: Matrix = (),
+    derivatives: Sequence[Matrix] = (),
+) -> StageSystem:
+    """Stationarity of h sum_n w_n L(q0 + h sum_b a_nb V_b, sum_b l_nb V_b, t_n) at fixed q1 = q0 + h sum_b beta_b V_b.
+
+    Args:
+        system: the Lagrangian.
+        abscissae: (g,) points in [0, 1].
+        weights: (g,) with sum 1.
+        position: (g, s) matrix a.
+        velocity: (g, s) matrix l.
+        end_position: (s,) vector beta.
+        extrapolation: (s, s), the guess for the next step.
+        blocks: (s,) where the velocities are; left out, the points.
+        derivative_weights: rows of (g,) weights of h^k d^k L/dt^k, k = 1, 2, ..
+        derivatives: as many (g, s) matrices of the k-th derivatives of the l_nb.
+    """
+    points, size = len(abscissae), len(end_position)
+    beta = unit_sum(end_position)
+    place, weights = dyadic(position), unit_sum(weights)
+    gathers = _curve_gathers(system, place, (velocity, *derivatives))
+    scalars = (system.lagrangian, *forms_of(system).rates(len(derivatives)))
+    families = [
+        ScalarFamily(
+            name=f"derivative_{k}" if k else "quadrature",
+            abscissae=abscissae,
+            weights=own,
+            weight_names=tuple(f"{'d' * k}w_{n}" for n in range(1, points + 1)),
+            gathers=gathers[: k + 2],
+            scalar=scalar,
+            power=k,
+        )
+        for k, (own, scalar) in enumerate(zip((weights, *derivative_weights), scalars, strict=True))
+    ]
+    return stationary_increments(
+        families=families,
+        blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
+        end_position=beta,
+        rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=beta[b - 1]) for b in range(1, size + 1)),
+        extrapolation=extrapolation,
+        shape=None
+        if derivatives
+        else Velocities(
+            abscissae=abscissae,
+            blocks=blocks or abscissae,
+            position=place,
+            velocity=velocity,
+            end=beta,
+            weights=weights,
+            variational=True,
+        ),
+    )
+
+
+def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Sequence[Matrix]) -> tuple[Gather, ...]:
+    """Q, v and as many further time derivatives of the curve as there are tables."""
+    points = len(position)
+    rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
+    place = Table.joined(Table.constant(points, 1, 1), Table.named("a", position))
+    return (
+        Gather(arguments=system.coordinates, table=place, power=0),
+        *(
+            Gather(
+                arguments=arguments,
+                table=Table.joined(Table.constant(points, 1), Table.named(f"{'d' * k}l", table)),
+                power=-1 - k,
+            )
+            for k, (arguments, table) in enumerate(zip(rates, velocities, strict=True))
+        ),
+    )
+
+
+def nodal_quadrature_family(
+    system: MechanicalSystem, nodes: Nodes, rule: Quadrature, *, other_blocks: int = 0
+) -> ScalarFamily:
+    """The quadrature of L along the interpolant through Q^0 .. Q^s, in the paper's notation.
+
+    ``other_blocks`` unknown blocks behind Q^s (velocities, multipliers) do not move the curve.
+    """
+    padding = Table.constant(len(rule), other_blocks)
+    values = Table.named("l", cardinal_values(nodes.points, rule.points), column=0)
+    slopes = Table.named("dl", cardinal_slopes(nodes.points, rule.points), column=0)
+    return ScalarFamily(
+        name="quadrature",
+        abscissae=rule.abscissae,
+        weights=rule.weights,
+        weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
+        gathers=(
+            Gather(arguments=system.coordinates, table=Table.joined(values, padding), power=0),
+            Gather(arguments=system.velocities, table=Table.joined(slopes, padding), power=-1, scale=Fraction(2)),
+        ),
+        scalar=system.lagrangian,
+        scale=Fraction(1, 2),
+    )
+
+
+def position_block(v: int, nodes: Nodes) -> Block:
+    """The unknown Q^v, first guessed on the straight line."""
+    return Block(name=f"Q_{v}", power=0, straight=(mp.one, nodes.abscissae[v]))

@@ -1,0 +1,276 @@
+"""Runge-Kutta methods, (22)-(23), in phase space (q, p) and in position-velocity form (q, v).
+
+Spectral collocation at the nodes x_1 .. x_s is the collocation Runge-Kutta method (22)-(23) on the abscissae
+c_i = (x_i + 1)/2, so the compiled form of all of them is a tableau (A, b, c). On Hamilton's equations, with stage
+velocities V_i as unknowns,
+
+    q_i = q0 + h sum_j a_ij V_j,     L_v(q_i, V_i) = p0 + h sum_j a_ij L_q(q_j, V_j),                   (22), (21)
+
+and on (q, v), with v0 and z_i = h (acceleration at c_i) as unknowns,
+
+    V_i = v0 + sum_j a_ij z_j,       q_i = q0 + h sum_j a_ij V_j,       E(q_i, V_i, z_i / h, t_i) = 0,    (18)
+
+E the Euler-Lagrange residual. When the mass is not constant these are two different maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from scvi_codegen.display.number_tables import Part
+from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.acceleration_stages import position_system
+from scvi_codegen.methods.exactness import Exactness
+from scvi_codegen.methods.galerkin_stages import galerkin_system
+from scvi_codegen.methods.method import Method, Specification, lagrangian_scatters
+from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_system import (
+    Block,
+    Gather,
+    PointFamily,
+    Row,
+    Scatter,
+    StageSystem,
+    Table,
+)
+from scvi_codegen.tables import tableau as tableaux
+from scvi_codegen.tables.basis import (
+    identity_matrix,
+    next_step,
+)
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.tableau import Tableau
+
+__all__ = [
+    "TABLEAU_METHODS",
+    "ChebyshevGauss",
+    "ChebyshevLobatto",
+    "CollocationRK",
+    "ExplicitEuler",
+    "Gauss",
+    "LobattoIIIA",
+    "RadauIA",
+    "RadauIIA",
+    "RungeKutta",
+    "check_form",
+    "phase_space_system",
+]
+
+FORMS = ("phase-space", "position")
+
+
+@dataclass(frozen=True, slots=True)
+class RungeKutta(Method):
+    """A Runge-Kutta method on Hamilton's equations (``form="phase-space"``) or on (q, v) (``form="position"``).
+
+    Args:
+        tableau: (A, b, c); its order, symmetry and symplecticity are computed from the coefficients (paper, Table 4).
+        form: ``"phase-space"`` or ``"position"``; symplectic tableaux are symplectic in phase space only (and for
+            constant mass).
+    """
+
+    tableau: Tableau
+    form: str = "phase-space"
+
+    def __post_init__(self) -> None:
+        check_form(self.form)
+
+    @property
+    def name(self) -> str:
+        """``<tableau>`` or ``<tableau>-position``."""
+        base = self.tableau.name.replace(":", "-")
+        return base if self.form == "phase-space" else f"{base}-position"
+
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        stages = len(self.tableau.b)
+        return f"Runge-Kutta {self.tableau.name}, {stages} stage{'s' * (stages > 1)}, {self.form} form"
+
+    @property
+    def order(self) -> int | None:
+        """From the simplifying conditions of the tableau."""
+        return self.tableau.order
+
+    @property
+    def symmetric(self) -> bool:
+        """From the tableau."""
+        return self.tableau.is_symmetric
+
+    @property
+    def symplectic(self) -> bool:
+        """From the tableau; never promised in position form, where p is not an unknown."""
+        return self.form == "phase-space" and self.tableau.is_symplectic
+
+    @property
+    def needs_regular(self) -> bool:
+        """In position form."""
+        return self.form == "position"
+
+    @property
+    def exactness(self) -> Exactness:
+        """In phase space linear maps, quadratic ones where it is symplectic; Gauss methods are variational."""
+        if self.form == "position":
+            return Exactness()
+        stages = len(self.tableau.b)
+        gauss = self.symplectic and self.tableau.order == 2 * stages
+        curve, quadrature = (stages, 2 * stages) if gauss else (-1, -1)
+        return Exactness(polynomials=2 if self.symplectic else 1, curve=curve, quadrature=quadrature)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The tableau."""
+        return (self.tableau,)
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        family, _, stages = self.tableau.name.partition(":")
+        if family in TABLEAU_METHODS:
+            return {"method": family, "stages": int(stages), "form": self.form}
+        if family == "explicit-euler":
+            return {"method": family, "form": self.form}
+        return {"method": "collocation", "abscissae": [float(c) for c in self.tableau.c], "form": self.form}
+
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
+        """Symplectic tableaux by their generating function (exactly symplectic when rounded), others as they are."""
+        tableau = self.tableau
+        if self.form == "position":
+            return position_system(system, tableau)
+        if not self.symplectic:
+            return phase_space_system(system, tableau)
+        size = len(tableau.b)
+        return galerkin_system(
+            system,
+            abscissae=tableau.c,
+            weights=tableau.b,
+            position=tableau.A,
+            velocity=identity_matrix(size),
+            end_position=tableau.b,
+            extrapolation=next_step(tableau.c),
+        )
+
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
+        """The stage equations (22)-(23)."""
+        return (position_system if self.form == "position" else phase_space_system)(system, self.tableau)
+
+
+def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
+    """(22) on Hamilton's equations, momenta eliminated by p_i = L_v(q_i, V_i)."""
+    size = len(tableau.b)
+    family = PointFamily(
+        name="stage",
+        abscissae=tableau.c,
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(
+            Gather(
+                arguments=system.coordinates,
+                table=Table.joined(Table.constant(size, 1, 1), Table.named("a", tableau.A)),
+                power=0,
+            ),
+            Gather(
+                arguments=system.velocities,
+                table=Table.joined(Table.constant(size, 1), Table.identity(size)),
+                power=-1,
+            ),
+        ),
+        scatters=(),
+    )
+    b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((f"b_{n + 1}",) for n in range(size)))
+    return StageSystem(
+        blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
+        rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),
+        families=(
+            lagrangian_scatters(
+                family,
+                system,
+                Scatter(results=(), table=Table.joined(_transposed(tableau), b_column), power=1),
+                Scatter(results=(), table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)), power=0),
+            ),
+        ),
+        end_position=Table.joined(Table.constant(1, 1, 1), _transposed_row(b_column)),
+        end_momentum=mp.one,
+        end_numbers=("22", "22"),
+        extrapolation=next_step(tableau.c),
+        shape=Velocities(
+            abscissae=tableau.c,
+            blocks=tableau.c,
+            position=tableau.A,
+            velocity=identity_matrix(size),
+            end=tableau.b,
+            weights=tableau.b,
+            variational=False,
+        ),
+    )
+
+
+def _transposed(tableau: Tableau) -> Table:
+    size = len(tableau.b)
+    table = Table.named("a", tableau.A)
+    return Table(
+        entries=tuple(tuple(table.entries[i][j] for i in range(size)) for j in range(size)),
+        names=tuple(tuple(table.names[i][j] for i in range(size)) for j in range(size)),
+    )
+
+
+def _transposed_row(column: Table) -> Table:
+    return Table(entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),))
+
+
+def check_form(form: str) -> None:
+    """Raise :class:`MethodError` for a form that does not exist."""
+    if form not in FORMS:
+        raise MethodError(f"form must be 'phase-space' or 'position', not {form!r}")
+
+
+def CollocationRK(abscissae: Sequence[float], *, form: str = "phase-space") -> RungeKutta:
+    """Collocation Runge-Kutta method (22)-(23) on any distinct abscissae c_1 < .. < c_s, usually in [0, 1]."""
+    return RungeKutta(tableaux.collocation_tableau(tuple(abscissae)), form)
+
+
+def Gauss(stages: int, *, form: str = "phase-space") -> RungeKutta:
+    """Gauss collocation: order 2 stages, symplectic, symmetric, A-stable (paper, Tables 1-3)."""
+    return RungeKutta(tableaux.gauss(stages), form)
+
+
+def RadauIIA(stages: int, *, form: str = "phase-space") -> RungeKutta:
+    """Radau IIA collocation: order 2 stages - 1, A-stable, stiffly accurate."""
+    return RungeKutta(tableaux.radau_iia(stages), form)
+
+
+def RadauIA(stages: int, *, form: str = "phase-space") -> RungeKutta:
+    """Radau IA: order 2 stages - 1, A-stable; not a collocation method."""
+    return RungeKutta(tableaux.radau_ia(stages), form)
+
+
+def LobattoIIIA(stages: int, *, form: str = "phase-space") -> RungeKutta:
+    """Lobatto IIIA collocation: order 2 stages - 2, symmetric, A-stable."""
+    return RungeKutta(tableaux.lobatto_iiia(stages), form)
+
+
+def ChebyshevGauss(stages: int, *, form: str = "phase-space") -> RungeKutta:
+    """Collocation at the Chebyshev points of the first kind: order s (even s) or s + 1 (odd s), symmetric."""
+    return RungeKutta(tableaux.chebyshev_gauss(stages), form)
+
+
+def ChebyshevLobatto(stages: int, *, form: str = "phase-space") -> RungeKutta:
+    """Collocation at the Chebyshev-Lobatto points, both ends stages: order s (even s) or s + 1 (odd s), symmetric."""
+    return RungeKutta(tableaux.chebyshev_lobatto(stages), form)
+
+
+def ExplicitEuler(*, form: str = "phase-space") -> RungeKutta:
+    """Explicit Euler: order 1, neither symplectic nor symmetric; a baseline."""
+    return RungeKutta(tableaux.explicit_euler(), form)
+
+
+TABLEAU_METHODS: dict[str, Callable[..., RungeKutta]] = {
+    "gauss": Gauss,
+    "radau-iia": RadauIIA,
+    "radau-ia": RadauIA,
+    "lobatto-iiia": LobattoIIIA,
+    "chebyshev-gauss": ChebyshevGauss,
+    "chebyshev-lobatto": ChebyshevLobatto,
+}
+"""Runge-Kutta families by the name of their tableau; each takes ``stages`` and ``form``."""

@@ -1,0 +1,237 @@
+"""The equations of shooting-based methods, (33)-(34), compiled and as printed; differentiated in full, and not."""
+
+from __future__ import annotations
+
+from scvi_codegen.mechanics.forms import forms_of, multipliers
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.acceleration_stages import (
+    acceleration_extrapolation,
+    acceleration_gathers,
+    acceleration_unknowns,
+    residual_family,
+)
+from scvi_codegen.methods.collocation import nodal_blocks, nodal_gathers
+from scvi_codegen.methods.galerkin_stages import nodal_quadrature_family
+from scvi_codegen.methods.method import lagrangian_scatters, unit_sum
+from scvi_codegen.methods.shapes import PrintedCurve, ShotCurve
+from scvi_codegen.methods.stage_system import (
+    Block,
+    Gather,
+    PointFamily,
+    Row,
+    ScalarFamily,
+    Scatter,
+    StageSystem,
+    Table,
+    dyadic,
+    stationary_increments,
+    stationary_nodal,
+)
+from scvi_codegen.tables.basis import (
+    cardinal_integrals,
+    cardinal_slopes,
+    cardinal_values,
+    matrix_product,
+)
+from scvi_codegen.tables.nodes import Nodes
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import Tableau
+
+__all__ = ["printed_increments", "printed_nodal", "shooting_increments", "shooting_nodal"]
+
+
+def shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, _nodes: Nodes) -> StageSystem:
+    """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i)."""
+    size = len(tableau.b)
+    position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
+    blocks = (
+        *acceleration_unknowns(size),
+        *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+    )
+    action = ScalarFamily(
+        name="quadrature",
+        abscissae=rule.abscissae,
+        weights=unit_sum(rule.unit_weights),
+        weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
+        gathers=_curve_gathers(system, dyadic(position_rows), velocity_rows, other_blocks=size),
+        scalar=system.lagrangian,
+    )
+    beta = dyadic([end_row])[0]
+    extrapolated = acceleration_extrapolation(tableau)
+    return stationary_increments(
+        families=(action, _multiplier_family(system, tableau)),
+        blocks=blocks,
+        end_position=(*beta, *(mp.zero,) * size),
+        rows=(
+            *(Row(number=f"z_{i}", kind="IDEL", momentum=beta[i]) for i in range(size + 1)),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        extrapolation=(
+            *((*line, *(mp.zero,) * size) for line in extrapolated),
+            *((*(mp.zero,) * (size + 1), *(mp.mpf(int(i == j)) for j in range(size))) for i in range(size)),
+        ),
+        shape=ShotCurve(tableau, rule),
+    )
+
+
+def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFamily:
+    """The collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
+    size = len(tableau.b)
+    position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
+    rounded = Gather(
+        arguments=position.arguments,
+        table=Table(entries=dyadic(position.table.entries), names=position.table.names),
+        power=0,
+    )
+    own = Gather(
+        arguments=multipliers(system),
+        table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
+        power=-1,
+    )
+    return ScalarFamily(
+        name="node",
+        abscissae=tableau.c,
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(rounded, velocity, acceleration, own),
+        scalar=forms_of(system).multiplied_residual,
+        power=1,
+        in_action=False,
+    )
+
+
+def _curve(tableau: Tableau, at: Vector) -> tuple[Matrix, Matrix, Vector]:
+    """The polynomial through V_i = v0 + sum a_ij z_j at abscissae ``at``: rows for q / h and v, the row of q1 / h."""
+    moved = tuple((mp.one, *line) for line in tableau.A)
+    position = matrix_product(cardinal_integrals(tableau.c, at, 0), moved)
+    velocity = matrix_product(cardinal_values(tableau.c, at), moved)
+    return position, velocity, matrix_product((tableau.b,), moved)[0]
+
+
+def _curve_gathers(
+    system: MechanicalSystem, position: Matrix, velocity: Matrix, *, other_blocks: int = 0
+) -> tuple[Gather, Gather]:
+    points = len(position)
+    padding = Table.constant(points, other_blocks)
+    return (
+        Gather(
+            arguments=system.coordinates,
+            table=Table.joined(Table.constant(points, 1, 1), Table.named("r", position, column=0), padding),
+            power=0,
+        ),
+        Gather(
+            arguments=system.velocities,
+            table=Table.joined(Table.constant(points, 1), Table.named("u", velocity, column=0), padding),
+            power=-1,
+        ),
+    )
+
+
+def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
+    """(34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
+    size, points = len(tableau.b), len(rule)
+    position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
+    abscissae = nodes.abscissae
+    values = cardinal_values(abscissae, rule.abscissae)
+    slopes = cardinal_slopes(abscissae, rule.abscissae)
+    none = Table.constant(points, size)
+
+    def first_and_sum(lines: Matrix) -> Table:
+        first, both = [(line[0],) for line in lines], [(line[0] + line[-1],) for line in lines]
+        return Table.joined(Table.named("l", first), none, Table.named("l", both))
+
+    quadrature = lagrangian_scatters(
+        PointFamily(
+            name="quadrature",
+            abscissae=rule.abscissae,
+            weights=rule.unit_weights,
+            weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
+            gathers=_curve_gathers(system, position_rows, velocity_rows),
+            scatters=(),
+        ),
+        system,
+        Scatter(results=(), table=first_and_sum(values), power=1),
+        Scatter(results=(), table=first_and_sum(slopes), power=0),
+    )
+    inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
+    node = residual_family(
+        system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
+    )
+    return StageSystem(
+        blocks=acceleration_unknowns(size),
+        rows=(
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        families=(quadrature, node),
+        end_position=Table.named("r", [(1, *end_row)], column=0),
+        end_momentum=mp.one,
+        end_numbers=("34c", "34e"),
+        extrapolation=acceleration_extrapolation(tableau),
+        shape=PrintedCurve(tableau, rule),
+    )
+
+
+def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+    """G = L_d + sum lambda_i . E_i in the paper's unknowns Q^1 .. Q^s, v0 and lambda_1 .. lambda_s."""
+    size = nodes.degree
+    own = Gather(
+        arguments=multipliers(system),
+        table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
+        power=0,
+    )
+    node = ScalarFamily(
+        name="node",
+        abscissae=nodes.abscissae[1:],
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(*nodal_gathers(system, nodes, other_blocks=size), own),
+        scalar=forms_of(system).multiplied_residual,
+        power=-1,
+        in_action=False,
+    )
+    return stationary_nodal(
+        families=(nodal_quadrature_family(system, nodes, rule, other_blocks=1 + size), node),
+        blocks=(
+            *nodal_blocks(nodes),
+            *(Block(name=f"lambda_{i}", power=0, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
+        ),
+        end_block=size - 1,
+        rows=(
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+            *(Row(number="dG/dQ", kind="multiplier", momentum=mp.zero) for _ in range(size - 1)),
+            Row(number="dG/dv0", kind="multiplier", momentum=mp.zero, power=1),
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+        ),
+        end_numbers=("34c", "34e"),
+    )
+
+
+def printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
+    """(34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
+    size = nodes.degree
+    action = nodal_quadrature_family(system, nodes, rule, other_blocks=1)
+    none = Table.constant(len(rule), size)
+
+    def ends(table: Table) -> Table:
+        return Table.joined(none, table.columns([0]), table.columns([size]))
+
+    quadrature = action.point_family([ends(gather.table) for gather in action.gathers])
+    node = residual_family(
+        system,
+        nodes.abscissae[1:],
+        nodal_gathers(system, nodes),
+        Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
+    )
+    return StageSystem(
+        blocks=nodal_blocks(nodes),
+        rows=(
+            *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
+            Row(number="34d", kind="IDEL", momentum=mp.one),
+        ),
+        families=(quadrature, node),
+        end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
+        end_momentum=mp.zero,
+        end_numbers=("34c", "34e"),
+    )

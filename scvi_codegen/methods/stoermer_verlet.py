@@ -1,0 +1,93 @@
+"""The Stoermer-Verlet method as an implicit pair, which is explicit for separable systems."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scvi_codegen.display.number_tables import Part
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.exactness import Exactness
+from scvi_codegen.methods.galerkin_stages import galerkin_system
+from scvi_codegen.methods.method import Method, Specification
+from scvi_codegen.methods.stage_system import (
+    StageSystem,
+)
+from scvi_codegen.tables.basis import (
+    extrapolation,
+    identity_matrix,
+)
+from scvi_codegen.tables.precision import Vector, mp
+from scvi_codegen.tables.tableau import lobatto_iiia
+
+__all__ = ["StoermerVerlet"]
+
+
+@dataclass(frozen=True, slots=True)
+class StoermerVerlet(Method):
+    """Stoermer-Verlet: the two-stage Lobatto IIIA-IIIB pair, order 2, symplectic, symmetric.
+
+    For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the
+    trapezoidal rule; for other Lagrangians it is implicit. Source: Hairer, Lubich & Wanner, Geometric Numerical
+    Integration, II.2.
+    """
+
+    @property
+    def name(self) -> str:
+        """``stoermer-verlet``."""
+        return "stoermer-verlet"
+
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        return "Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages)"
+
+    @property
+    def order(self) -> int | None:
+        """2."""
+        return 2
+
+    @property
+    def symmetric(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
+    def symplectic(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
+    def exactness(self) -> Exactness:
+        """Straight lines; f may be linear in q."""
+        return Exactness(curve=1, quadrature=2, gauge=1)
+
+    @property
+    def fractions(self) -> Vector:
+        """One step."""
+        return (mp.one,)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The tableau of positions."""
+        return (lobatto_iiia(2),)
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        return {"method": "stoermer-verlet"}
+
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
+        """The pair written by its generating function, unknowns V_1, V_2."""
+        tableau = lobatto_iiia(2)
+        return galerkin_system(
+            system,
+            abscissae=tableau.c,
+            weights=tableau.b,
+            position=tableau.A,
+            velocity=identity_matrix(2),
+            end_position=tableau.b,
+            extrapolation=extrapolation(tableau.c, 1),
+        )
+
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
+        """The same equations: the paper uses the method without printing it."""
+        return self.stage_system(system)
