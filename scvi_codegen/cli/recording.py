@@ -40,9 +40,9 @@ def is_folder(output: str) -> bool:
 
 def check_format(output: str, *, ensemble: bool) -> None:
     """Find out whether there is such a kind of file, and its library."""
-    known = (".npz", ".csv") if ensemble else tuple(export.WRITERS)
+    known = tuple(export.WRITERS)
     if Path(output).suffix.lower() not in known:
-        what = f"an ensemble is written as {' or '.join(known)}"
+        what = f"an ensemble is written as {', '.join(known)}"
         if not ensemble:
             what = f"a trajectory is written as {', '.join(known)} or into a folder {SUFFIX}"
         raise click.BadParameter(f"{what}, not as '{output}'", param_hint="'-o'")

@@ -1,33 +1,32 @@
 """States of a trajectory, however long, as files and as tables: npz, CSV, HDF5, Zarr; xarray, pandas.
 
-Files are written piece by piece, so that their length does not matter, and take their place when they are whole. HDF5
-and Zarr have dimension names, as netCDF has them: ``xarray.open_dataset`` and ``xarray.open_zarr`` read them. h5py,
-zarr, xarray and pandas are the extra ``data``, imported where they are used.
+Files are written piece by piece, so that their length does not matter, and take their place when they are whole.
+h5netcdf, zarr, xarray and pandas are the extra ``data``, imported where they are used.
 """
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import json
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import MissingLibraryError, StateError
+from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import replaced
+from scvi_codegen.files.labelled import Labelled, imported, missing, write_hdf5, write_zarr
 
 if TYPE_CHECKING:
     import pandas
-    import xarray
 
-__all__ = ["Piece", "States", "check_format", "chunk_rows", "to_dataframe", "to_xarray", "write_states"]
+__all__ = ["LABELLED", "Piece", "States", "check_format", "chunk_rows", "to_dataframe", "write_states", "write_whole"]
 
 Array = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, Array, Array, NDArray[np.int32]]
@@ -48,6 +47,9 @@ class States:
         parameters: value by name.
         h: step size.
         about: texts to write beside the numbers, by name: title, system, method, version, ...
+        maps: names of the momentum maps.
+        quantities: what follows from t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c).
+        units: of t, q, p and these, where they are known.
     """
 
     count: int
@@ -56,22 +58,44 @@ class States:
     parameters: Mapping[str, float]
     h: float
     about: Mapping[str, str]
+    maps: tuple[str, ...] = ()
+    quantities: Callable[[Array, Array, Array], Mapping[str, Array]] | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def attributes(self) -> dict[str, Any]:
         """All but the states as numbers and texts."""
         return {**self.about, "h": self.h, "parameters": json.dumps(dict(self.parameters))}
 
-    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], tuple[str, ...]]]:
-        """Shape, type and names of the dimensions of each array."""
+    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+        """Shape and type of each array."""
         n, m = self.count, len(self.coordinates)
-        real, vector = np.dtype(float), ("t", "coordinate")
-        return {
-            "t": ((n,), real, ("t",)),
-            "q": ((n, m), real, vector),
-            "p": ((n, m), real, vector),
-            "iterations": ((n,), np.dtype(np.int32), ("t",)),
-        }
+        real = np.dtype(float)
+        return {"t": ((n,), real), "q": ((n, m), real), "p": ((n, m), real), "iterations": ((n,), np.dtype(np.int32))}
+
+    def labelled(self) -> Labelled:
+        """With names for dimensions, and with what follows from the states."""
+        dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",)}
+        dimensions |= {"q": ("t", "coordinate"), "p": ("t", "coordinate"), "iterations": ("t",)}
+        whole = {"coordinate": np.array(self.coordinates)}
+        if self.quantities is not None:
+            dimensions |= {"velocity": ("t", "coordinate"), "energy": ("t",)}
+        if self.quantities is not None and self.maps:
+            dimensions |= {"symmetry": ("symmetry",), "momentum_map": ("t", "symmetry")}
+            whole["symmetry"] = np.array(self.maps)
+        return Labelled(
+            dimensions=dimensions,
+            pieces=self._labelled_pieces,
+            whole=whole,
+            count=self.count,
+            units={name: unit for name, unit in self.units.items() if name in dimensions},
+            attributes=self.attributes,
+        )
+
+    def _labelled_pieces(self) -> Iterator[dict[str, NDArray[Any]]]:
+        for t, q, p, iterations in self.pieces():
+            more = {} if self.quantities is None else self.quantities(t, q, p)
+            yield {"t": t, "q": q, "p": p, "iterations": iterations, **more}
 
 
 def chunk_rows(dimension: int) -> int:
@@ -92,22 +116,31 @@ def check_format(path: str | os.PathLike[str]) -> None:
         raise StateError(f"a trajectory is saved by the suffix of its file, one of {known}, not as {str(path)!r}")
     library = LIBRARIES.get(suffix)
     if library is not None and importlib.util.find_spec(library) is None:
-        raise _missing(library)
+        raise missing(library)
 
 
 def write_states(states: States, path: str | os.PathLike[str]) -> None:
     """Write states in the format of the suffix, whole or not at all.
 
     Raises:
-        StateError, MissingLibraryError: as :func:`check_format`; StateError also if another folder is in the way.
+        StateError, MissingLibraryError: as :func:`check_format`; StateError also if another folder is in the way, and
+            for units in a format that has none.
         OSError: if it cannot be written.
     """
     check_format(path)
+    suffix = Path(path).suffix.lower()
+    if states.units and suffix not in LABELLED:
+        raise StateError(f"a file {suffix} has no place for units; {', '.join(LABELLED)} have")
+    write_whole(path, lambda made: WRITERS[suffix](states, made))
+
+
+def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> None:
+    """Have ``write`` make a file or a folder, which then takes the place of ``path``, or nothing changes."""
     if Path(path).is_dir() and not (Path(path) / ".zgroup").exists():
         raise StateError(f"{str(path)!r} is a folder with something else in it: choose another name")
     try:
         with replaced(path) as made:
-            WRITERS[Path(path).suffix.lower()](states, made)
+            write(made)
     except OSError as error:
         if error.errno is None:
             raise
@@ -115,19 +148,9 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
         raise OSError(error.errno, what, str(path)) from error
 
 
-def to_xarray(states: States) -> xarray.Dataset:
-    """Variables q and p (t, coordinate) and iterations (t), with h, parameters and the rest as attributes."""
-    library = _imported("xarray")
-    arrays = _joined(states)
-    named = {name: (dimensions, arrays[name]) for name, (_, _, dimensions) in states.columns().items()}
-    coordinates = {"t": named.pop("t"), "coordinate": list(states.coordinates)}
-    dataset: xarray.Dataset = library.Dataset(named, coords=coordinates, attrs=states.attributes)
-    return dataset
-
-
 def to_dataframe(states: States) -> pandas.DataFrame:
     """A line a state, by time: a column for each coordinate x and each momentum p_x, and iterations."""
-    library = _imported("pandas")
+    library = imported("pandas")
     arrays, names = _joined(states), states.coordinates
     columns = dict(zip(names, arrays["q"].T, strict=True))
     columns |= {f"p_{name}": column for name, column in zip(names, arrays["p"].T, strict=True)}
@@ -155,7 +178,7 @@ def _write_npz(states: States, path: Path) -> None:
         **{name: np.array(text) for name, text in states.about.items()},
     }
     with zipfile.ZipFile(path, "w") as archive:
-        for i, (name, (shape, kind, _)) in enumerate(states.columns().items()):
+        for i, (name, (shape, kind)) in enumerate(states.columns().items()):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 described = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": shape}
                 np.lib.format.write_array_header_1_0(file, described)
@@ -175,60 +198,14 @@ def _write_csv(states: States, path: Path) -> None:
             np.savetxt(file, np.column_stack(piece), delimiter=",", fmt=formats)
 
 
-def _write_hdf5(states: States, path: Path) -> None:
-    with _imported("h5py").File(path, "w") as file:
-        file.attrs.update(states.attributes)
-        file.create_dataset("coordinate", data=list(states.coordinates))
-        for name, (shape, kind, _) in states.columns().items():
-            file.create_dataset(name, shape, kind)
-        _fill(states, file)
-        for name in ("t", "coordinate"):
-            file[name].make_scale(name)
-        for name in ("q", "p", "iterations"):
-            for axis, dimension in enumerate(states.columns()[name][2]):
-                file[name].dims[axis].attach_scale(file[dimension])
+def _write_labelled(states: States, path: Path, *, write: Callable[[Labelled, Path], None]) -> None:
+    write(states.labelled(), path)
 
 
-def _write_zarr(states: States, path: Path) -> None:
-    """Version 2 of the format, which every reader knows."""
-    group = _imported("zarr").open_group(str(path), mode="w", zarr_format=2)
-    group.attrs.update(states.attributes)
-    rows = max(1, min(states.count, chunk_rows(len(states.coordinates))))
-    for name, (shape, kind, dimensions) in states.columns().items():
-        array = group.create_array(name, shape=shape, dtype=kind, chunks=(rows, *shape[1:]), fill_value=None)
-        array.attrs["_ARRAY_DIMENSIONS"] = list(dimensions)
-    names = np.array(states.coordinates)
-    group.create_array("coordinate", shape=names.shape, dtype=names.dtype).attrs["_ARRAY_DIMENSIONS"] = ["coordinate"]
-    group["coordinate"][:] = names
-    _fill(states, group)
-    _imported("zarr").consolidate_metadata(str(path), zarr_format=2)
-
-
-def _fill(states: States, arrays: Any) -> None:
-    first = 0
-    for piece in states.pieces():
-        last = first + len(piece[0])
-        for name, part in zip(COLUMNS, piece, strict=True):
-            arrays[name][first:last] = part
-        first = last
-
-
-WRITERS: dict[str, Callable[[States, Path], None]] = {
+LABELLED = {".h5": write_hdf5, ".hdf5": write_hdf5, ".nc": write_hdf5, ".zarr": write_zarr}
+"""Formats that have names for dimensions, and units."""
+WRITERS: Mapping[str, Callable[[States, Path], None]] = {
     ".npz": _write_npz,
     ".csv": _write_csv,
-    ".h5": _write_hdf5,
-    ".hdf5": _write_hdf5,
-    ".zarr": _write_zarr,
-}
-LIBRARIES = {".h5": "h5py", ".hdf5": "h5py", ".zarr": "zarr"}
-
-
-def _imported(library: str) -> Any:
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise _missing(library) from error
-
-
-def _missing(library: str) -> MissingLibraryError:
-    return MissingLibraryError(f"this needs {library}, which is not installed: pip install 'scvi-codegen[data]'")
+} | {suffix: partial(_write_labelled, write=write) for suffix, write in LABELLED.items()}
+LIBRARIES = {".h5": "h5netcdf", ".hdf5": "h5netcdf", ".nc": "h5netcdf", ".zarr": "zarr"}

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.export import LABELLED, check_format, write_whole
+from scvi_codegen.files.labelled import Labelled, checked_units, to_dataset
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.trajectory import relative_changes
+
+if TYPE_CHECKING:
+    import xarray
 
 __all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory"]
 
@@ -87,22 +94,71 @@ class EnsembleTrajectory:
                 continue
         return values, sizes
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.npz`` (the arrays and names) or ``.csv`` (a line a state: trajectory, t, q, p), atomically.
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+        """Write ``.npz``, ``.csv`` (a line a state: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
 
         In a CSV file trajectories are numbered from 0, parameters that differ between them have columns too, and states
-        after a failure are left out.
+        after a failure are left out. HDF5 and Zarr hold what :meth:`to_xarray` gives.
 
         Raises:
-            StateError: for another suffix.
+            StateError: for another suffix, or units in a format that has none.
+            MissingLibraryError: without h5netcdf or zarr (extra ``data``).
         """
-        suffix = Path(path).suffix.lower()
-        if suffix == ".npz":
-            write_atomically(path, self._write_npz)
-        elif suffix == ".csv":
-            write_atomically(path, self._write_csv)
-        else:
-            raise StateError(f"an ensemble is saved as .npz or .csv, not as {str(path)!r}")
+        suffix, known = Path(path).suffix.lower(), checked_units(units)
+        if suffix in LABELLED:
+            check_format(path)
+            write_whole(path, lambda made: LABELLED[suffix](self._labelled(known), made))
+            return
+        write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
+        if write is None:
+            raise StateError(f"an ensemble is saved as .npz, .csv, {', '.join(LABELLED)}, not as {str(path)!r}")
+        if known:
+            raise StateError(f"a file {suffix} has no place for units; {', '.join(LABELLED)} have")
+        write_atomically(path, write)
+
+    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """Variables q, p, velocity (t, trajectory, coordinate), energy, momentum_map, parameters, status, steps.
+
+        Args:
+            units: as of :meth:`Trajectory.to_xarray`.
+
+        Raises:
+            StateError: for units of something else.
+            MissingLibraryError: without xarray (extra ``data``).
+        """
+        return to_dataset(self._labelled(checked_units(units)))
+
+    def _labelled(self, units: Mapping[str, str]) -> Labelled:
+        """The arrays with names for their dimensions."""
+        interface, each = self.stepper.interface, ("t", "trajectory")
+        dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",), "energy": each}
+        dimensions |= dict.fromkeys(("q", "p", "velocity"), (*each, "coordinate"))
+        dimensions |= {"status": ("trajectory",), "steps": ("trajectory",)}
+        whole: dict[str, NDArray[Any]] = {
+            "coordinate": np.array(interface.coordinates),
+            "status": self.status,
+            "steps": self.steps,
+        }
+        if interface.parameters:
+            dimensions |= {"parameter": ("parameter",), "parameters": ("trajectory", "parameter")}
+            whole |= {"parameter": np.array(interface.parameters), "parameters": self.parameters}
+        if interface.map_names:
+            dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*each, "symmetry")}
+            whole["symmetry"] = np.array(interface.map_names)
+        return Labelled(
+            dimensions=dimensions,
+            pieces=lambda: iter([{"t": self.t, "q": self.q, "p": self.p, **self._quantities()}]),
+            whole=whole,
+            count=len(self.t),
+            units={name: unit for name, unit in units.items() if name in dimensions},
+            attributes={**interface.about(), "h": self.h},
+        )
+
+    def _quantities(self) -> dict[str, Array]:
+        found = [
+            quantities(self.stepper, self.parameters[j], self.t, self.q[:, j], self.p[:, j]) for j in range(len(self))
+        ]
+        return {name: np.stack([part[name] for part in found], axis=1) for name in found[0]}
 
     def _reached(self, j: int) -> NDArray[np.bool_]:
         """(n,) which states of a trajectory there are."""

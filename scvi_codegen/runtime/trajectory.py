@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -12,11 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.files.export import States, to_dataframe, to_xarray, write_states
+from scvi_codegen.files.export import States, to_dataframe, write_states
+from scvi_codegen.files.labelled import checked_units, to_dataset
 from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike
 from scvi_codegen.runtime.kept_states import Array, KeptStates
+from scvi_codegen.runtime.quantities import quantities
 
 if TYPE_CHECKING:
     import pandas
@@ -73,7 +76,7 @@ class Trajectory(KeptStates):
         values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
         return relative_changes(values, sizes)
 
-    def states(self) -> States:
+    def states(self, units: Mapping[str, str] | None = None) -> States:
         """The states as :mod:`scvi_codegen.files.export` writes them."""
         interface = self.stepper.interface
         piece = (self.t, self.q, self.p, self.iterations)
@@ -84,6 +87,9 @@ class Trajectory(KeptStates):
             parameters=dict(zip(interface.parameters, map(float, self.parameters), strict=True)),
             h=self.h,
             about=interface.about(),
+            maps=interface.map_names,
+            quantities=partial(quantities, self.stepper, self.parameters),
+            units=checked_units(units),
         )
 
     @property
@@ -168,25 +174,34 @@ class Trajectory(KeptStates):
 
         return animate(self, path, seconds=seconds, positions=positions)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, atomically.
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+        """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
 
         An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and texts title,
-        system, method, version. A CSV file has columns t, the coordinates x, the momenta p_x, iterations.
+        system, method, version. A CSV file has columns t, the coordinates x, the momenta p_x, iterations. HDF5 and Zarr
+        hold what :meth:`to_xarray` gives.
 
         Raises:
-            StateError: for another suffix.
-            MissingLibraryError: without h5py or zarr (extra ``data``).
+            StateError: for another suffix, or units in a format that has none.
+            MissingLibraryError: without h5netcdf or zarr (extra ``data``).
         """
-        write_states(self.states(), path)
+        write_states(self.states(units), path)
 
-    def to_xarray(self) -> xarray.Dataset:
-        """Variables q and p (t, coordinate), iterations (t); h, parameters and titles as attributes.
+    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """Variables q, p, velocity (t, coordinate), energy, iterations (t), momentum_map (t, symmetry).
+
+        Attributes are h, parameters and titles, and a ``long_name`` of each variable. What cannot be computed for a
+        state is NaN there.
+
+        Args:
+            units: of t, q, p, velocity, energy or momentum_map, as in ``{"t": "day", "q": "au"}``; those of velocities
+                follow.
 
         Raises:
+            StateError: for units of something else.
             MissingLibraryError: without xarray (extra ``data``).
         """
-        return to_xarray(self.states())
+        return to_dataset(self.states(units).labelled())
 
     def to_dataframe(self) -> pandas.DataFrame:
         """A line a state, by time: columns for each coordinate x and momentum p_x, and iterations.

@@ -190,7 +190,7 @@ class TestChoices:
             ("kepler --steps -1", "steps must be at least 0"),
             ("kepler --every 0", "every must be at least 1"),
             ("kepler --tolerance 0", "the tolerance must be positive"),
-            ("kepler -o orbit.txt", "as .npz, .csv, .h5, .hdf5, .zarr or into a folder .run, not as 'orbit.txt'"),
+            ("kepler -o orbit.txt", "as .npz, .csv, .h5, .hdf5, .nc, .zarr or into a folder .run, not as 'orbit.txt'"),
             ("kepler -o no/orbit.npz", "there is no folder 'no'"),
             ("kepler --plot orbit.gif", "saved as .png or .svg"),
             ("relativistic-particle --velocity 2", "q = "),

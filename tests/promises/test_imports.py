@@ -43,6 +43,7 @@ OWNERS = {
     "cffi": "native",
     "click": "cli",
     "distributed": "runtime",
+    "h5netcdf": "files",
     "h5py": "files",
     "jinja2": "display rendering",
     "markupsafe": "display reproduce",

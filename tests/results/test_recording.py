@@ -8,6 +8,7 @@ import sys
 import tracemalloc
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -317,6 +318,42 @@ class TestFiles:
         assert_same(SimpleNamespace(**{name: dataset[name].values for name in COLUMNS}), whole)
         assert (dataset.q.dims, list(dataset.coordinate)) == (("t", "coordinate"), ["q1", "q2"])
         assert dataset.attrs["method"] == whole.stepper.interface.method
+
+    @pytest.mark.parametrize("suffix", ["h5", "hdf5", "nc"])
+    def test_hdf5_as_xarray_reads_it(self, saved, suffix):
+        pytest.importorskip("h5netcdf")
+        xarray = pytest.importorskip("xarray")
+        given, whole = saved
+        given.save(f"a.{suffix}", units={"t": "day", "q": "au"})
+        with xarray.open_dataset(f"a.{suffix}") as dataset:
+            xarray.testing.assert_identical(
+                dataset.drop_attrs().load(), whole.to_xarray(units={"t": "day", "q": "au"}).drop_attrs()
+            )
+            assert dataset.velocity.attrs == {"long_name": "velocity that belongs to the momentum", "units": "au day-1"}
+            assert (dataset.t.attrs["units"], dataset.p.attrs) == ("day", {"long_name": "momentum"})
+
+    def test_velocities_energies_and_momentum_maps_are_there(self, kepler):
+        pytest.importorskip("xarray")
+        run = kepler.integrate(**STATE, h=H, steps=30)
+        dataset = run.to_xarray()
+        velocities = [kepler.velocity(q, p) for q, p in zip(run.q, run.p, strict=True)]
+        np.testing.assert_array_equal(dataset.velocity, velocities)
+        np.testing.assert_array_equal(dataset.energy, run.energy())
+        np.testing.assert_array_equal(dataset.momentum_map, run.momentum_maps())
+        assert list(dataset.symmetry.values) == list(kepler.momentum_map_names)
+
+    def test_what_cannot_be_computed_is_not_a_number(self, kepler):
+        run = kepler.integrate(**STATE, h=H, steps=9)
+        q = run.q.copy()
+        q[4] = 0.0
+        dataset = replace(run, q=q).to_xarray()
+        assert list(np.flatnonzero(np.isnan(dataset.energy))) == [4]
+        np.testing.assert_array_equal(np.delete(dataset.energy.values, 4), np.delete(run.energy(), 4))
+
+    @pytest.mark.parametrize(("path", "units"), [("a.csv", {"t": "s"}), ("a.h5", {"h": "s"}), ("a.h5", {"t": 1})])
+    def test_units_that_cannot_be_kept_are_refused(self, kepler, path, units):
+        with pytest.raises(StateError, match="units"):
+            kepler.integrate(**STATE, h=H, steps=3).save(path, units=units)
 
     def test_tables(self, kepler):
         pytest.importorskip("xarray")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +14,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
+from scvi_codegen.files.labelled import checked_units
 from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
+from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -153,7 +155,7 @@ class RecordedRun:
         """(n,) energies p.v - L."""
         return np.concatenate([piece.energy() for piece in self.pieces()])
 
-    def states(self) -> States:
+    def states(self, units: Mapping[str, str] | None = None) -> States:
         """The states as :mod:`scvi_codegen.files.export` writes them, read file by file."""
         manifest = self.manifest
         return States(
@@ -163,11 +165,14 @@ class RecordedRun:
             parameters=dict(zip(manifest.interface.parameters, manifest.parameters, strict=True)),
             h=manifest.h,
             about=manifest.about(),
+            maps=manifest.interface.map_names,
+            quantities=lambda t, q, p: quantities(self.stepper, np.array(manifest.parameters), t, q, p),
+            units=checked_units(units),
         )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`."""
-        write_states(self.states(), path)
+        write_states(self.states(units), path)
 
     def _trajectory(self, piece: tuple[Any, ...]) -> Trajectory:
         t, q, p, iterations = piece
