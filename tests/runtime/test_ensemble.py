@@ -326,7 +326,7 @@ class TestFiles:
             assert set(rows[:, 1]) == {result.parameters[j, 0]}
 
     def test_other_suffixes(self, result: EnsembleTrajectory, tmp_path):
-        with pytest.raises(StateError, match=r"saved as \.npz or \.csv"):
+        with pytest.raises(StateError, match=r"saved as \.npz, \.csv, \.h5"):
             result.save(tmp_path / "runs.txt")
 
 
@@ -480,7 +480,7 @@ class TestCommandLine:
             ("kepler --ensemble none.toml", "none.toml cannot be read"),
             ("kepler --ensemble grid.toml --plot a.png", "--plot is for one trajectory"),
             ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is for one trajectory"),
-            ("kepler --ensemble grid.toml -o runs.txt", "written as .npz or .csv"),
+            ("kepler --ensemble grid.toml -o runs.txt", "written as .npz, .csv, .h5"),
             ("planar-pendulum --ensemble grid.toml", "'q1' is no coordinate"),
             (
                 "kepler --steps 1000000000000 --ensemble grid.toml",
