@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.mechanics import Mechanics
@@ -147,8 +148,7 @@ class _Problem:
     """Checked arguments, and the search for a grid that is fine enough."""
 
     def __init__(self, system: LagrangianSystem, h: Any, t: Any, parameters: Values, digits: int) -> None:
-        if isinstance(digits, bool) or not isinstance(digits, int) or not 1 <= digits <= MOST_DIGITS:
-            raise StateError(f"digits must be a whole number from 1 to {MOST_DIGITS}, not {digits!r}")
+        checked_count(digits, "digits", least=1, most=MOST_DIGITS)
         self.names = [coordinate.name for coordinate in system.coordinates]
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
         if self.h == 0:

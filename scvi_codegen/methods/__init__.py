@@ -6,6 +6,7 @@ from collections.abc import Callable
 from inspect import Parameter, signature
 from typing import Any
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.composition import Composition
@@ -83,8 +84,7 @@ def method_from_specification(specification: Specification) -> Method:
         if argument not in accepted:
             raise MethodError(f"{name} takes no {argument!r}; it takes {', '.join(accepted) or 'no arguments'}")
     for argument in {"degree", "stages", "order"} & set(arguments):
-        if isinstance(arguments[argument], bool) or not isinstance(arguments[argument], int):
-            raise MethodError(f"{argument} must be an integer, not {arguments[argument]!r}")
+        checked_count(arguments[argument], argument, least=1, error=MethodError)
     if not isinstance(arguments.get("abscissae", ""), str | list | tuple):
         raise MethodError(f"abscissae must be a list of numbers or a name, not {arguments['abscissae']!r}")
     for argument in REQUIRED[name]:

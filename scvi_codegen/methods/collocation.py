@@ -15,7 +15,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import VELOCITY_BLOCK, position_system, residual_family, single_point
 from scvi_codegen.methods.choices import resolve_nodes
 from scvi_codegen.methods.galerkin_stages import position_block
-from scvi_codegen.methods.method import Method, Specification, check_count
+from scvi_codegen.methods.method import Method, Specification, degree_count
 from scvi_codegen.methods.runge_kutta import check_form, phase_space_system
 from scvi_codegen.methods.stage_system import (
     Block,
@@ -52,7 +52,7 @@ class SpectralCollocation(Method):
     form: str = "position"
 
     def __post_init__(self) -> None:
-        check_count(self.degree, "the degree of spectral collocation")
+        object.__setattr__(self, "degree", degree_count(self.degree, "the degree of spectral collocation"))
         check_form(self.form)
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
 

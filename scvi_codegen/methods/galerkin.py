@@ -26,7 +26,7 @@ from scvi_codegen.methods.choices import (
 )
 from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.galerkin_stages import galerkin_system, nodal_quadrature_family, position_block
-from scvi_codegen.methods.method import Method, Specification, check_count
+from scvi_codegen.methods.method import Method, Specification, degree_count
 from scvi_codegen.methods.stage_system import (
     Row,
     StageSystem,
@@ -72,7 +72,7 @@ class SVI(Method):
     space: CurveSpace | str | None = None
 
     def __post_init__(self) -> None:
-        check_count(self.degree, "the degree of a spectral variational integrator")
+        object.__setattr__(self, "degree", degree_count(self.degree, "the degree of a spectral variational integrator"))
         object.__setattr__(self, "space", resolve_space(self.space))
         own = self.curves.default_rule(self.degree) if self.quadrature is None else self.quadrature
         object.__setattr__(self, "quadrature", resolve_quadrature(own, self.degree))

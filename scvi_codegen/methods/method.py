@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import sympy
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
@@ -25,7 +27,10 @@ from scvi_codegen.methods.stage_system import PointFamily, Scatter, StageSystem,
 from scvi_codegen.tables.precision import Number, Vector, mp
 from scvi_codegen.tables.tableau import MOST_STAGES
 
-__all__ = ["Method", "Specification", "check_count", "check_regular", "lagrangian_scatters", "unit_sum"]
+__all__ = ["Method", "Specification", "check_regular", "degree_count", "lagrangian_scatters", "unit_sum"]
+
+degree_count = partial(checked_count, least=1, most=MOST_STAGES, error=MethodError)
+"""A degree, or a number of stages."""
 
 Specification = Mapping[str, str | int | bool | Sequence[float]]
 
@@ -132,16 +137,6 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
             "is singular: use an SVI with as many quadrature points as its degree, or a Runge-Kutta or collocation "
             "method in phase-space form"
         )
-
-
-def check_count(value: int, what: str, *, least: int = 1, most: int = MOST_STAGES) -> None:
-    """Raise :class:`MethodError` unless ``value`` is an integer between ``least`` and ``most``."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise MethodError(f"{what} must be an integer, not {value!r}")
-    if value < least:
-        raise MethodError(f"{what} must be at least {least}, not {value}")
-    if value > most:
-        raise MethodError(f"{what} must be at most {most}: take a lower one, and more steps")
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:

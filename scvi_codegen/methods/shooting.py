@@ -25,7 +25,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.methods.method import Method, Specification, check_count
+from scvi_codegen.methods.method import Method, Specification, degree_count
 from scvi_codegen.methods.shooting_stages import printed_increments, printed_nodal, shooting_increments, shooting_nodal
 from scvi_codegen.methods.stage_system import (
     StageSystem,
@@ -68,7 +68,9 @@ class SCVI(Method):
     abscissae: Sequence[Any] | str | None = None
 
     def __post_init__(self) -> None:
-        check_count(self.degree, "the degree of a spectral-collocation variational integrator")
+        object.__setattr__(
+            self, "degree", degree_count(self.degree, "the degree of a spectral-collocation variational integrator")
+        )
         if not isinstance(self.variational, bool):
             raise MethodError(f"variational is True or False, not {self.variational!r}")
         object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))

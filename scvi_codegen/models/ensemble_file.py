@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.model import Model
@@ -152,9 +153,7 @@ def _axis(value: Any, where: str) -> Array:
     if isinstance(value, dict):
         if set(value) != {"from", "to", "count"}:
             raise ModelFileError(f"{where} must have from, to and count, not {', '.join(value) or 'nothing'}")
-        count = value["count"]
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST:
-            raise ModelFileError(f"{where} count must be a whole number from 1 to {MOST}, not {count!r}")
+        count = checked_count(value["count"], f"{where} count", least=1, most=MOST, error=ModelFileError)
         return np.linspace(real(value["from"], f"{where} from"), real(value["to"], f"{where} to"), count)
     values = value if isinstance(value, list) else [value]
     if not values:

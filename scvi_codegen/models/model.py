@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method
@@ -20,11 +21,10 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.run import Run
     from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["DEFAULT_METHOD", "Model", "check_length", "real", "whole"]
+__all__ = ["DEFAULT_METHOD", "Model", "check_length", "real"]
 
 DEFAULT_METHOD = SVI(8)
 """What the problems of the catalogue are integrated with unless another method is chosen."""
-MOST_STEPS = 2**53
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,14 +70,14 @@ class Model:
                 object.__setattr__(self, name, real(value, name))
         if self.h == 0.0:
             raise ModelFileError("the step is 0: it must be positive, or negative to go back")
-        if self.span is not None and not 0.0 < self.span / abs(self.h) < MOST_STEPS:
+        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
             raise ModelFileError(
                 f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
                 "backward, of fewer than 2^53 steps"
             )
         if self.steps is not None:
-            object.__setattr__(self, "steps", whole(self.steps, "steps", least=0))
-        object.__setattr__(self, "every", whole(self.every, "every", least=1))
+            object.__setattr__(self, "steps", checked_count(self.steps, "steps", least=0, error=ModelFileError))
+        object.__setattr__(self, "every", checked_count(self.every, "every", least=1, error=ModelFileError))
 
     @classmethod
     def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
@@ -145,14 +145,4 @@ def real(value: Any, where: str) -> float:
         number = math.inf
     if not math.isfinite(number):
         raise ModelFileError(f"{where} is {number}: a finite number is wanted")
-    return number
-
-
-def whole(value: Any, where: str, *, least: int) -> int:
-    """A whole number of at least ``least`` and below 2^53, or an error that begins with ``where``."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        raise ModelFileError(f"{where} must be a whole number, not {value!r}")
-    number = int(value)
-    if not least <= number < MOST_STEPS:
-        raise ModelFileError(f"{where} must be at least {least} and below 2^53, not {number}")
     return number

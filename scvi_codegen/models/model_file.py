@@ -39,6 +39,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
@@ -46,7 +47,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
-from scvi_codegen.models.model import Model, check_length, real, whole
+from scvi_codegen.models.model import Model, check_length, real
 from scvi_codegen.models.problems import Problem, problem
 
 __all__ = ["dump_model", "load_model", "parse_model", "save_model"]
@@ -236,10 +237,11 @@ def _read_run(document: Mapping[str, Section], default: Model | None) -> dict[st
         found = "both" if "span" in section else "neither"
         raise ModelFileError(f"[run] has {found} of span and steps: give a length of time or a number of steps")
     step = real(_required(section, "step", "[run]"), "[run] step")
-    every = whole(section.get("every", 1), "[run] every", least=1)
+    every = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
     if "span" in section:
         return {"h": step, "span": real(section["span"], "[run] span"), "every": every}
-    return {"h": step, "steps": whole(section["steps"], "[run] steps", least=0), "every": every}
+    steps = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
+    return {"h": step, "steps": steps, "every": every}
 
 
 def _section(document: Mapping[str, Section], name: str) -> Section:

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 
-__all__ = ["checked_count", "checked_number", "checked_step", "empty_array", "real_array"]
+__all__ = ["checked_number", "checked_step", "empty_array", "real_array"]
 
-MOST = 2**53
 REAL_KINDS = "iufO"
 """Not complex numbers, which lose half of themselves when they are converted, nor dates, text and truth values."""
 
@@ -62,14 +61,3 @@ def checked_step(h: float) -> float:
     if number == 0.0:
         raise StateError("the step h is 0")
     return number
-
-
-def checked_count(value: int, name: str, *, least: int) -> int:
-    """An integer of at least ``least``, below 2^53."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise StateError(f"{name} must be a whole number, not {value!r}")
-    if value < least:
-        raise StateError(f"{name} must be at least {least}, not {value}")
-    if value >= MOST:
-        raise StateError(f"{name} must be below 2^53")
-    return int(value)

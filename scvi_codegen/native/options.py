@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_count, checked_number
+from scvi_codegen.native.arguments import checked_number
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 
@@ -42,9 +43,7 @@ class SolverOptions:
             raise StateError(f"the tolerance must be positive, not {self.tolerance!r}")
         if not isinstance(self.absolute, bool):
             raise StateError(f"absolute must be True or False, not {self.absolute!r}")
-        checked_count(self.max_iterations, "max_iterations", least=1)
-        if self.max_iterations > MOST_ITERATIONS:
-            raise StateError(f"max_iterations must be at most {MOST_ITERATIONS}, not {self.max_iterations}")
+        checked_count(self.max_iterations, "max_iterations", least=1, most=MOST_ITERATIONS)
 
 
 def checked_options(options: SolverOptions | None) -> SolverOptions | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.native.arguments import checked_count
+from scvi_codegen.counts import checked_count
 from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 

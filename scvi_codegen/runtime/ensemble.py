@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native import building
-from scvi_codegen.native.arguments import checked_count, checked_number, checked_step, empty_array, real_array
+from scvi_codegen.native.arguments import checked_number, checked_step, empty_array, real_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory

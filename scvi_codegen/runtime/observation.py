@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.native.arguments import checked_count
 from scvi_codegen.runtime.dense_output import lengths_at, states_at
 from scvi_codegen.runtime.event_search import EventSearch
 from scvi_codegen.runtime.memory import Memory

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.native.arguments import checked_count, empty_array
+from scvi_codegen.counts import checked_count
+from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array

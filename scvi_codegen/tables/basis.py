@@ -16,7 +16,7 @@ from itertools import accumulate
 from operator import mul
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.tables.nodes import checked_count, to_number
+from scvi_codegen.tables.nodes import point_count, to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp, settled
 from scvi_codegen.tables.quadrature import gauss_legendre
 
@@ -170,7 +170,7 @@ def extrapolation(points: Iterable[Number], shift: Number, degree: int | None = 
     numbers, offset = checked_points(points), to_number(shift)
     if degree is None:
         return cardinal_values(numbers, [point + offset for point in numbers])
-    degree = checked_count(degree, "the degree of an extrapolation", 0)
+    degree = point_count(degree, "the degree of an extrapolation", least=0)
     if degree >= len(numbers):
         raise MethodError(f"degree {degree} does not fit {len(numbers)} points; give 0 to {len(numbers) - 1}")
     with mp.workdps(guard_digits(numbers) + len(numbers)):

@@ -7,12 +7,12 @@ method on the three-term recurrence with twenty guard digits: no eigenvalue prob
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from typing import Any, TypeAlias, TypeVar
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 
@@ -25,7 +25,6 @@ __all__ = [
     "chebyshev_gauss_points",
     "chebyshev_lobatto",
     "chebyshev_lobatto_points",
-    "checked_count",
     "equispaced",
     "family_named",
     "is_antisymmetric",
@@ -34,6 +33,7 @@ __all__ = [
     "legendre_lobatto",
     "legendre_lobatto_points",
     "nodes_by_name",
+    "point_count",
     "radau_left",
     "radau_left_points",
     "radau_right",
@@ -45,6 +45,9 @@ __all__ = [
 GUARD = 20
 MOST_POINTS = 128
 """Of a rule or a curve: a second of 60-digit arithmetic, and far beyond what double precision has a use for."""
+
+point_count = partial(checked_count, most=MOST_POINTS, error=MethodError)
+"""A number of points, or a degree."""
 
 Expressions: TypeAlias = tuple[Any, ...]
 """A tuple of SymPy expressions (SymPy is imported only where one is made)."""
@@ -65,7 +68,7 @@ class Nodes:
     points: Vector
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "degree", checked_count(self.degree, "the degree", 1))
+        object.__setattr__(self, "degree", point_count(self.degree, "the degree", least=1))
         object.__setattr__(self, "points", ascending_points(self.points, "node"))
         if len(self.points) != self.degree + 1:
             raise MethodError(
@@ -125,18 +128,6 @@ def is_antisymmetric(points: Vector) -> bool:
     """Whether reversing the points changes their signs and nothing else, to 50 digits."""
     tolerance = mp.mpf(10) ** (10 - DIGITS)
     return all(abs(left + right) <= tolerance for left, right in zip(points, reversed(points), strict=True))
-
-
-def checked_count(value: Any, what: str, least: int, most: int = MOST_POINTS) -> int:
-    """Return ``value`` as an int, or raise ``MethodError`` when it is not one or not between ``least`` and ``most``."""
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise MethodError(f"{what} must be an integer, got {value!r}; give an integer of at least {least}")
-    count = operator.index(value)
-    if count < least:
-        raise MethodError(f"{what} must be at least {least}, got {count}; give {least} or more")
-    if count > most:
-        raise MethodError(f"{what} must be at most {most}; take fewer, and more steps")
-    return count
 
 
 def family_named(name: str, families: Mapping[str, Item], what: str) -> Item:
@@ -234,7 +225,7 @@ def equispaced_points(count: int) -> Vector:
 
 def nodes_of(name: str, degree: int, points: Callable[[int], Vector]) -> Nodes:
     """Return the family member of this degree, after checking the degree."""
-    return Nodes(name=name, degree=degree, points=points(checked_count(degree, "the degree", 1) + 1))
+    return Nodes(name=name, degree=degree, points=points(point_count(degree, "the degree", least=1) + 1))
 
 
 @lru_cache(maxsize=None, typed=True)

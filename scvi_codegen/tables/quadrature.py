@@ -17,11 +17,11 @@ from scvi_codegen.tables.nodes import (
     ascending_points,
     chebyshev_gauss_points,
     chebyshev_lobatto_points,
-    checked_count,
     family_named,
     is_antisymmetric,
     legendre_gauss_points,
     legendre_lobatto_points,
+    point_count,
     radau_left_points,
     radau_right_points,
     to_number,
@@ -86,7 +86,7 @@ class Quadrature:
                     f"quadrature {self.name!r} has {len(self.points)} points and {len(weights)} weights; "
                     "give one weight for each point, and at least one point"
                 )
-        claimed = checked_count(self.order, "the order of a quadrature", 0, MOST_ORDER)
+        claimed = point_count(self.order, "the order of a quadrature", least=0, most=MOST_ORDER)
         tolerance = CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE
         found = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
         if found == 0:
@@ -189,7 +189,7 @@ def gauss_legendre(n: int) -> Quadrature:
     >>> rule.name, rule.order, [float(w) for w in rule.weights]
     ('gauss-legendre:2', 4, [1.0, 1.0])
     """
-    n = checked_count(n, "the number of Gauss-Legendre points", 1)
+    n = point_count(n, "the number of Gauss-Legendre points", least=1)
     return gauss_type("gauss-legendre", legendre_gauss_points(n), 2 * n, lambda x, P2: 2 * (1 - x * x) / (n * n * P2))
 
 
@@ -199,7 +199,7 @@ def gauss_lobatto(n: int) -> Quadrature:
 
     Points: -1, 1 and the roots of P'_{n-1}. Weights: 2 / (n (n - 1) P_{n-1}(x)^2) (Davis & Rabinowitz, section 2.7).
     """
-    n = checked_count(n, "the number of Gauss-Lobatto points", 2)
+    n = point_count(n, "the number of Gauss-Lobatto points", least=2)
     return gauss_type("gauss-lobatto", legendre_lobatto_points(n), 2 * n - 2, lambda x, P2: 2 / (n * (n - 1) * P2))
 
 
@@ -210,7 +210,7 @@ def gauss_radau(n: int, side: Literal["left", "right"] = "left") -> Quadrature:
     Points on the left: the roots of P_{n-1} + P_n. Weights: (1 - x) / (n P_{n-1}(x))^2, for the right side (1 + x)
     (Davis & Rabinowitz, section 2.7).
     """
-    n = checked_count(n, "the number of Gauss-Radau points", 1)
+    n = point_count(n, "the number of Gauss-Radau points", least=1)
     if side not in ("left", "right"):
         raise MethodError(f"the side of a Gauss-Radau rule is 'left' or 'right', got {side!r}; choose one of them")
     points, sign = (radau_left_points(n), -1) if side == "left" else (radau_right_points(n), 1)
@@ -245,7 +245,7 @@ def clenshaw_curtis(n: int) -> Quadrature:
     Weights: (c_j / N) (1 - sum_{k=1}^{N//2} b_k cos(2 j k pi / N) / (4k^2 - 1)) with c_j = 1 at the ends, else 2, and
     b_k = 1 for 2k = N, else 2 (Waldvogel 2006; Trefethen 2008).
     """
-    n = checked_count(n, "the number of Clenshaw-Curtis points", 2)
+    n = point_count(n, "the number of Clenshaw-Curtis points", least=2)
     with mp.workdps(DIGITS + GUARD):
         weights = symmetrised(clenshaw_curtis_weights(n, +mp.pi, mp.cos))
     points = chebyshev_lobatto_points(n)
@@ -258,7 +258,7 @@ def fejer(n: int) -> Quadrature:
 
     Weights: (2 / n) (1 - 2 sum_{k=1}^{n//2} cos((2j + 1) k pi / n) / (4k^2 - 1)) (Waldvogel 2006).
     """
-    n = checked_count(n, "the number of Fejer points", 1)
+    n = point_count(n, "the number of Fejer points", least=1)
     with mp.workdps(DIGITS + GUARD):
         weights = symmetrised(fejer_weights(n, +mp.pi, mp.cos))
     return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
@@ -275,9 +275,11 @@ def hermite(n: int, derivatives: int = 1) -> Quadrature:
     >>> rule.name, rule.order, [float(w) for w in rule.derivative_weights[0]]
     ('hermite:2', 4, [0.3333333333333333, -0.3333333333333333])
     """
-    n = checked_count(n, "the number of Hermite points", 2)
-    kinds = 1 + checked_count(derivatives, "the number of derivatives of a Hermite rule", 1)
-    count = checked_count(n * kinds, "the number of values and derivatives of a Hermite rule", 4, MOST_CONDITIONS)
+    n = point_count(n, "the number of Hermite points", least=2)
+    kinds = 1 + point_count(derivatives, "the number of derivatives of a Hermite rule", least=1)
+    count = point_count(
+        n * kinds, "the number of values and derivatives of a Hermite rule", least=4, most=MOST_CONDITIONS
+    )
     points = legendre_lobatto_points(n)
     with mp.workdps(DIGITS + GUARD + 2 * count):
         rows = mp.matrix(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, differentiation_matrix, matrix_product
 from scvi_codegen.tables.nodes import to_number
@@ -128,8 +129,9 @@ class Trigonometric(CurveSpace):
         frequency = float(to_number(self.frequency))
         if not frequency > 0.0:
             raise MethodError(f"the frequency of trigonometric curves is positive, in radians a step, not {frequency}")
-        if self.harmonics is not None and (isinstance(self.harmonics, bool) or self.harmonics < 1):
-            raise MethodError(f"trigonometric curves have at least one harmonic, not {self.harmonics}")
+        if self.harmonics is not None:
+            harmonics = checked_count(self.harmonics, "the number of harmonics", least=1, error=MethodError)
+            object.__setattr__(self, "harmonics", harmonics)
         object.__setattr__(self, "frequency", frequency)
 
     @property
@@ -233,15 +235,12 @@ class Splines(CurveSpace):
     breakpoints: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.pieces, bool) or self.pieces < 1:
-            raise MethodError(f"splines have at least one piece, not {self.pieces}")
-        if self.pieces > MOST_POINTS:
-            raise MethodError(f"splines have at most {MOST_POINTS} pieces: take fewer, and more steps")
+        pieces = checked_count(self.pieces, "the number of pieces", least=1, most=MOST_POINTS, error=MethodError)
         inner = tuple(float(to_number(x)) for x in self.breakpoints)
         if any(not a < b for a, b in pairwise((0.0, *inner, 1.0))):
             raise MethodError(f"breakpoints must ascend between 0 and 1, not {', '.join(map(str, inner))}")
         object.__setattr__(self, "breakpoints", inner)
-        object.__setattr__(self, "pieces", len(inner) + 1 if inner else self.pieces)
+        object.__setattr__(self, "pieces", len(inner) + 1 if inner else pieces)
 
     @property
     def name(self) -> str:

@@ -20,7 +20,7 @@ from scvi_codegen.tables.basis import cardinal_integrals, transpose
 from scvi_codegen.tables.nodes import (
     chebyshev_gauss_points,
     chebyshev_lobatto_points,
-    checked_count,
+    point_count,
     to_number,
     to_unit,
 )
@@ -198,7 +198,7 @@ def partner_matrix(A: Sequence[Sequence[Any]], b: Sequence[Any]) -> tuple[tuple[
 
 def _stages(s: Any) -> int:
     """Refuse more stages than there may be before their points are computed."""
-    return checked_count(s, "the number of stages", 0, MOST_STAGES)
+    return point_count(s, "the number of stages", least=0, most=MOST_STAGES)
 
 
 @lru_cache(maxsize=None, typed=True)
@@ -244,14 +244,14 @@ def lobatto_iiib(s: int) -> Tableau:
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_gauss(s: int) -> Tableau:
     """Return collocation on the s Chebyshev-Gauss points: symmetric, of order s for even s and s + 1 for odd s."""
-    s = checked_count(s, "the number of Chebyshev-Gauss stages", 1, MOST_STAGES)
+    s = point_count(s, "the number of Chebyshev-Gauss stages", least=1, most=MOST_STAGES)
     return collocation_tableau(to_unit(chebyshev_gauss_points(s)), f"chebyshev-gauss:{s}")
 
 
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(s: int) -> Tableau:
     """Return collocation on the s >= 2 Chebyshev-Lobatto points: symmetric, of order s (even s) or s + 1 (odd s)."""
-    s = checked_count(s, "the number of Chebyshev-Lobatto stages", 2, MOST_STAGES)
+    s = point_count(s, "the number of Chebyshev-Lobatto stages", least=2, most=MOST_STAGES)
     return collocation_tableau(to_unit(chebyshev_lobatto_points(s)), f"chebyshev-lobatto:{s}")
 
 

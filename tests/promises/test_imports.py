@@ -19,6 +19,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors version
+    counts
     tables files
     formulas display ir
     mechanics rendering

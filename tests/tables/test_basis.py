@@ -154,7 +154,7 @@ def test_products_and_transposes() -> None:
         (lambda: cardinal_values((0, 1, 0), (0,)), "point 2 .* occurs twice"),
         (lambda: differentiation_matrix(()), "at least one point"),
         (lambda: extrapolation((0, 1), 1, 2), "degree 2 does not fit 2 points"),
-        (lambda: extrapolation((0, 1), 1, 0.5), "must be an integer"),
+        (lambda: extrapolation((0, 1), 1, 0.5), "must be a whole number"),
         (lambda: extrapolation((0, 1), 1, -1), "at least 0"),
     ],
 )

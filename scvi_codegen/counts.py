@@ -1,0 +1,30 @@
+"""The one checker of whole numbers that users give: degrees, points, steps, threads."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+from scvi_codegen.errors import ScviCodegenError, StateError
+
+__all__ = ["LARGEST_COUNT", "checked_count"]
+
+LARGEST_COUNT = 2**53 - 1
+"""Up to here a binary64 holds every whole number."""
+
+
+def checked_count(
+    value: Any, name: str, *, least: int, most: int = LARGEST_COUNT, error: type[ScviCodegenError] = StateError
+) -> int:
+    """The value as an int from ``least`` to ``most``, or an error that names it; truth values are no numbers."""
+    try:
+        count = operator.index(value)
+    except TypeError:
+        count = None
+    if count is None or isinstance(value, bool):
+        raise error(f"{name} must be a whole number, not {value!r}")
+    if count < least:
+        raise error(f"{name} must be at least {least}, not {count}")
+    if count > most:
+        raise error(f"{name} must be at most {most}, not {count}")
+    return count

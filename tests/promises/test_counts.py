@@ -1,0 +1,42 @@
+"""Whole numbers from users: one checker, one wording, whatever is counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+
+from scvi_codegen.counts import LARGEST_COUNT, checked_count
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.tables.quadrature import gauss_legendre
+
+
+@pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3), sympy.Integer(3)])
+def test_whole_numbers_of_any_kind_become_ints(value):
+    assert type(checked_count(value, "n", least=3, most=3)) is int
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 3.0, "3", None, [3]])
+def test_nothing_else_is_one(value):
+    with pytest.raises(StateError, match="n must be a whole number, not"):
+        checked_count(value, "n", least=0)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (1, "n must be at least 2, not 1"),
+        (6, "n must be at most 5, not 6"),
+        (LARGEST_COUNT + 1, "n must be at most 5, not 9007199254740992"),
+    ],
+)
+def test_what_is_out_of_range_is_named_with_the_end_it_passes(value, message):
+    with pytest.raises(MethodError, match=message):
+        checked_count(value, "n", least=2, most=5, error=MethodError)
+
+
+def test_a_degree_in_numpys_integers_is_the_same_degree():
+    assert SVI(np.int64(3)) == SVI(3)
+    assert repr(SVI(np.int64(3))) == repr(SVI(3))
+    assert gauss_legendre(np.int32(4)) == gauss_legendre(4)
