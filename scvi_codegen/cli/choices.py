@@ -6,24 +6,25 @@ import math
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_model
+from scvi_codegen.models.model_file import catalogue_model, load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = ["SOLVER_OPTION", "Choices", "model_arguments", "read_model"]
+__all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "Choices", "model_arguments", "read_model"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-INHERITED = ("degree", "quadrature", "nodes", "stages")
-"""Arguments that a method named on the command line takes over from the method of the model, if it has them."""
+METHOD_CHOICES = (
+    *("method", "degree", "stages", "order", "nodes", "quadrature", "space", "form", "variational", "abscissae"),
+)
+"""Options that say something of the method."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +50,23 @@ class Choices:
     span: float | None
     steps: int | None
     every: int | None
+
+    def sections(self) -> dict[str, dict[str, Any]]:
+        """The same as sections of a model file."""
+        named = {
+            "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
+            "method": {name: getattr(self, name) for name in METHOD_CHOICES},
+            "run": {"step": self.step, "span": self.span, "steps": self.steps, "every": self.every},
+            "parameters": dict(self.parameter),
+        }
+        given = {
+            name: {key: _plain(x) for key, x in section.items() if x is not None} for name, section in named.items()
+        }
+        return {name: section for name, section in given.items() if section}
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _numbers(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, ...] | None:
@@ -149,7 +167,7 @@ def model_arguments(command: Command, *, required: bool = True) -> Command:
 
 
 def read_model(name: str, choices: Choices) -> Model:
-    """The model of a file or of the catalogue, with the choices of the command line.
+    """The model of a file or of the catalogue, with the choices of the command line laid over it.
 
     Raises:
         click.UsageError: if choices exclude each other.
@@ -159,46 +177,12 @@ def read_model(name: str, choices: Choices) -> Model:
         raise click.UsageError("--p and --velocity exclude each other")
     if choices.span is not None and choices.steps is not None:
         raise click.UsageError("--span and --steps exclude each other")
-    model = _named_model(name)
-    changes: dict[str, Any] = {
-        "system": model.system.with_parameters(**dict(choices.parameter)) if choices.parameter else model.system,
-        "method": _chosen_method(model.method, choices),
-    }
-    direct = {"q": choices.q, "t": choices.time, "h": choices.step, "every": choices.every}
-    changes |= {field: value for field, value in direct.items() if value is not None}
-    if choices.p is not None or choices.velocity is not None:
-        changes |= {"p": choices.p, "velocity": choices.velocity}
-    if choices.span is not None or choices.steps is not None:
-        changes |= {"span": choices.span, "steps": choices.steps}
-    return replace(model, **changes)
-
-
-def _named_model(name: str) -> Model:
-
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
-        return load_model(path)
-    try:
-        return Model.from_problem(problem(name))
-    except SystemDefinitionError as error:
-        if name.partition(":")[0] in PROBLEMS:
-            raise
-        raise SystemDefinitionError(f"{error} (There is no model file '{name}', either.)") from error
-
-
-def _chosen_method(method: Method, choices: Choices) -> Method:
-    """The method of the model with what the command line changes of it."""
-    fields = ("degree", "stages", "order", "quadrature", "nodes", "space", "form", "variational", "abscissae")
-    given = {field: getattr(choices, field) for field in fields if getattr(choices, field) is not None}
-    if choices.method is None and not given:
-        return method
-    base = dict(method.specification())
-    if base.get("quadrature") == f"gauss-legendre:{base.get('degree')}":
-        del base["quadrature"]  # the default for its degree: another degree has another default
-    if choices.method is not None and choices.method != base["method"]:
-        accepted = ARGUMENTS.get(choices.method, ())
-        base = {field: value for field, value in base.items() if field in INHERITED and field in accepted}
-        base["method"] = choices.method
-    if {"abscissae", "space"} & given.keys():
-        base.pop("nodes", None)  # they say in other words where the curve is given
-    return method_from_specification(base | given)
+        return load_model(path, choices.sections())
+    if name.partition(":")[0] not in PROBLEMS:
+        try:
+            problem(name)
+        except SystemDefinitionError as error:
+            raise SystemDefinitionError(f"{error} (There is no model file '{name}', either.)") from error
+    return catalogue_model(name, choices.sections())

@@ -15,7 +15,7 @@
     q_dot = [0.0]                                       # velocities, or p = [...] for momenta, not both
     t = 0.0                                             # left out: 0
 
-    [method]
+    [method]                                            # left out: SVI(8)
     method = "svi"                                      # then its arguments: degree, quadrature, nodes, ...
     degree = 8
 
@@ -27,13 +27,17 @@
 A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
 the names ``p_q``.
 
-``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and each of
-``[initial]``, ``[method]``, ``[run]`` that is left out is the catalogue's. Files are written complete in themselves.
+``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and what
+``[initial]`` and ``[run]`` leave out is the catalogue's. Files are written complete in themselves.
+
+Sections may be laid over those of a file, as the options of a command line are: they supply what it lacks and replace
+what it says.
 '''
 
 from __future__ import annotations
 
 import os
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -47,22 +51,30 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
-from scvi_codegen.models.model import Model, check_length, real
+from scvi_codegen.models.model import DEFAULT_METHOD, Model, check_length, real
 from scvi_codegen.models.problems import Problem, problem
 
-__all__ = ["dump_model", "load_model", "parse_model", "save_model"]
+__all__ = ["catalogue_model", "dump_model", "load_model", "parse_model", "save_model"]
 
 Built = TypeVar("Built")
 Section = Mapping[str, Any]
+Document = Mapping[str, Section]
 
 SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "catalogue")
+KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": ("step", "span", "steps", "every")}
 SECTIONS = ("system", "parameters", "initial", "method", "run")
+ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"span", "steps"})
+"""One of each is given."""
+NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("step", "span")}
+"""Keys, or their alternatives, without which there is nothing to run."""
+INHERITED = ("degree", "quadrature", "nodes", "stages")
+"""Arguments that a method laid over another takes from it, if it has them."""
 SHORT_VECTOR = 4
 TEXT_WIDTH = 100
 
 
-def load_model(path: str | os.PathLike[str]) -> Model:
-    """Read a model file.
+def load_model(path: str | os.PathLike[str], given: Document | None = None) -> Model:
+    """Read a model file, with the sections ``given`` laid over its own.
 
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
@@ -74,7 +86,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     except UnicodeDecodeError as error:
         raise ModelFileError(f"{path} is not a text file in UTF-8: {error.reason} at byte {error.start}") from error
     try:
-        return parse_model(text)
+        return parse_model(text, given)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
 
@@ -89,14 +101,21 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
-def parse_model(text: str) -> Model:
+def catalogue_model(name: str, given: Document | None = None) -> Model:
+    """An entry of the catalogue, with the sections ``given`` laid over it. Raises as :func:`load_model`."""
+    return _read_model({"system": {"catalogue": name}}, given or {})
+
+
+def parse_model(text: str, given: Document | None = None) -> Model:
     """The model described by TOML text; see the module's docstring. Raises as :func:`load_model`."""
     document = read_toml(text)
     _check_keys(document, SECTIONS, "section")
     for name, content in document.items():
         if not isinstance(content, dict):
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
-    return _read_model(document)
+    for name, known in KEYS.items():
+        _check_keys(document.get(name, {}), known, "key", f"[{name}]")
+    return _read_model(document, given or {})
 
 
 def dump_model(model: Model) -> str:
@@ -125,13 +144,18 @@ def _document(model: Model) -> dict[str, Any]:
     if system.parameters:
         values = zip(system.parameters, system.defaults, strict=True)
         document["parameters"] = {parameter.name: value for parameter, value in values}
+    return {**document, **_motion(model, names)}
+
+
+def _motion(model: Model, names: Sequence[str]) -> dict[str, Any]:
+    """The sections beside the system."""
     vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
     initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
     specification = model.method.specification()
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification.items()}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
     run = {"step": model.h, **length, "every": model.every}
-    return {**document, "initial": {"t": model.t, **initial}, "method": method, "run": run}
+    return {"initial": {"t": model.t, **initial}, "method": method, "run": run}
 
 
 def _wrapped(formula: str) -> str:
@@ -145,15 +169,65 @@ def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[
     return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))
 
 
-def _read_model(document: Mapping[str, Section]) -> Model:
-    section = _section(document, "system")
-    entry = _read_catalogue(section)
-    default = Model.from_problem(entry) if entry else None
-    system = _read_system(section, document.get("parameters", {}), entry)
-    state = _read_state(document, system, default)
-    method = default.method if default and "method" not in document else _read_method(_section(document, "method"))
-    run = _read_run(document, default)
-    return Model(system=system, method=method, **state, **run)
+def _read_model(document: Document, given: Document) -> Model:
+    entry = _read_catalogue(document.get("system", {}))
+    if entry is not None:
+        names = [coordinate.name for coordinate in entry.system.coordinates]
+        document = _laid_over(_motion(Model.from_problem(entry), names), document)
+    base = document.get("method", DEFAULT_METHOD.specification())
+    document = {**_laid_over(document, given), "method": _changed_method(base, given.get("method", {}))}
+    if entry is None:
+        _check_complete(document)
+        _check_used(document["system"], given.get("parameters", {}))
+    system = _read_system(document["system"], document.get("parameters", {}), entry)
+    state = _read_state(document["initial"], system)
+    return Model(system=system, method=_read_method(document["method"]), **state, **_read_run(document["run"]))
+
+
+def _laid_over(below: Document, above: Document) -> dict[str, Section]:
+    """All sections; what one of them says above replaces what is below, and the alternatives of it."""
+    document = dict(below)
+    for name, section in above.items():
+        replaced = {key for keys in ALTERNATIVES if not keys.isdisjoint(section) for key in keys}
+        kept = {} if name == "method" else below.get(name, {})
+        document[name] = {key: value for key, value in kept.items() if key not in replaced} | dict(section)
+    return document
+
+
+def _changed_method(base: Section, given: Section) -> Section:
+    """A method with some arguments changed; another method takes over what it has in common with it."""
+    if not given:
+        return base
+    kept = dict(base)
+    if kept.get("quadrature") == f"gauss-legendre:{kept.get('degree')}":
+        del kept["quadrature"]  # the default for its degree: another degree has another default
+    name = given.get("method", kept.get("method"))
+    if name != kept.get("method"):
+        accepted = ARGUMENTS.get(name, ())
+        kept = {key: value for key, value in kept.items() if key in INHERITED and key in accepted}
+    if {"abscissae", "space"} & given.keys():
+        kept.pop("nodes", None)  # they say in other words where the curve is given
+    return {**kept, **given}
+
+
+def _check_complete(document: Document) -> None:
+    """Name all that is missing at once."""
+    missing = []
+    for name, keys in NEEDED.items():
+        for key in keys:
+            choice = next((choice for choice in ALTERNATIVES if key in choice), {key})
+            if choice.isdisjoint(document.get(name, {})):
+                missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
+    if missing:
+        raise ModelFileError(f"there is no {', no '.join(missing)}")
+
+
+def _check_used(section: Section, parameters: Section) -> None:
+    """Refuse a parameter laid over a system that knows none of that name."""
+    formula = str(section.get("lagrangian", section.get("hamiltonian")))
+    for name in parameters:
+        if name not in re.findall(r"\w+", formula):
+            raise ModelFileError(f"the system has no parameter '{name}'")
 
 
 def _read_catalogue(section: Section) -> Problem | None:
@@ -168,10 +242,7 @@ def _read_system(section: Section, parameters: Section, entry: Problem | None) -
     values = {key: real(value, f"[parameters] {key}") for key, value in parameters.items()}
     if entry is not None:
         return _in_section("[parameters]", lambda: entry.system.with_parameters(**values))
-    _check_keys(section, SYSTEM_KEYS, "key", "[system]")
-    if ("lagrangian" in section) == ("hamiltonian" in section):
-        found = "both" if "lagrangian" in section else "neither"
-        raise ModelFileError(f"[system] has {found} of lagrangian and hamiltonian: give one of them")
+    _check_one(section, "system", "lagrangian", "hamiltonian")
     name, coordinates = _text(section, "name", "[system]"), _names(section, "coordinates")
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
     if "hamiltonian" in section:
@@ -191,16 +262,9 @@ def _names(section: Section, key: str) -> list[str]:
     return names
 
 
-def _read_state(document: Mapping[str, Section], system: MechanicalSystem, default: Model | None) -> dict[str, Any]:
-    if default and "initial" not in document:
-        return {"q": default.q, "p": default.p, "velocity": default.velocity}
-    section = _section(document, "initial")
-    _check_keys(section, ("q", "p", "q_dot", "t"), "key", "[initial]")
-    if ("p" in section) == ("q_dot" in section):
-        found = "both" if "p" in section else "neither"
-        raise ModelFileError(f"[initial] has {found} of p and q_dot: give momenta p or velocities q_dot")
+def _read_state(section: Section, system: MechanicalSystem) -> dict[str, Any]:
+    _check_one(section, "initial", "p", "q_dot")
     names = [coordinate.name for coordinate in system.coordinates]
-    _required(section, "q", "[initial]")
     keys = {"q": "q", "p": "p", "q_dot": "velocity"}
     vectors = {field: _read_vector(section[key], names, key) for key, field in keys.items() if key in section}
     return {**vectors, "t": real(section.get("t", 0.0), "[initial] t")}
@@ -228,15 +292,9 @@ def _read_method(section: Section) -> Method:
     return _in_section("[method]", lambda: method_from_specification(section))
 
 
-def _read_run(document: Mapping[str, Section], default: Model | None) -> dict[str, Any]:
-    if default and "run" not in document:
-        return {"h": default.h, "span": default.span}
-    section = _section(document, "run")
-    _check_keys(section, ("step", "span", "steps", "every"), "key", "[run]")
-    if ("span" in section) == ("steps" in section):
-        found = "both" if "span" in section else "neither"
-        raise ModelFileError(f"[run] has {found} of span and steps: give a length of time or a number of steps")
-    step = real(_required(section, "step", "[run]"), "[run] step")
+def _read_run(section: Section) -> dict[str, Any]:
+    _check_one(section, "run", "span", "steps")
+    step = real(section["step"], "[run] step")
     every = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
     if "span" in section:
         return {"h": step, "span": real(section["span"], "[run] span"), "every": every}
@@ -244,10 +302,9 @@ def _read_run(document: Mapping[str, Section], default: Model | None) -> dict[st
     return {"h": step, "steps": steps, "every": every}
 
 
-def _section(document: Mapping[str, Section], name: str) -> Section:
-    if name not in document:
-        raise ModelFileError(f"the section [{name}] is missing")
-    return document[name]
+def _check_one(section: Section, name: str, one: str, other: str) -> None:
+    if one in section and other in section:
+        raise ModelFileError(f"[{name}] has both of {one} and {other}: give one of them")
 
 
 def _required(section: Section, key: str, where: str) -> Any:

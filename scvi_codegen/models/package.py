@@ -16,7 +16,7 @@ import json
 import keyword
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from string import Template
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
-__all__ = ["generate_package", "load_package"]
+__all__ = ["CERTIFICATE_FILE", "generate_package", "load_package"]
 
-INTERFACE_FILE = "interface.json"
+INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1
 OUTPUTS = 20
 
@@ -49,7 +49,9 @@ def generate_package(
     force: bool = False,
     embedded: Embedded | None = None,
 ) -> Path:
-    """Write the integrator of a model into a folder, made if it is missing; other files in it are left alone.
+    """Write the integrator of a model into a folder, made if it is missing; files of others in it are left alone.
+
+    What an older integrator left there, and the certificate of other code, is removed.
 
     Args:
         model: system, method, and the initial state and step of the example.
@@ -71,8 +73,11 @@ def generate_package(
     texts = _texts(model, prefix, solver, embedded)
     try:
         target.mkdir(parents=True, exist_ok=True)
+        stale = _stale(target, texts)
         if not force:
-            _refuse_to_lose(target, texts)
+            _refuse_to_lose(target, texts, stale)
+        for name in stale:
+            (target / name).unlink(missing_ok=True)
         for name, text in texts.items():
             write_atomically(target / name, partial(_write, text))
     except OSError as error:
@@ -233,10 +238,22 @@ def _checksum(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _refuse_to_lose(folder: Path, texts: Mapping[str, str]) -> None:
-    """Raise :class:`PackageError` if a file to be written exists and was neither written by us nor is the same."""
+def _stale(folder: Path, texts: Mapping[str, str]) -> list[str]:
+    """Files of the integrator that is there which this one has not; its certificate, unless the code is the same."""
     known = _recorded(folder)
-    for name, text in texts.items():
+    if known is None:
+        return []
+    same = all(known.get(name) == _checksum(text.encode()) for name, text in texts.items() if name != INTERFACE_FILE)
+    return [
+        *([] if same else [CERTIFICATE_FILE]),
+        *(name for name in known if name not in texts and Path(name).name == name),
+    ]
+
+
+def _refuse_to_lose(folder: Path, texts: Mapping[str, str], stale: Sequence[str]) -> None:
+    """Raise :class:`PackageError` if a file to be lost exists and was neither written by us nor is the same."""
+    known = _recorded(folder)
+    for name, text in ({name: "" for name in stale if name != CERTIFICATE_FILE} | dict(texts)).items():
         try:
             found = _checksum((folder / name).read_bytes())
         except FileNotFoundError:

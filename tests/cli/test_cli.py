@@ -149,6 +149,13 @@ class TestChoices:
     def test_methods(self, choices, method):
         assert chosen(**choices).method == method
 
+    def test_options_supply_what_a_file_lacks(self):
+        text = output_of("systems", "kepler")
+        Path("bare.toml").write_text(text[: text.index("[initial]")])
+        assert "no q in [initial], no p or q_dot in [initial], no step in [run]" in error_of("run", "bare.toml")
+        model = chosen("bare.toml", q=(1.0, 0.0), velocity=(0.0, 1.0), step=0.1, steps=2)
+        assert (model.method, model.h, model.steps, model.p) == (SVI(8), 0.1, 2, None)
+
     def test_a_chosen_quadrature_survives_another_degree(self):
         save_model(replace(chosen(), method=SVI(3, "clenshaw-curtis:7")), "a.toml")
         assert chosen("a.toml", degree=4).method == SVI(4, "clenshaw-curtis:7")
@@ -177,12 +184,12 @@ class TestChoices:
             ("kepler --span 1 --steps 1", "--span and --steps exclude each other"),
             ("kepler --method gaus", "did you mean 'gauss'?"),
             ("kepler --method gauss", "gauss needs 'stages'"),
-            ("kepler --stages 3", "svi takes no 'stages'; it takes degree, quadrature, nodes"),
+            ("kepler --stages 3", "unknown key 'stages' in [method] for svi. Known: method, degree, quadrature"),
             ("kepler --quadrature gauss-legendre", "lacks its number of points"),
             ("kepler --degree x", "'x' is not a valid integer"),
             ("kepler --q 1,a", "could not convert string to float: 'a'"),
             ("kepler --q 1", "q must have 2 numbers for (q1, q2), not 1"),
-            ("kepler --q nan,0", "q[0] (q1) is nan"),
+            ("kepler --q nan,0", "[initial] q, q1, is nan"),
             ("kepler --parameter mu", "'mu' is not of the form NAME=VALUE"),
             ("kepler --parameter mu=nan", "'mu=nan' is not of the form NAME=VALUE"),
             ("kepler --parameter nu=1", "has no parameter 'nu'"),

@@ -158,13 +158,13 @@ def test_a_catalogue_reference_may_be_changed():
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("every", "evry", "unknown key 'evry' in [run]; did you mean 'every'?"),
-        ('name = "pendulum"\n', "", "[system] lacks 'name'"),
-        ("step = 0.25\n", "", "[run] lacks 'step'"),
+        ('name = "pendulum"\n', "", "there is no name in [system]"),
+        ("step = 0.25\n", "", "there is no step in [run]"),
         ("degree = 3\n", "", "svi needs 'degree'"),
-        ("q = [0.5]\n", "", "[initial] lacks 'q'"),
-        ("q_dot = [0]\n", "", "[initial] has neither of p and q_dot"),
+        ("q = [0.5]\n", "", "there is no q in [initial]"),
+        ("q_dot = [0]\n", "", "there is no p or q_dot in [initial]"),
         ("q_dot = [0]\n", "q_dot = [0]\np = [0]\n", "[initial] has both of p and q_dot"),
-        ("span = 10\n", "", "[run] has neither of span and steps"),
+        ("span = 10\n", "", "there is no span or steps in [run]"),
         ("span = 10\n", "span = 10\nsteps = 40\n", "[run] has both of span and steps"),
         ("q = [0.5]", "q = 0.5", "[initial] q must be a list of numbers or a table"),
         ("q = [0.5]", "q = [0.5, 1]", "[initial] q must have 1 numbers for (q), not 2"),
@@ -207,11 +207,33 @@ def test_mistakes_are_named(old, new, message, tmp_path):
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_a_missing_section_is_named():
-    with pytest.raises(ModelFileError, match=r"the section \[run\] is missing"):
+def test_all_that_is_missing_is_named_at_once():
+    with pytest.raises(ModelFileError, match=r"no step in \[run\], no span or steps in \[run\]"):
         parse_model(PENDULUM[: PENDULUM.index("[run]")])
+    everything = ["name", "coordinates", "hamiltonian.or.lagrangian", "q", "p.or.q_dot", "step", "span.or.steps"]
+    with pytest.raises(ModelFileError, match=r" in \[\w+\], no ".join(everything)):
+        parse_model("")
     with pytest.raises(ModelFileError, match="must be a section"):
         parse_model("run = 3\n" + PENDULUM[: PENDULUM.index("[run]")])
+
+
+def test_without_a_method_it_is_the_default():
+    text = PENDULUM.replace('[method]\nmethod = "svi"\ndegree = 3\n', "")
+    assert text != PENDULUM
+    assert parse_model(text).method == SVI(8)
+
+
+def test_sections_laid_over_a_file_supply_and_replace():
+    system = PENDULUM[: PENDULUM.index("[initial]")]
+    given = {"initial": {"q": [0.5], "p": [0.0]}, "run": {"step": 0.1, "steps": 3}, "method": {"degree": 4}}
+    model = parse_model(system, given)
+    assert (model.q, model.p, model.h, model.steps, model.method) == ((0.5,), (0.0,), 0.1, 3, SVI(4))
+    model = parse_model(PENDULUM, {**given, "parameters": {"m": 7.0}})
+    assert (model.p, model.velocity, model.steps, model.span) == ((0.0,), None, 3, None)
+    assert model.system.defaults[0] == 7.0
+    assert (model.t, model.every) == (1.5, 4)
+    with pytest.raises(ModelFileError, match="no parameter 'nu'"):
+        parse_model(PENDULUM, {"parameters": {"nu": 1.0}})
 
 
 def test_a_faulty_formula_is_pointed_at_and_the_cause_is_kept():

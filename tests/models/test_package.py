@@ -190,6 +190,31 @@ def test_methods_that_no_file_can_hold_are_generated_without_a_model_file(pendul
     assert load_package(folder).dimension == 1
 
 
+def test_nothing_of_an_older_integrator_stays(pendulum, tmp_path):
+    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    (folder / "certificate.json").write_text("{}")
+    (folder / "notes.txt").write_text("mine")
+    generate_package(pendulum, folder)  # the same code: what was measured of it holds
+    assert (folder / "certificate.json").exists()
+    generate_package(replace(pendulum, method=SVI(2)), folder, embedded="double")
+    assert not (folder / "certificate.json").exists()
+    assert not (folder / "__init__.py").exists()
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_an_edited_file_that_would_be_stale_is_not_lost(pendulum, tmp_path):
+    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    (folder / "__init__.py").write_text("# mine\n")
+    with pytest.raises(PackageError, match=r"__init__\.py was edited"):
+        generate_package(pendulum, folder, embedded="double")
+    record = json.loads((folder / "interface.json").read_text())
+    record["files"] = {"../outside": "0"}
+    (tmp_path / "outside").write_text("not ours")
+    (folder / "interface.json").write_text(json.dumps(record))
+    generate_package(pendulum, folder, force=True)
+    assert (tmp_path / "outside").exists()
+
+
 def test_velocities_without_momenta_are_refused(tmp_path):
     model = model_of("relativistic-particle", velocity=(2.0,))
     with pytest.raises(StateError, match="no momenta"):

@@ -8,21 +8,18 @@ from typing import Any
 import click
 
 from scvi_codegen import verification
-from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.package import load_package
+from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification import Certificate
 
 __all__ = ["verify"]
 
-MODEL_FILE, CERTIFICATE = "model.toml", "certificate.json"
-METHOD_CHOICES = tuple(
-    "method degree stages order nodes quadrature space form variational abscissae".split()  # noqa: SIM905  (a line of words)
-)
+MODEL_FILE = "model.toml"
 
 
 @click.command()
@@ -84,5 +81,5 @@ def _certificate_path(name: str) -> Path | None:
     """Beside the artefact: in a generated folder, beside a model file; ``None`` for a name of the catalogue."""
     path = Path(name)
     if path.is_dir():
-        return path / CERTIFICATE
-    return path.with_suffix(f".{CERTIFICATE}") if path.is_file() else None
+        return path / CERTIFICATE_FILE
+    return path.with_suffix(f".{CERTIFICATE_FILE}") if path.is_file() else None
