@@ -8,6 +8,7 @@ all variables together, however often it occurs, which is many times quicker tha
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 from sympy import Add, Expr, Function, Mul, Pow, S, Symbol, log
 
@@ -23,7 +24,7 @@ def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
     >>> gradient(x**2 * z + z, [x, y, z])
     {0: 2*x*z, 2: x**2 + 1}
     """
-    return dict(sorted(_Accumulation(variables).of(expression).items()))
+    return dict(sorted(_accumulation(tuple(variables)).of(expression).items()))
 
 
 def jacobian(
@@ -40,7 +41,7 @@ def jacobian(
     {(0, 0): y, (0, 1): x, (1, 1): 2*y}
     """
     rows = expressions if isinstance(expressions, Mapping) else dict(enumerate(expressions))
-    accumulation = _Accumulation(variables)
+    accumulation = _accumulation(tuple(variables))
     entries = {(row, column): entry for row in rows for column, entry in accumulation.of(rows[row]).items()}
     return dict(sorted(entries.items()))
 
@@ -58,6 +59,12 @@ def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, in
     return dict(sorted((upper | lower).items()))
 
 
+@lru_cache(maxsize=4)
+def _accumulation(variables: tuple[Symbol, ...]) -> _Accumulation:
+    """What is known already: momenta, forces and masses of a system are asked for again and again."""
+    return _Accumulation(variables)
+
+
 class _Accumulation:
     """Partial derivatives of every node met so far, by index of the variable, zeros left out."""
 
@@ -67,9 +74,10 @@ class _Accumulation:
     def of(self, node: Expr) -> _Gradient:
         if not node.args:
             return self.known.get(node, {})
-        if node not in self.known:
-            self.known[node] = self.derived(node)
-        return self.known[node]
+        found = self.known.get(node)
+        if found is None:
+            found = self.known[node] = self.derived(node)
+        return found
 
     def derived(self, node: Expr) -> _Gradient:
         inner = [self.of(argument) for argument in node.args]

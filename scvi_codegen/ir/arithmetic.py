@@ -64,6 +64,7 @@ class _Graph:
         self.nodes: list[Constant | Load | tuple[str, tuple[int, ...]]] = []
         self._ids: dict[Constant | Load | tuple[str, tuple[int, ...]], int] = {}
         self._read: dict[sympy.Expr, int] = {}
+        self._constant: dict[sympy.Basic, bool] = {}
 
     def node(self, content: Constant | Load | tuple[str, tuple[int, ...]]) -> int:
         """The id of a node, new or not."""
@@ -83,10 +84,18 @@ class _Graph:
             self._read[expression] = self._build(expression)
         return self._read[expression]
 
+    def is_constant(self, expression: sympy.Basic) -> bool:
+        """Whether no symbol occurs: each part is asked once, where ``free_symbols`` walks through it every time."""
+        known = self._constant.get(expression)
+        if known is None:
+            known = not expression.is_Symbol and all(map(self.is_constant, expression.args))
+            self._constant[expression] = known
+        return known
+
     def _build(self, expression: sympy.Expr) -> int:
         if isinstance(expression, sympy.Symbol):
             return self.node(self.loads[expression])
-        if not expression.free_symbols:
+        if self.is_constant(expression):
             return self.node(Constant(_double(expression)))
         if isinstance(expression, sympy.Add):
             return self._sum(expression)
@@ -116,9 +125,12 @@ class _Graph:
     def _scaled(self, coefficient: sympy.Rational, rest: sympy.Expr) -> int:
         if rest == 1:
             return self.node(Constant(_double(coefficient)))
+        factors = sympy.Mul.make_args(rest)
         if coefficient == 1:
             return self.read(rest)
-        return self.read(sympy.Mul(coefficient, rest, evaluate=not isinstance(rest, sympy.Add)))
+        if any(map(self.is_constant, factors)):  # roots of numbers, with which the coefficient may unite
+            return self.read(sympy.Mul(coefficient, rest))
+        return self._multiplied(coefficient, factors)
 
     def _times(self, coefficient: sympy.Rational, node: int) -> int:
         if coefficient == 1:
@@ -129,11 +141,14 @@ class _Graph:
 
     def _product(self, expression: sympy.Mul) -> int:
         coefficient, rest = expression.as_coeff_Mul()
-        factors = sorted(sympy.Mul.make_args(rest), key=self._rank)
+        return self._multiplied(coefficient, sympy.Mul.make_args(rest))
+
+    def _multiplied(self, coefficient: sympy.Rational, factors: Sequence[sympy.Expr]) -> int:
+        ordered = sorted(factors, key=self._rank)
         negative = coefficient < 0
         magnitude = abs(coefficient)
         nodes = [] if magnitude == 1 else [self.node(Constant(_double(magnitude)))]
-        for factor in factors:
+        for factor in ordered:
             node = self.read(factor)
             content = self.nodes[node]
             if isinstance(content, tuple) and content[0] == "neg":
@@ -173,7 +188,7 @@ class _Graph:
 
     def _rank(self, factor: sympy.Expr) -> tuple[int, int]:
         """Numbers, parameters, composites, coordinates; among equals the order of first reading."""
-        if not factor.free_symbols:
+        if self.is_constant(factor):
             return (0, self.read(factor))
         if isinstance(factor, sympy.Symbol):
             return (1 if self.loads[factor].source == "parameters" else 3, self.read(factor))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     import sympy
 
-__all__ = ["Constant", "Expression", "Kernel", "Load", "Operation"]
+__all__ = ["Constant", "Expression", "Kernel", "Load", "Operation", "loads", "operations"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,20 +69,25 @@ class Kernel:
     @property
     def uses_arguments(self) -> bool:
         """Whether any ``u[i]`` occurs."""
-        return self._uses("u")
+        return self.uses("u")
 
     @property
     def uses_time(self) -> bool:
         """Whether ``t`` occurs."""
-        return self._uses("t")
+        return self.uses("t")
 
     @property
     def uses_parameters(self) -> bool:
         """Whether any ``parameters[i]`` occurs."""
-        return self._uses("parameters")
+        return self.uses("parameters")
 
-    def _uses(self, source: str) -> bool:
-        return any(_occurs(source, expression) for expression in (*self.temporaries, *self.results))
+    def uses(self, array: str) -> bool:
+        """Whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``slope``."""
+        if array == "value":
+            return True
+        if array == "slope":
+            return len(self.results) > self.values
+        return any(load.source == array for each in (*self.temporaries, *self.results) for load in loads(each))
 
     def operation_counts(self) -> dict[str, int]:
         """Operations by name, in alphabetical order."""
@@ -112,19 +117,25 @@ class Kernel:
         return "\n".join(lines)
 
 
+def loads(expression: Expression) -> Iterator[Load]:
+    """What an expression reads."""
+    pending = [expression]
+    while pending:
+        each = pending.pop()
+        if isinstance(each, Load):
+            yield each
+        elif isinstance(each, Operation):
+            pending.extend(each.operands)
+
+
+def operations(expression: Expression) -> int:
+    """How many operations an expression has."""
+    return 1 + sum(map(operations, expression.operands)) if isinstance(expression, Operation) else 0
+
+
 def _last_temporary(expression: Expression) -> int:
     """The largest index of a temporary in an expression, -1 without one."""
-    if isinstance(expression, Load):
-        return expression.index if expression.source == "w" else -1
-    if isinstance(expression, Operation):
-        return max((_last_temporary(operand) for operand in expression.operands), default=-1)
-    return -1
-
-
-def _occurs(source: str, expression: Expression) -> bool:
-    if isinstance(expression, Load):
-        return expression.source == source
-    return isinstance(expression, Operation) and any(_occurs(source, operand) for operand in expression.operands)
+    return max((load.index for load in loads(expression) if load.source == "w"), default=-1)
 
 
 def _count(expression: Expression, counts: dict[str, int]) -> None:

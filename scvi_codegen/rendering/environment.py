@@ -8,7 +8,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from scvi_codegen.files.templates import template_folder
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.parts import Part, parts
 from scvi_codegen.rendering.printer import (
+    ARRAYS,
     print_lane_statements,
     print_number,
     print_statements,
@@ -17,23 +19,26 @@ from scvi_codegen.rendering.printer import (
 __all__ = ["template_environment"]
 
 
-def _signature(kernel: Kernel) -> str:
-    """C parameters of a kernel: only what it uses."""
-    parts = ["const double *u"] if kernel.uses_arguments else []
-    parts += ["double t"] if kernel.uses_time else []
-    parts += ["const double *parameters"] if kernel.uses_parameters else []
-    parts += ["double *value"]
-    parts += ["double *slope"] if len(kernel.results) > kernel.values else []
-    return ", ".join(parts)
+def _signature(code: Kernel | Part) -> str:
+    """C parameters of a kernel or of a part of one: only what it uses."""
+    declared = {"u": "const double *u", "t": "double t", "parameters": "const double *parameters"}
+    declared |= {"kept": "double *restrict kept"}
+    return ", ".join(declared.get(array, f"double *{array}") for array in ARRAYS if code.uses(array))
 
 
-def _lane_signature(kernel: Kernel, sources: tuple[str, ...]) -> str:
+def _lane_signature(code: Kernel | Part, sources: tuple[str, ...]) -> str:
     """The same with vectors in place of numbers."""
-    signature = _signature(kernel).replace("const double *u", "const lanes *u").replace("double *value", "lanes *value")
-    signature = signature.replace("double *slope", "lanes *slope")
-    if "t" in sources:
-        return signature.replace("double t", "lanes t")
-    return signature.replace("const double *parameters", "const lanes *parameters")
+    vectors = ("*u", "*restrict kept", "*value", "*slope", *(("t",) if "t" in sources else ("*parameters",)))
+    signature = _signature(code)
+    for name in vectors:
+        signature = signature.replace(f"double {name}", f"lanes {name}")
+    return signature
+
+
+def _parts(kernel: Kernel) -> tuple[Part, ...]:
+    """The functions that a kernel calls, if it is cut into several."""
+    cut = parts(kernel)
+    return cut if len(cut) > 1 else ()
 
 
 def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:
@@ -73,6 +78,7 @@ def template_environment() -> Environment:
     environment.filters |= {
         "number": print_number,
         "signature": _signature,
+        "parts": _parts,
         "call_arguments": _call_arguments,
         "counts": _counts,
         "pairs": lambda entries: ", ".join(f"{{{i}, {j}}}" for i, j in entries),

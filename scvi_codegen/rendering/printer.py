@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.ir.parts import Part, kept_numbers, parts
 from scvi_codegen.ir.sweeps import Sweep
 
 __all__ = [
+    "ARRAYS",
     "constants",
     "lane_functions",
     "print_expression",
@@ -21,6 +23,9 @@ __all__ = [
 Sources: TypeAlias = tuple[str, ...]
 """Loads that differ from lane to lane: ``("u", "t")`` where lanes are points, ``("u", "parameters")`` where they are
 trajectories."""
+
+ARRAYS = ("u", "t", "parameters", "kept", "value", "slope")
+"""What a kernel and its parts may use, in the order of their arguments."""
 
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
 
@@ -62,28 +67,28 @@ def _load(load: Load) -> str:
 
 def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
     """The functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
-    vectors = _Vectors(kernel, sources)
-    return _functions(kernel, vectors.has)
+    return set().union(*(_functions(part, _Vectors(part, sources).has) for part in parts(kernel)))
 
 
 def scalar_functions(kernel: Kernel) -> set[str]:
     """All functions that occur in a kernel."""
-    return _functions(kernel, lambda expression: True)
+    return set().union(*(_functions(part, lambda expression: True) for part in parts(kernel)))
 
 
 def constants(kernel: Kernel) -> Iterator[float]:
     """The numbers written in a kernel."""
-    return (expression.value for expression in _expressions(kernel) if isinstance(expression, Constant))
+    every = (expression for part in parts(kernel) for expression in _expressions(part))
+    return (expression.value for expression in every if isinstance(expression, Constant))
 
 
-def _functions(kernel: Kernel, wanted: Callable[[Expression], bool]) -> set[str]:
-    operations = (expression for expression in _expressions(kernel) if isinstance(expression, Operation))
+def _functions(part: Part, wanted: Callable[[Expression], bool]) -> set[str]:
+    operations = (expression for expression in _expressions(part) if isinstance(expression, Operation))
     return {each.operator for each in operations if each.operator not in PRECEDENCE and wanted(each)}
 
 
-def _expressions(kernel: Kernel) -> Iterator[Expression]:
-    """Every expression of a kernel, with those it is made of."""
-    pending: list[Expression] = [*kernel.temporaries, *kernel.results]
+def _expressions(part: Part) -> Iterator[Expression]:
+    """Every expression of a part, with those it is made of."""
+    pending: list[Expression] = [expression for _, _, expression in part.statements]
     while pending:
         expression = pending.pop()
         yield expression
@@ -91,28 +96,39 @@ def _expressions(kernel: Kernel) -> Iterator[Expression]:
             pending.extend(expression.operands)
 
 
-def print_statements(kernel: Kernel) -> list[str]:
-    """The statements of a kernel of numbers."""
+def print_statements(code: Kernel | Part) -> list[str]:
+    """The statements of a kernel of numbers, or of one of its parts."""
+    cut = parts(code) if isinstance(code, Kernel) else (code,)
+    if len(cut) > 1:
+        return [f"double kept[{kept_numbers(cut)}];", *map(_call, cut)]
     return [
         f"const double w{k} = {print_expression(expression)};"
         if kind == "w"
         else f"{kind}[{k}] = {print_expression(expression)};"
-        for kind, k, expression in kernel.statements()
+        for kind, k, expression in cut[0].statements
     ]
 
 
-def print_lane_statements(kernel: Kernel, sweep: Sweep, sources: Sources) -> list[str]:
+def print_lane_statements(code: Kernel | Part, sweep: Sweep, sources: Sources) -> list[str]:
     """The same for vectors; what is the same in every lane stays a number, slopes go to their places in the mass."""
-    vectors = _Vectors(kernel, sources)
+    cut = parts(code) if isinstance(code, Kernel) else (code,)
+    if len(cut) > 1:
+        return [f"lanes kept[{kept_numbers(cut)}];", *map(_call, cut)]
+    vectors = _Vectors(cut[0], sources)
     statements = []
-    for kind, k, expression in kernel.statements():
+    for kind, k, expression in cut[0].statements:
         text, vector = _print_lanes(expression, vectors), vectors.has(expression)
         if kind == "w":
             statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
         else:
-            target = f"value[{k}]" if kind == "value" else _place_in_mass(sweep, k)
+            target = _place_in_mass(sweep, k) if kind == "slope" else f"{kind}[{k}]"
             statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")
     return statements
+
+
+def _call(part: Part) -> str:
+    """Part of a kernel, called from there; its arguments have the names of the kernel's."""
+    return f"{part.name}({', '.join(array for array in ARRAYS if part.uses(array))});"
 
 
 def _place_in_mass(sweep: Sweep, k: int) -> str:
@@ -121,12 +137,12 @@ def _place_in_mass(sweep: Sweep, k: int) -> str:
 
 
 class _Vectors:
-    """Which temporaries of a kernel differ from lane to lane."""
+    """Which temporaries of a part differ from lane to lane; what earlier parts kept are vectors."""
 
-    def __init__(self, kernel: Kernel, sources: Sources) -> None:
-        self.sources, self.temporaries = sources, set[int]()
-        for k, expression in enumerate(kernel.temporaries):
-            if self.has(expression):
+    def __init__(self, part: Part, sources: Sources) -> None:
+        self.sources, self.temporaries = (*sources, "kept"), set[int]()
+        for kind, k, expression in part.statements:
+            if kind == "w" and self.has(expression):
                 self.temporaries.add(k)
 
     def has(self, expression: Expression) -> bool:

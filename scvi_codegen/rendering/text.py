@@ -7,12 +7,13 @@ over the program's tables and the C that does not depend on it. Arithmetic arriv
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, TypeAlias, get_args
 
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.parts import parts
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
 from scvi_codegen.rendering.environment import template_environment
@@ -167,6 +168,7 @@ def render_ensemble(program: Program) -> Source | None:
     context = {
         "program": program,
         "prefix": prefix,
+        "cut": _is_cut(sweep.kernels),
         "tolerance": DEFAULT_TOLERANCE,
         "max_iterations": MAX_ITERATIONS,
         "width": ENSEMBLE_LANES,
@@ -239,6 +241,7 @@ def _context(program: Program) -> dict[str, object]:
         "program": program,
         "prefix": program.prefix,
         "kernels": program.kernels,
+        "cut": _is_cut((*_scalar_kernels(program), *(program.sweep.kernels if program.sweep else ()))),
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, _scalar_kernels(program)))),
         "legendre": program.legendre,
         "workspace": workspace_size(program),
@@ -257,6 +260,11 @@ def _context(program: Program) -> dict[str, object]:
 
 def _scalar_kernels(program: Program) -> tuple[Kernel, ...]:
     return (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
+
+
+def _is_cut(kernels: Iterable[Kernel]) -> bool:
+    """Whether one of them is several functions."""
+    return any(len(parts(kernel)) > 1 for kernel in kernels)
 
 
 def _lane_context(sweep: Sweep | None) -> dict[str, object]:

@@ -1,0 +1,165 @@
+"""Systems from two to some thousand coordinates, as the text a user writes: what compiling is measured with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise
+
+import numpy as np
+
+__all__ = ["Written", "bodies", "chain", "cloth", "kepler", "lennard_jones", "links", "post_newtonian"]
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Written:
+    """A Lagrangian as text, and a state to begin in.
+
+    Attributes:
+        name: what the system is called.
+        coordinates: their names; all momenta begin at 0.
+        lagrangian: the formula.
+        start: (m,) positions at which it is defined.
+        parameters: default value by name.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    lagrangian: str
+    start: tuple[float, ...]
+    parameters: dict[str, float] = field(default_factory=dict)
+
+
+def kepler() -> Written:
+    """The planar Kepler problem."""
+    return Written(
+        name="Kepler",
+        coordinates=("q1", "q2"),
+        lagrangian="(q1_dot**2 + q2_dot**2)/2 + mu/sqrt(q1**2 + q2**2)",
+        start=(0.5, 0.0),
+        parameters={"mu": 1.0},
+    )
+
+
+def links(n: int) -> Written:
+    """A pendulum of n unit masses, one below the other."""
+    masses = [[n - max(i, j) for j in range(n)] for i in range(n)]
+    kinetic = (f"{masses[i][j]}*cos(q{i} - q{j})*q{i}_dot*q{j}_dot/2" for i in range(n) for j in range(n))
+    return Written(
+        name=f"{n} links",
+        coordinates=tuple(f"q{i}" for i in range(n)),
+        lagrangian=_sum((*kinetic, *(f"{n - i}*g*cos(q{i})" for i in range(n)))),
+        start=tuple(0.3 + 0.1 * i for i in range(n)),
+        parameters={"g": 9.81},
+    )
+
+
+def chain(n: int) -> Written:
+    """n unit masses between walls, springs with a quartic part between them (FPUT, beta)."""
+    names = tuple(f"q{i}" for i in range(1, n + 1))
+    stretched = [f"({b} - {a})" for a, b in pairwise(("0", *names, "0"))]
+    return Written(
+        name=f"chain of {n}",
+        coordinates=names,
+        lagrangian=_sum((*(f"{q}_dot**2/2" for q in names), *(f"-{s}**2/2 - beta*{s}**4/4" for s in stretched))),
+        start=tuple(float(x) for x in np.sin(np.pi * np.arange(1, n + 1) / (n + 1))),
+        parameters={"beta": 0.3},
+    )
+
+
+def bodies(n: int) -> Written:
+    """n bodies in space under their gravity."""
+    names = [f"b{i}" for i in range(n)]
+    return Written(
+        name=f"{n} bodies",
+        coordinates=_cartesian(names),
+        lagrangian=_sum(
+            (
+                *(f"m_{a}*{_square(a)}/2" for a in names),
+                *(f"m_{a}*m_{b}/{_distance(a, b)}" for a, b in combinations(names, 2)),
+            )
+        ),
+        start=_grid(n),
+        parameters={f"m_{a}": 1.0 / (1.0 + i) for i, a in enumerate(names)},
+    )
+
+
+def lennard_jones(n: int) -> Written:
+    """n atoms in space."""
+    names = [f"a{i}" for i in range(n)]
+    pairs = (
+        f"4*epsilon*((sigma/{_distance(a, b)})**6 - (sigma/{_distance(a, b)})**12)" for a, b in combinations(names, 2)
+    )
+    return Written(
+        name=f"Lennard-Jones {n}",
+        coordinates=_cartesian(names),
+        lagrangian=_sum((*(f"mass*{_square(a)}/2" for a in names), *pairs)),
+        start=_grid(n),
+        parameters={"mass": 1.0, "epsilon": 1.0, "sigma": 1.0},
+    )
+
+
+def cloth(n: int) -> Written:
+    """n by n unit masses in space, with springs of length 1 along the threads, hung into gravity."""
+    names = [f"p{i}_{j}" for i in range(n) for j in range(n)]
+    threads = [(i * n + j, i * n + j + 1) for i in range(n) for j in range(n - 1)]
+    threads += [(i * n + j, (i + 1) * n + j) for i in range(n - 1) for j in range(n)]
+    springs = (f"-k*({_distance(names[a], names[b])} - 1)**2/2" for a, b in threads)
+    return Written(
+        name=f"cloth {n} x {n}",
+        coordinates=_cartesian(names),
+        lagrangian=_sum((*(f"{_square(a)}/2 - g*{a}_z" for a in names), *springs)),
+        start=tuple(float(x) for i in range(n) for j in range(n) for x in (1.1 * i, 1.1 * j, 0.01 * i * j)),
+        parameters={"k": 100.0, "g": 9.81},
+    )
+
+
+def post_newtonian(n: int) -> Written:
+    """n point masses with the first relativistic corrections (Einstein, Infeld, Hoffmann)."""
+    names = [f"b{i}" for i in range(n)]
+    kinetic = [f"m_{a}*({_square(a)}/2 + {_square(a)}**2/(8*c2))" for a in names]
+    squared = (
+        f"-m_{a}*({_sum(f'm_{b}/{_distance(a, b)}' for b in names if b != a)})**2/(2*c2)"
+        for a in names
+    )  # fmt: skip
+    return Written(
+        name=f"post-Newtonian {n}",
+        coordinates=_cartesian(names),
+        lagrangian=_sum((*kinetic, *(_relativistic_pair(a, b) for a, b in combinations(names, 2)), *squared)),
+        start=_grid(n),
+        parameters={f"m_{a}": 1.0 / (1.0 + i) for i, a in enumerate(names)} | {"c2": 1e4},
+    )
+
+
+def _relativistic_pair(a: str, b: str) -> str:
+    product = "(" + " + ".join(f"{a}_{x}_dot*{b}_{x}_dot" for x in AXES) + ")"
+    along = ["(" + " + ".join(f"({a}_{x} - {b}_{x})*{c}_{x}_dot" for x in AXES) + ")" for c in (a, b)]
+    r = _distance(a, b)
+    correction = f"3*({_square(a)} + {_square(b)}) - 7*{product} - {along[0]}*{along[1]}/{r}**2"
+    return f"m_{a}*m_{b}/{r}*(1 + ({correction})/(2*c2))"
+
+
+def _sum(terms: Iterable[str]) -> str:
+    return " + ".join(terms)
+
+
+def _cartesian(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{name}_{x}" for name in names for x in AXES)
+
+
+def _square(a: str) -> str:
+    """The square of a speed."""
+    return "(" + " + ".join(f"{a}_{x}_dot**2" for x in AXES) + ")"
+
+
+def _distance(a: str, b: str) -> str:
+    return "sqrt(" + " + ".join(f"({a}_{x} - {b}_{x})**2" for x in AXES) + ")"
+
+
+def _grid(n: int) -> tuple[float, ...]:
+    """n places in space, at least 1.2 apart, not quite regular."""
+    side = int(np.ceil(n ** (1 / 3)))
+    places = np.array([(i, j, k) for i in range(side) for j in range(side) for k in range(side)][:n])
+    return tuple(float(x) for x in (1.3 * places + 0.04 * np.sin(1.0 + 5.0 * np.arange(3 * n).reshape(n, 3))).ravel())
