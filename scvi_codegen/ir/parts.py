@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
 
 from scvi_codegen.ir.kernel import Expression, Kernel, Load, Operation, loads, operations
@@ -47,6 +48,7 @@ def kept_numbers(cut: Sequence[Part]) -> int:
     return 1 + max((index for part in cut for kind, index, _ in part.statements if kind == "kept"), default=-1)
 
 
+@lru_cache(maxsize=32)
 def parts(kernel: Kernel) -> tuple[Part, ...]:
     """The kernel in pieces of about equal size; one, if it is short enough."""
     pieces = list(_pieces(tuple(kernel.statements())))

@@ -93,15 +93,27 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
 
 def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:
     """Non-zero slopes, grouped by scatter and gather."""
+    entries = _slopes(family)
     slopes: list[sympy.Expr] = []
     blocks = []
     for s, scatter in enumerate(family.scatters):
+        top = sum(len(other.results) for other in family.scatters[:s])
         for g, gather in enumerate(family.gathers):
-            entries = jacobian(scatter.results, gather.arguments)
-            if entries:
-                blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=tuple(entries)))
-                slopes.extend(entries.values())
+            left = sum(len(other.arguments) for other in family.gathers[:g])
+            places = [(i, j) for i in range(len(scatter.results)) for j in range(len(gather.arguments))]
+            found = [(i, j) for i, j in places if (top + i, left + j) in entries]
+            if found:
+                blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=tuple(found)))
+                slopes.extend(entries[top + i, left + j] for i, j in found)
     return tuple(slopes), tuple(blocks)
+
+
+def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
+    """Non-zero derivatives of results by arguments; where the results are a gradient, one for both of a pair."""
+    entries = jacobian(family.results, family.arguments)
+    if family.scalar is None:
+        return entries
+    return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
 
 
 def _gather_loop(family: PointFamily, index: int) -> GatherLoop:
