@@ -57,7 +57,7 @@ def links(n: int) -> Written:
 
 
 def chain(n: int) -> Written:
-    """n unit masses between walls, springs with a quartic part between them (FPUT, beta)."""
+    """A chain of n unit masses between walls, springs with a quartic part between them (FPUT, beta)."""
     names = tuple(f"q{i}" for i in range(1, n + 1))
     stretched = [f"({b} - {a})" for a, b in pairwise(("0", *names, "0"))]
     return Written(
@@ -70,7 +70,7 @@ def chain(n: int) -> Written:
 
 
 def bodies(n: int) -> Written:
-    """n bodies in space under their gravity."""
+    """Bodies in space under their gravity."""
     names = [f"b{i}" for i in range(n)]
     return Written(
         name=f"{n} bodies",
@@ -87,7 +87,7 @@ def bodies(n: int) -> Written:
 
 
 def lennard_jones(n: int) -> Written:
-    """n atoms in space."""
+    """Atoms in space."""
     names = [f"a{i}" for i in range(n)]
     pairs = (
         f"4*epsilon*((sigma/{_distance(a, b)})**6 - (sigma/{_distance(a, b)})**12)" for a, b in combinations(names, 2)
@@ -102,7 +102,7 @@ def lennard_jones(n: int) -> Written:
 
 
 def cloth(n: int) -> Written:
-    """n by n unit masses in space, with springs of length 1 along the threads, hung into gravity."""
+    """Unit masses in space, n by n, with springs of length 1 along the threads, hung into gravity."""
     names = [f"p{i}_{j}" for i in range(n) for j in range(n)]
     threads = [(i * n + j, i * n + j + 1) for i in range(n) for j in range(n - 1)]
     threads += [(i * n + j, (i + 1) * n + j) for i in range(n - 1) for j in range(n)]
@@ -117,7 +117,7 @@ def cloth(n: int) -> Written:
 
 
 def post_newtonian(n: int) -> Written:
-    """n point masses with the first relativistic corrections (Einstein, Infeld, Hoffmann)."""
+    """Point masses with the first relativistic corrections (Einstein, Infeld, Hoffmann)."""
     names = [f"b{i}" for i in range(n)]
     kinetic = [f"m_{a}*({_square(a)}/2 + {_square(a)}**2/(8*c2))" for a in names]
     squared = (
@@ -159,7 +159,7 @@ def _distance(a: str, b: str) -> str:
 
 
 def _grid(n: int) -> tuple[float, ...]:
-    """n places in space, at least 1.2 apart, not quite regular."""
+    """Places in space, at least 1.2 apart, not quite regular."""
     side = int(np.ceil(n ** (1 / 3)))
     places = np.array([(i, j, k) for i in range(side) for j in range(side) for k in range(side)][:n])
     return tuple(float(x) for x in (1.3 * places + 0.04 * np.sin(1.0 + 5.0 * np.arange(3 * n).reshape(n, 3))).ravel())
