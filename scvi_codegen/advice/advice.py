@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.advice.pilot import STEEP, Pilot, launch
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -84,6 +85,20 @@ class Advice:
     evidence: tuple[Evidence, ...]
     message: str
     warnings: tuple[str, ...]
+
+    def _repr_html_(self) -> str:
+        facts = [
+            ("step", plain(f"h = {self.h:.6g}, {self.steps} of them")),
+            ("expected error", plain(f"{self.expected_error:.1e}")),
+            *(("warning", plain(warning)) for warning in self.warnings),
+        ]
+        rows = [
+            (plain(f"{h:.4g}"), plain(f"{error:.1e}"), plain(f"{iterations:.1f}"), plain(f"{seconds:.2e}"))
+            for h, error, iterations, seconds in self.evidence
+        ]
+        head = ("h", "error at the end", "iterations a step", "seconds a unit of time")
+        pilots = grid(rows, head=head, caption="What pilot runs found") if rows else Html("")
+        return card(f"Advice: {self.method.title}", facts, pilots)
 
 
 def advise(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.systems import (
@@ -53,6 +54,16 @@ class Problem:
     step: float
     span: float
     reference: str
+
+    def _repr_html_(self) -> str:
+        state = [("q", self.q), ("velocity", self.velocity), ("p", self.p)]
+        facts = (
+            ("name", plain(self.name)),
+            *((name, listed([f"{x:g}" for x in numbers])) for name, numbers in state if numbers is not None),
+            ("step, span", plain(f"{self.step:g}, {self.span:g}")),
+            ("described in", plain(self.reference)),
+        )
+        return card(self.title, facts, Html(self.system._repr_html_()))
 
     def __post_init__(self) -> None:
         given = [part for part in (self.velocity, self.p) if part is not None]

@@ -12,6 +12,7 @@ from enum import StrEnum
 from functools import partial
 from typing import IO, Any, NamedTuple
 
+from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.files.atomic import write_atomically
 
@@ -148,13 +149,27 @@ class Certificate:
     def _with(self, outcome: Outcome) -> tuple[Check, ...]:
         return tuple(check for check in self.checks if check.outcome is outcome)
 
-    def to_text(self) -> str:
-        """A line a check, and the verdict."""
+    @property
+    def verdict(self) -> str:
+        """Whether promises are kept, and how many."""
         counts = Counter(check.outcome for check in self.checks)
         verdict = "every promise measured is kept" if self.passed else "PROMISES ARE BROKEN"
         numbers = ", ".join(f"{counts[outcome]} {outcome.value}" for outcome in Outcome if counts[outcome])
+        return f"{verdict}: {numbers}"
+
+    def to_text(self) -> str:
+        """A line a check, and the verdict."""
         head = [self.title, f"C source sha256 {self.checksum}", f"flags {' '.join(self.flags)}; step {self.h:g}", ""]
-        return "\n".join([*head, *map(str, self.checks), "", f"{verdict}: {numbers}; {self.seconds:.1f} s"]) + "\n"
+        return "\n".join([*head, *map(str, self.checks), "", f"{self.verdict}; {self.seconds:.1f} s"]) + "\n"
+
+    def _repr_html_(self) -> str:
+        facts = (
+            ("verdict", plain(self.verdict)),
+            ("C source", plain(f"sha256 {self.checksum}")),
+            ("step", plain(f"{self.h:g}")),
+        )
+        head = ("", "outcome", "measured", "bound", "promise")
+        return card(self.title, facts, grid(map(_row, self.checks), head=head))
 
     def to_json(self) -> str:
         """All of it, for programs; numbers that are not finite are strings."""
@@ -163,6 +178,16 @@ class Certificate:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the JSON, whole or not at all."""
         write_atomically(path, partial(_write, self.to_json()))
+
+
+def _row(check: Check) -> tuple[Html, ...]:
+    """Of the table in a notebook; what is broken stands out."""
+    outcome = plain(check.outcome.value)
+    if check.outcome is Outcome.BROKEN:
+        outcome = Html(f"<strong>{outcome}</strong>")
+    numbers = ["" if number is None else f"{number:.3g}" for number in (check.measured, check.bound)]
+    words = "; ".join(filter(None, (check.promise, check.remark)))
+    return plain(check.name), outcome, *map(plain, numbers), plain(words)
 
 
 def _write(text: str, file: IO[bytes]) -> None:

@@ -15,6 +15,7 @@ from samples import compile_quickly
 
 import scvi_codegen as sc
 from scvi_codegen.display.cards import card, listed, plain, sparkline
+from scvi_codegen.verification.certificate import Check, Outcome
 
 METHODS = [
     sc.SVI(3),
@@ -33,10 +34,43 @@ METHODS = [
 
 
 @cache
+def falling() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
+        name="falling", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - g*y", parameters={"g": 9.81}
+    )
+
+
+@cache
 def trajectory() -> sc.Trajectory:
     kepler = sc.problem("kepler")
     stepper = compile_quickly(kepler.system, sc.SVI(2))
     return stepper.integrate(kepler.q, stepper.momentum(kepler.q, kepler.velocity), h=0.1, steps=1000)
+
+
+@cache
+def advice() -> sc.Advice:
+    kepler = sc.problem("kepler")
+    return sc.advise(kepler.system, sc.StoermerVerlet(), kepler.q, [0.0, 1.7], 5.0, 1e-3)
+
+
+def certificate(outcome: Outcome = Outcome.KEPT) -> sc.Certificate:
+    check = Check(name="order", promise="it is <4>", outcome=outcome, measured=3.98, bound=3.7, remark="from 4 steps")
+    unknown = Check(name="drift", promise="none", outcome=Outcome.NOT_MEASURED, remark="no symmetry")
+    return sc.Certificate(
+        title="Kepler problem by SVI",
+        system="Kepler problem",
+        method="svi-2",
+        version="0",
+        checksum="ab" * 32,
+        flags=("-O3",),
+        q=(0.5, 0.0),
+        p=(0.0, 1.7),
+        t=0.0,
+        h=0.1,
+        parameters={"mu": 1.0},
+        checks=(check, unknown),
+        seconds=1.0,
+    )
 
 
 DISPLAYED: dict[str, Callable[[], Any]] = {
@@ -47,6 +81,10 @@ DISPLAYED: dict[str, Callable[[], Any]] = {
     "radicals": lambda: sc.derive(sc.problem("kepler").system, sc.SCVI(2), radicals=True),
     "stepper": lambda: trajectory().stepper,
     "trajectory": trajectory,
+    "problem": lambda: sc.problem("kepler"),
+    "certificate": certificate,
+    "advice": advice,
+    "symmetry": lambda: sc.symmetries(falling())[-1],
 } | {method.name: lambda method=method: method for method in METHODS}
 
 
@@ -143,6 +181,41 @@ class TestTrajectory:
             stepper=run.stepper,
         )
         assert 'aria-label="energy"' not in broken._repr_html_()
+
+
+class TestSymmetry:
+    def test_direction_gauge_and_what_is_conserved(self):
+        boost = sc.symmetries(falling())[-1]
+        assert boost.name == "boost of y"
+        shown = boost._repr_html_()
+        assert "Symmetry: boost of y" in shown
+        assert all(word in shown for word in ("conserves", "direction", "gauge"))
+
+    def test_a_direction_that_leaves_a_coordinate_does_not_list_it(self):
+        first = sc.symmetries(falling())[0]
+        assert first.name == "momentum of x"
+        assert "<mi>y</mi>" not in first._repr_html_()
+
+
+class TestOutcomes:
+    def test_a_certificate_shows_its_checks_and_what_is_broken(self):
+        kept, broken = certificate()._repr_html_(), certificate(Outcome.BROKEN)._repr_html_()
+        assert "every promise measured is kept: 1 kept, 1 not measured" in kept
+        assert "<strong>" not in kept
+        assert "<strong>BROKEN</strong>" in broken
+        assert "it is &lt;4&gt;; from 4 steps" in kept
+        assert kept.count("3.98") == kept.count("3.7<") == 1
+
+    def test_advice_shows_the_step_and_its_evidence(self):
+        shown = advice()._repr_html_()
+        assert f"h = {advice().h:.6g}, {advice().steps} of them" in shown
+        assert shown.count('<th scope="row"') == 2 + len(advice().warnings) + len(advice().evidence)
+
+    def test_a_problem_shows_its_state_and_its_system(self):
+        kepler = sc.problem("kepler")
+        shown = kepler._repr_html_()
+        assert kepler.system._repr_html_() in shown
+        assert kepler.reference in shown
 
 
 def test_a_sparkline_goes_from_bottom_to_top_and_leaves_out_what_is_not_finite():

@@ -25,6 +25,8 @@ from functools import lru_cache
 import sympy
 from sympy import Expr, Symbol
 
+from scvi_codegen.display.cards import Html, card
+from scvi_codegen.display.mathml import mathml
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
@@ -50,6 +52,10 @@ __all__ = ["Symmetry", "all_symmetries", "check_symmetry", "symmetries"]
 
 MOST_COORDINATES = 12
 LONGEST_SHOWN = 300
+
+
+MOST_SHOWN = 12
+"""Components of a direction that a notebook shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +91,13 @@ class Symmetry:
         variables = (*self.coordinates, *self.momenta, self.time)
         texts = [_term_text(x, [variables[i] ** power for i, power in powers.items()]) for x, powers in terms]
         return " + ".join(texts).replace("+ -", "- ")
+
+    def _repr_html_(self) -> str:
+        moved = zip(self.coordinates, self.direction, strict=True)
+        changes = [f"{mathml(Symbol('delta'))}{mathml(q)} = {mathml(xi)}" for q, xi in moved if xi != 0]
+        facts = [("conserves", Html(mathml(self.momentum_map))), ("direction", Html("; ".join(changes[:MOST_SHOWN])))]
+        facts += [("gauge", Html(mathml(self.gauge)))] if self.gauge != 0 else []
+        return card(f"Symmetry: {self.name}", facts)
 
     def degrees(self) -> set[tuple[int, int, int]] | None:
         """Degrees in (t, q, p) of the terms of the momentum map, ``None`` if it is not a polynomial."""
