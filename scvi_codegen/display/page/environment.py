@@ -16,6 +16,16 @@ from scvi_codegen.files.templates import template_folder
 
 __all__ = ["page_template", "style_sheet"]
 
+KINDS = {
+    "paragraph": blocks.Paragraph,
+    "formula": blocks.Formula,
+    "listing": blocks.Listing,
+    "code": blocks.Code,
+    "drawing": blocks.Drawing,
+    "beside": blocks.Beside,
+    "table": blocks.TableBlock,
+}
+"""What templates ask of a block."""
 COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
 
@@ -52,8 +62,7 @@ def _environment() -> Environment:
         "c_text": _c_text,
         "markup": Markup,
     }
-    kinds = ("Paragraph", "Formula", "Listing", "Code", "Drawing", "Beside", "Table")
-    environment.tests |= {kind.lower(): _is_a(getattr(blocks, kind)) for kind in kinds}
+    environment.tests |= {name: _is_a(kind) for name, kind in KINDS.items()}
     return environment
 
 
