@@ -8,8 +8,10 @@ differences.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -61,6 +63,10 @@ class DerivedStep:
             None if family.scalar is None else Tape([family.scalar], own)
             for family, own in zip(stages.families, symbols, strict=True)
         ]
+        self.blocks = _slices(stages.block_sizes(system.dimension))
+        self.rows = _slices(stages.row_sizes(system.dimension))
+        self.arguments = [_slices([len(gather.arguments) for gather in family.gathers]) for family in stages.families]
+        self.results = [_slices([len(scatter.results) for scatter in family.scatters]) for family in stages.families]
         self.powers = [row.power for row in stages.rows] + [0]
         self.momenta = numbers([*(row.momentum for row in stages.rows), stages.end_momentum])
         self.gathers = [[numbers(gather.table.entries) for gather in family.gathers] for family in stages.families]
@@ -69,7 +75,7 @@ class DerivedStep:
     @property
     def unknowns(self) -> int:
         """How many numbers a step is solved for."""
-        return len(self.stages.blocks) * self.system.dimension
+        return int(self.blocks[-1].stop)
 
     def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """The step from (q, p) at t to t + h; numbers are taken as they are given, so 0.1 is the double.
@@ -83,10 +89,10 @@ class DerivedStep:
         for _ in range(MOST_ITERATIONS):
             if matrix is None:
                 matrix = self._inverse(self._exact_matrix(z, known), known)
-            change = self._solved(matrix, rows[:-1])
-            size = max(map(abs, change.ravel()))
+            change = matrix @ rows[: self.unknowns]
+            size = max(map(abs, change))
             z, rows, whole = self._moved(z, change, known)
-            if whole and size <= mp.eps**0.75 * max(1, *map(abs, z.ravel())):
+            if whole and size <= mp.eps**0.75 * max(1, *map(abs, z)):
                 return self._end(z, rows, known)
             if size > STEADY * last:
                 matrix = None
@@ -107,30 +113,29 @@ class DerivedStep:
         """What one update of Newton's iteration makes of the straight line, the matrix from finite differences."""
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
         z = self._straight(known)
-        matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[:-1]
+        matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[: self.unknowns]
         inverse = self._inverse(matrix, known)
-        update = self._solved(inverse, rows)
+        update = inverse @ rows
         for _ in range(REFINEMENTS):
-            update = update + self._solved(inverse, rows - (matrix @ update.ravel()).reshape(rows.shape))
+            update = update + inverse @ (rows - matrix @ update)
         z = z - update
         return self._end(z, self._rows(z, known), known)
 
     def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
-        """(m,) and (blocks, m) derivatives of the generating function by q0 and the unknowns, by central differences.
+        """(m,) and (unknowns,) derivatives of the generating function by q0 and the unknowns, by central differences.
 
         ``None`` where a family of points has no scalar.
         """
         if None in self.scalars:
             return None
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
-        z = np.array(solved.unknowns, dtype=object).reshape(len(self.stages.blocks), -1)
-        joined = np.concatenate([known.q[None], z])
+        joined, m = np.array([*known.q, *solved.unknowns], dtype=object), self.system.dimension
 
         def action(values: Numbers) -> Number:
-            return self._action(values[1:], _Known(values[0], known.p, known.h, known.t))
+            return self._action(values[m:], _Known(values[:m], known.p, known.h, known.t))
 
         slopes = np.empty_like(joined)
-        for place in np.ndindex(joined.shape):
+        for place in range(len(joined)):
             width = mp.mpf(10) ** -18 * max(1, abs(joined[place]))
             ends = []
             for sign in (1, -1):
@@ -138,7 +143,7 @@ class DerivedStep:
                 moved[place] += sign * width
                 ends.append(action(moved))
             slopes[place] = (ends[0] - ends[1]) / (2 * width)
-        return slopes[0], slopes[1:]
+        return slopes[:m], slopes[m:]
 
     def _action(self, z: Numbers, known: _Known) -> Number:
         total = mp.zero
@@ -154,27 +159,33 @@ class DerivedStep:
         return total
 
     def _straight(self, known: _Known) -> Numbers:
-        """(blocks, m): the straight line with the velocity of the initial state."""
+        """(unknowns,): the straight line with the velocity of the initial state, 0 for blocks of other sizes."""
         v = self.motion.velocity(known.q, known.p, known.t)
-        return np.array(
+        return np.concatenate(
             [
                 known.q * block.straight[0]
                 + v * (block.straight[1] * known.h ** (1 - block.power))
                 + known.p * block.momentum
+                if block.size is None
+                else numbers([0] * block.size)
                 for block in self.stages.blocks
-            ],
-            dtype=object,
+            ]
         )
 
     def _arguments(self, f: int, z: Numbers, known: _Known) -> Numbers:
         """(points, arguments) of the kernel of a family."""
-        powers = np.array([known.h**block.power for block in self.stages.blocks], dtype=object)
-        columns = np.concatenate([known.q[None], powers[:, None] * z])
         parts = []
         for gather, table in zip(self.stages.families[f].gathers, self.gathers[f], strict=True):
             factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
-            parts.append((table @ columns) * factor)
+            parts.append(np.array([self._gathered(line, len(gather.arguments), z, known) * factor for line in table]))
         return np.concatenate(parts, axis=1)
+
+    def _gathered(self, line: Numbers, size: int, z: Numbers, known: _Known) -> Numbers:
+        """(size,) sum of q0 and the blocks with the coefficients of a line of a table."""
+        total = known.q * line[0] if line[0] else numbers([0] * size)
+        for b in np.flatnonzero(line[1:]):
+            total = total + z[self.blocks[b]] * (line[b + 1] * known.h ** self.stages.blocks[b].power)
+        return total
 
     def _point(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> list[Number]:
         return [*arguments, known.t + family.abscissae[n] * known.h, *self.motion.parameters]
@@ -188,23 +199,25 @@ class DerivedStep:
         return scale * family.weights[n] * known.h ** (scatter.power + self.powers[r])
 
     def _rows(self, z: Numbers, known: _Known) -> Numbers:
-        """(blocks + 1, m): the equations, and p1."""
-        rows = self.momenta[:, None] * known.p[None]
+        """The equations, and p1."""
         m = self.system.dimension
+        starts = [
+            known.p * x if own.stop - own.start == m else numbers([0] * (own.stop - own.start))
+            for own, x in zip(self.rows, self.momenta, strict=True)
+        ]
+        rows = np.concatenate(starts)
         for f, family in enumerate(self.stages.families):
             arguments = self._arguments(f, z, known)
             for n in range(len(family.abscissae)):
                 values = self._kernel(f, n, arguments[n], known)
-                for s, table in enumerate(self.scatters[f]):
-                    own = values[s * m : (s + 1) * m]
+                for s, (table, results) in enumerate(zip(self.scatters[f], self.results[f], strict=True)):
                     for r in np.flatnonzero(table[n]):
-                        rows[r] = rows[r] + own * (self._factor(family, s, n, r, known) * table[n, r])
+                        rows[self.rows[r]] += values[results] * (self._factor(family, s, n, r, known) * table[n, r])
         return rows
 
     def _exact_matrix(self, z: Numbers, known: _Known) -> Numbers:
         """Derivatives of the rows by the unknowns, those of the kernels by differences."""
-        blocks, m = len(self.stages.blocks), self.system.dimension
-        matrix = numbers(np.zeros((blocks, m, blocks, m)))
+        matrix = numbers(np.zeros((self.unknowns, self.unknowns)))
         powers = [known.h**block.power for block in self.stages.blocks]
         for f, family in enumerate(self.stages.families):
             arguments = self._arguments(f, z, known)
@@ -212,14 +225,14 @@ class DerivedStep:
                 slopes = self._kernel_slopes(f, n, arguments[n], known)
                 for s, rows in enumerate(self.scatters[f]):
                     for g, gather in enumerate(family.gathers):
-                        own = slopes[s * m : (s + 1) * m, g * m : (g + 1) * m]
+                        own = slopes[self.results[f][s], self.arguments[f][g]]
                         moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
                         for r in np.flatnonzero(rows[n, :-1]):
                             factor = self._factor(family, s, n, r, known) * rows[n, r] * moved
                             for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
                                 entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
-                                matrix[r, :, b, :] += own * entry
-        return matrix.reshape(blocks * m, blocks * m)
+                                matrix[self.rows[r], self.blocks[b]] += own * entry
+        return matrix
 
     def _kernel_slopes(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
         values = self._kernel(f, n, arguments, known)
@@ -242,15 +255,14 @@ class DerivedStep:
         result: Numbers = columns[:, None] * inverse * rows
         return result
 
-    def _solved(self, inverse: Numbers, rows: Numbers) -> Numbers:
-        update: Numbers = (inverse @ rows.ravel()).reshape(rows.shape)
-        return update
-
     def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
-        powers = np.array([known.h**block.power for block in self.stages.blocks], dtype=object)
-        row = numbers(self.stages.end_position.entries[0])
-        q = row @ np.concatenate([known.q[None], powers[:, None] * z])
-        return SolvedStep(unknowns=tuple(z.ravel()), q=tuple(q), p=tuple(rows[-1]))
+        q = self._gathered(numbers(self.stages.end_position.entries[0]), self.system.dimension, z, known)
+        return SolvedStep(unknowns=tuple(z), q=tuple(q), p=tuple(rows[self.rows[-1]]))
+
+
+def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
+    """Where parts of these sizes stand, one after the other."""
+    return tuple(slice(end - size, end) for size, end in zip(sizes, accumulate(sizes), strict=True))
 
 
 @lru_cache(maxsize=64)

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 
 import sympy
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import MomentumMap, Program
@@ -58,6 +59,9 @@ def lower(
         (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`). newton: whether Newton's iteration is emitted;
         with it the discrete Legendre transforms. symmetries: whose momentum maps are emitted.
     """
+    m = system.dimension
+    if {*stages.block_sizes(m), *stages.row_sizes(m)} != {m}:
+        raise MethodError(f"{method.name} has blocks of other sizes than {m}: they are not compiled yet")
     mass = forms_of(system).legendre_slopes
     families = tuple(lowered_family(system, family) for family in stages.families)
     met = [*mass, *_meetings(families if newton else ())]

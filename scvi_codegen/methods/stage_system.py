@@ -1,11 +1,12 @@
 """The shape every method shares: points on the step, a small symbolic kernel at each, and tables of numbers between.
 
-A step from (t, q0, p0) with step size h has unknown *blocks* z_1 .. z_B of m components each. At point n of a *family*
+A step from (t, q0, p0) with step size h has unknown *blocks* z_1 .. z_B, of m components each unless they say otherwise
+(multipliers of constraints). At point n of a *family*
 (quadrature points, collocation nodes, the start, the end) the arguments of a kernel are *gathered* from the unknowns,
 
     u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b),                       t_n = t + c_n h,
 
-the kernel phi (m results in the arguments, time and parameters) is evaluated, its results are *scattered* into rows,
+the kernel phi (results in the arguments, time and parameters) is evaluated, its results are *scattered* into rows,
 
     R_r = (momentum coefficient) p0 + sum_families sum_n scale w_n h^(power + power of r) S_nr phi(u_n) = 0,
 
@@ -97,7 +98,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """m unknowns of one kind: ``Q_1`` (position, power 0), ``V_3`` (velocity, power 1), ``lambda_2``, ``v_0``.
+    """Unknowns of one kind: ``Q_1`` (position, power 0), ``V_3`` (velocity, power 1), ``lambda_2``, ``v_0``.
 
     Attributes:
         name: its symbol in displayed equations.
@@ -105,6 +106,8 @@ class Block:
         straight: (a, b) of the straight-line guess z = a q0 + b h^(1 - power) v0.
         momentum: coefficient of p0 in that guess.
         moves: whether it is measured in positions, once multiplied by h^power; momenta and their multipliers are not.
+        size: how many components it has; ``None``: m. Other blocks than of m components begin with 0, and q1 does not
+            depend on them.
     """
 
     name: str
@@ -112,21 +115,29 @@ class Block:
     straight: tuple[Number, Number]
     momentum: int = 0
     moves: bool = True
+    size: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """m equations: their number in the paper, kind (``"stage"`` or ``"IDEL"``), coefficient of p0, extra power of h."""
+    """Equations: their number in the paper, kind (``"stage"``, ``"IDEL"``), coefficient of p0, extra power of h, size.
+
+    ``size`` is how many they are, m unless it is said; then p0 does not occur in them.
+    """
 
     number: str
     kind: str
     momentum: Number
     power: int = 0
+    size: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gather:
-    """m kernel arguments u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b); column 0 multiplies q0."""
+    """Kernel arguments u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b); column 0 multiplies q0.
+
+    They are as many as the blocks have components that are gathered; columns of other blocks are 0.
+    """
 
     arguments: tuple[sympy.Symbol, ...]
     table: Table
@@ -136,7 +147,10 @@ class Gather:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scatter:
-    """m kernel results, added to row r as h^(power + power of r) S_nr phi_n; the last column of S belongs to p1."""
+    """Kernel results, added to row r as h^(power + power of r) S_nr phi_n; the last column of S belongs to p1.
+
+    They are as many as the rows have equations to which they are added; columns of other rows are 0.
+    """
 
     results: tuple[sympy.Expr, ...]
     table: Table
@@ -202,6 +216,14 @@ class StageSystem:
     end_numbers: tuple[str, str]
     extrapolation: Matrix | None = None
     shape: Shape | None = None
+
+    def block_sizes(self, dimension: int) -> tuple[int, ...]:
+        """How many components each block has."""
+        return tuple(dimension if block.size is None else block.size for block in self.blocks)
+
+    def row_sizes(self, dimension: int) -> tuple[int, ...]:
+        """How many equations each row has; the last are the m of p1."""
+        return (*(dimension if row.size is None else row.size for row in self.rows), dimension)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

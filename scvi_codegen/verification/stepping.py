@@ -185,7 +185,7 @@ def _action(subject: Subject) -> Finding | None:
     row = numbers(equations.stages.end_position.entries[0])
     powers = [mp.mpf(state.h) ** block.power for block in equations.stages.blocks]
     expected = np.array([p1 * (row[b + 1] * power) for b, power in enumerate(powers)], dtype=object)
-    wrong = [*(slopes[0] - p1 * row[0] + p0), *(slopes[1] - expected).ravel()]
+    wrong = [*(slopes[0] - p1 * row[0] + p0), *(slopes[1] - expected.ravel())]
     size = max(1, *map(abs, p0), *map(abs, p1))
     return Finding(float(max(map(abs, wrong)) / size), STATIONARY)
 

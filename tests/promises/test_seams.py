@@ -1,0 +1,247 @@
+"""The seams: what the developers' page adds in a file and a line works, and blocks may be of any size."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+from scipy.integrate import solve_ivp
+
+import scvi_codegen
+from scvi_codegen.compiler import program_of
+from scvi_codegen.errors import MethodError
+from scvi_codegen.exact.step import DerivedStep
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.methods.galerkin_stages import nodal_quadrature_family, position_block
+from scvi_codegen.methods.method import Method, Specification
+from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.tables.nodes import Nodes, nodes_by_name
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.quadrature import gauss_lobatto
+
+ROOT = Path(scvi_codegen.__file__).parents[1]
+PAGE = ROOT / "docs" / "extending.md"
+
+
+# What the page adds.
+
+
+def additions() -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """What the page shows, each with the file named above it: new files, and changes of files."""
+    new, changes = (
+        re.findall(rf"^`([\w/.]+)`\n\n```{kind}\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
+        for kind in ("python", "diff")
+    )
+    return new, changes
+
+
+def changed(text: str, change: str) -> str:
+    """The text with the one place that a diff names changed."""
+    lines = [(line[:1], line[1:]) for line in change.splitlines()]
+    old, new = ("".join(f"{line}\n" for sign, line in lines if sign in kept) for kept in (" -", " +"))
+    assert text.count(old) == 1, f"the page changes what is not there, or not once:\n{change}"
+    return text.replace(old, new)
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package with all that the page adds."""
+    folder = tmp_path_factory.mktemp("extended")
+    for name in ("scvi_codegen", "templates"):
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    new, changes = additions()
+    for path, text in new:
+        (folder / path).write_text(text)
+    for path, change in changes:
+        (folder / path).write_text(changed((folder / path).read_text(), change))
+    return folder
+
+
+def run(folder: Path, script: str) -> str:
+    """What a script prints that uses the copy."""
+    own = f"import sys\nsys.meta_path[:] = [f for f in sys.meta_path if 'editable' not in repr(f).lower()]\n{script}"
+    own = own.replace("import sys\n", f"import sys\nsys.path.insert(0, {str(folder)!r})\n", 1)
+    found = subprocess.run([sys.executable, "-c", own], capture_output=True, text=True, check=False, cwd=folder)
+    assert found.returncode == 0, found.stderr
+    return found.stdout
+
+
+def test_the_page_adds_a_method_and_a_solver_in_a_file_and_a_line_each() -> None:
+    new, changes = additions()
+    lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
+    assert len(new) == 2
+    assert not any((ROOT / path).exists() for path, _ in new)
+    assert all(line.startswith("+") for line in lines)
+    assert sum("import" not in line for line in lines) == 2
+
+
+def test_the_method_of_the_page_is_the_midpoint_rule(extended: Path) -> None:
+    script = """
+import scvi_codegen, numpy as np
+from scvi_codegen.methods import Gauss, method_from_specification
+from scvi_codegen.models.problems import problem
+from scvi_codegen.compiler import program_of
+assert scvi_codegen.__file__.startswith(sys.path[0])
+system, method = problem("kepler").system, method_from_specification({"method": "midpoint"})
+own, gauss = (program_of(system, each, prefix="p") for each in (method, Gauss(1)))
+print(own.families == gauss.families, own.sweep == gauss.sweep, *(each.exact for each in own.momentum_maps))
+"""
+    assert run(extended, script).split() == ["True", "True", "True"]
+
+
+def test_the_solver_of_the_page_finds_what_newton_finds(extended: Path) -> None:
+    script = """
+import numpy as np
+from scvi_codegen import SCVI, compile_stepper
+from scvi_codegen.compiler import program_of
+from scvi_codegen.models.problems import problem
+given = problem("kepler")
+method = SCVI(4, abscissae="gauss")
+print(program_of(given.system, method).sweep.kind, program_of(given.system, SCVI(4)).sweep.kind)
+ends = []
+for solver in ("fixed-point", "newton"):
+    run = compile_stepper(given.system, method, solver=solver).integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=50)
+    ends.append(np.array([*run.q[-1], *run.p[-1]]))
+print(abs(ends[0] - ends[1]).max() < 1e-13)
+"""
+    assert run(extended, script).split() == ["separable", "shooting", "True"]
+
+
+# Blocks of another size than the coordinates: multipliers of constraints.
+
+
+@dataclass(frozen=True, slots=True)
+class Constrained(Method):
+    """SVI with s + 1 Lobatto points and multipliers of g(q) = 0 at the first s of them; RATTLE's positions for s = 1.
+
+    Unknowns Q^1 .. Q^s and lambda_0 .. lambda_(s-1), k components each; Jay, SIAM J. Numer. Anal. 33 (1996).
+    """
+
+    degree: int
+    constraints: tuple[sympy.Expr, ...]
+
+    name = title = "constrained"
+    symmetric = symplectic = True
+
+    @property
+    def order(self) -> int:
+        return 2 * self.degree
+
+    def specification(self) -> Specification:
+        return {"method": "constrained"}
+
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
+        s, k = self.degree, len(self.constraints)
+        nodes = nodes_by_name("legendre-lobatto", s)
+        none, stationary = Table.constant(s + 1, s), [0, *range(1, s)]
+        action = nodal_quadrature_family(system, nodes, gauss_lobatto(s + 1), other_blocks=s)
+        rows = [
+            Table.joined(gather.table.columns(stationary), none, gather.table.columns([s])) for gather in action.gathers
+        ]
+        return StageSystem(
+            blocks=(
+                *(position_block(v, nodes) for v in range(1, s + 1)),
+                *(
+                    Block(name=f"lambda_{n}", power=0, straight=(mp.zero, mp.zero), moves=False, size=k)
+                    for n in range(s)
+                ),
+            ),
+            rows=(
+                Row(number="27a", kind="IDEL", momentum=mp.one),
+                *(Row(number="27b", kind="stage", momentum=mp.zero) for _ in range(s - 1)),
+                *(Row(number="g", kind="stage", momentum=mp.zero, size=k) for _ in range(s)),
+            ),
+            families=(action.point_family(rows), self._reactions(system, nodes), self._surface(system, nodes)),
+            end_position=Table.named("", [[0] * s + [1] + [0] * s]),
+            end_momentum=mp.zero,
+            end_numbers=("27", "27c"),
+        )
+
+    paper_form = stage_system
+
+    def _reactions(self, system: MechanicalSystem, nodes: Nodes) -> PointFamily:
+        """(lambda . g)_q at the nodes 0 .. s - 1, in the rows of their positions."""
+        s, rule = self.degree, gauss_lobatto(self.degree + 1)
+        multipliers = sympy.symbols(f"lambda_:{len(self.constraints)}", real=True)
+        product = sympy.Add(*(x * g for x, g in zip(multipliers, self.constraints, strict=True)))
+        here = Table.joined(Table.identity(s), Table.constant(s, 1 + s))
+        return PointFamily(
+            name="reaction",
+            abscissae=nodes.abscissae[:s],
+            weights=rule.unit_weights[:s],
+            weight_names=("",) * s,
+            gathers=(
+                Gather(arguments=system.coordinates, table=here, power=0),
+                Gather(arguments=multipliers, table=Table.joined(Table.constant(s, 1 + s), Table.identity(s)), power=0),
+            ),
+            scatters=(Scatter(results=tuple(product.diff(q) for q in system.coordinates), table=here, power=1),),
+        )
+
+    def _surface(self, system: MechanicalSystem, nodes: Nodes) -> PointFamily:
+        """g at the nodes 1 .. s, which must vanish."""
+        s = self.degree
+        places = Table.joined(Table.constant(s, 1), Table.identity(s), Table.constant(s, s))
+        rows = Table.joined(Table.constant(s, s), Table.identity(s), Table.constant(s, 1))
+        return PointFamily(
+            name="surface",
+            abscissae=nodes.abscissae[1:],
+            weights=(mp.one,) * s,
+            weight_names=("",) * s,
+            gathers=(Gather(arguments=system.coordinates, table=places, power=0),),
+            scatters=(Scatter(results=self.constraints, table=rows, power=0),),
+        )
+
+
+def rod() -> tuple[LagrangianSystem, sympy.Expr]:
+    """A mass on a rod, in Cartesian coordinates: a pendulum."""
+    system = LagrangianSystem.from_text(
+        name="mass on a rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y"
+    )
+    x, y = system.coordinates
+    return system, (x**2 + y**2 - 1) / 2
+
+
+def pendulum(angle: float, rate: float, time: float) -> np.ndarray:
+    """The position of the mass by the pendulum's own equation."""
+    found = solve_ivp(lambda t, u: [u[1], -np.sin(u[0])], (0, time), [angle, rate], rtol=1e-13, atol=1e-14)
+    return np.array([np.sin(found.y[0, -1]), -np.cos(found.y[0, -1])])
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_multipliers_of_a_constraint_are_blocks_of_their_own_size(degree: int) -> None:
+    system, surface = rod()
+    step = DerivedStep(system, Constrained(degree, (surface,)).stage_system(system))
+    assert step.unknowns == degree * (2 + 1)
+    errors = []
+    for steps in (4, 8):
+        q, p = [np.sin(0.7), -np.cos(0.7)], [0.4 * np.cos(0.7), 0.4 * np.sin(0.7)]
+        for _ in range(steps):
+            end = step(q, p, 1 / mp.mpf(steps))
+            q, p = end.q, end.p
+            assert abs(q[0] ** 2 + q[1] ** 2 - 1) < 1e-15
+        errors.append(np.abs(np.array(q, dtype=float) - pendulum(0.7, 0.4, 1.0)).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.4)
+
+
+def test_without_a_constraint_nothing_is_left_but_the_svi() -> None:
+    system, _ = rod()
+    free = DerivedStep(system, Constrained(2, ()).stage_system(system))
+    own = DerivedStep(system, SVI(2, "gauss-lobatto:3").paper_form(system))
+    state = ([0.3, -0.9], [0.4, 0.1], 0.25)
+    assert max(abs(a - b) for a, b in zip(free(*state).q, own(*state).q, strict=True)) < 1e-40
+
+
+def test_other_sizes_are_refused_where_they_cannot_be_compiled() -> None:
+    system, surface = rod()
+    with pytest.raises(MethodError, match="blocks of other sizes than 2"):
+        program_of(system, Constrained(1, (surface,)))
