@@ -13,7 +13,8 @@ __all__ = ["main"]
 
 OVERVIEW = """Compile a Lagrangian into a variational integrator in C, run it, look at its equations.
 
-MODEL is a model file (TOML) or a name of the catalogue ('scvi-codegen systems'). Options override what it says.
+MODEL is a model file (TOML) or a name of the catalogue ('scvi-codegen systems'). Options supply what it lacks and
+replace what it says.
 
 \b
 Examples:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -12,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from scvi_codegen.cli.conservation import momentum_report
+from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -59,7 +57,7 @@ def integrate_states(
         StateError: if a state is unfit, or all of them need more memory than there is.
     """
     model, began = states.model, time.perf_counter()
-    _check_memory(len(states), model)
+    check_memory(model, len(states))
     stepper = compile_stepper(model.system, model.method, solver=solver)
     work = Ensemble(
         stepper,
@@ -93,23 +91,6 @@ def integrate_states(
         seconds=time.perf_counter() - started,
         interrupted=interrupted,
     )
-
-
-def _check_memory(count: int, model: Model) -> None:
-    kept = model.step_count // model.every + 1
-    needed = 16 * len(model.q) * count * kept
-    if needed > physical_memory():
-        raise StateError(
-            f"{kept} states of each of {count} trajectories need {needed / 1e9:.3g} GB of memory: keep fewer (--every)"
-        )
-
-
-def physical_memory() -> float:
-    """Bytes of this machine; infinitely many where it does not tell."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, OSError, ValueError):
-        return math.inf
 
 
 def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scvi_codegen.cli.conservation import energy_report, momentum_report
+from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
@@ -57,8 +58,9 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     Raises:
         BuildError: without a C compiler.
         MethodError: for a solver that the method does not have.
-        StateError: if the initial state is unfit.
+        StateError: if the initial state is unfit, or there is not the memory for all states.
     """
+    check_memory(model)
     began = time.perf_counter()
     run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
     preparation, seconds = time.perf_counter() - began, 0.0

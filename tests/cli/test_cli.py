@@ -196,6 +196,8 @@ class TestChoices:
             ("kepler --step 0", "the step is 0"),
             ("kepler --steps -1", "steps must be at least 0"),
             ("kepler --every 0", "every must be at least 1"),
+            ("kepler --span 1e15", "GB of memory: keep fewer (--every "),
+            ("kepler --span 1e15", "or write them into a folder as they come (-o NAME.run)"),
             ("kepler --tolerance 0", "the tolerance must be positive"),
             ("kepler -o orbit.txt", "as .npz, .csv, .h5, .hdf5, .nc, .zarr or into a folder .run, not as 'orbit.txt'"),
             ("kepler -o no/orbit.npz", "there is no folder 'no'"),
@@ -268,6 +270,12 @@ class TestRun:
         )
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
         assert len(arrays("a.npz")["t"]) == 1
+
+    def test_states_that_do_not_fit_are_kept_as_advised(self, monkeypatch):
+        monkeypatch.setattr("scvi_codegen.cli.memory.usable_memory", lambda: 20_000.0)
+        every = re.search(r"--every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
+        assert 1 < int(every) < 10
+        assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--every", every)
 
     def test_draws_a_picture(self):
         assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")

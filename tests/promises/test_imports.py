@@ -1,6 +1,7 @@
 """Imports point down only and in no circle, libraries have their rooms, and stepping loads nothing symbolic."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -184,6 +185,38 @@ def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     loaded = loaded_modules(use.format(**names), tmp_path)
     assert "numpy" in loaded
     assert loaded.isdisjoint(HEAVY)
+
+
+def test_type_checkers_see_the_public_names_where_they_are():
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    seen = {alias.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    homes = {name: f"scvi_codegen.{home}" for home, names in scvi_codegen._HOMES.items() for name in names}
+    assert seen == homes | {"__version__": "scvi_codegen.version"}
+    assert dir(scvi_codegen) == sorted(seen)
+
+
+TYPED = """
+import scvi_codegen as sc
+reveal_type(sc.SVI(4))
+reveal_type(sc.compile_stepper)
+sc.no_such_name
+"""
+
+
+def test_a_type_checker_knows_them_and_the_code_of_the_readme(tmp_path):
+    (tmp_path / "typed.py").write_text(TYPED)
+    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    (tmp_path / "readme.py").write_text("\n".join(blocks))
+    command = [sys.executable, "-m", "mypy", "--ignore-missing-imports", "--cache-dir", str(tmp_path / "cache")]
+    words = [*command, "typed.py", "readme.py"]
+    lines = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout.splitlines()
+    assert 'typed.py:3: note: Revealed type is "scvi_codegen.methods.galerkin.SVI"' in lines
+    assert any(line.startswith("typed.py:4") and "scvi_codegen.runtime.stepper.Stepper" in line for line in lines)
+    assert [line for line in lines if "error" in line] == [
+        'typed.py:5: error: Module has no attribute "no_such_name"  [attr-defined]',
+        "Found 1 error in 1 file (checked 2 source files)",
+    ]
 
 
 def test_public_names_are_all_there_and_come_from_where_they_are_said_to():

@@ -484,7 +484,7 @@ class TestCommandLine:
             ("planar-pendulum --ensemble grid.toml", "'q1' is no coordinate"),
             (
                 "kepler --steps 1000000000000 --ensemble grid.toml",
-                "1000000000001 states of each of 6 trajectories need 1.92e+05 GB of memory: keep fewer (--every)",
+                "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: keep fewer (--every ",
             ),
         ],
     )

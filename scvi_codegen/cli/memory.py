@@ -1,0 +1,46 @@
+"""Whether the states of a run fit into memory, asked before it begins: a process that takes more is killed unheard."""
+
+from __future__ import annotations
+
+import math
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.models.model import Model
+
+__all__ = ["check_memory", "usable_memory"]
+
+COPIES = 2
+"""Kept in pieces, then joined and summed up."""
+LIMIT_OF_GROUP = Path("/sys/fs/cgroup/memory.max")
+"""What Linux gives a container."""
+
+
+def check_memory(model: Model, trajectories: int = 1) -> None:
+    """Refuse a run whose states do not fit, and say how it would.
+
+    Raises:
+        StateError: naming the size, and the distance between states at which they fit.
+    """
+    kept = model.step_count // model.every + 1
+    each = 16 * len(model.q) * trajectories + 12  # q and p of each; time and iterations
+    room = usable_memory() / (COPIES * each)
+    if kept <= room:
+        return
+    states = f"{kept} states" if trajectories == 1 else f"{kept} states of each of {trajectories} trajectories"
+    ways = [f"keep fewer (--every {-(-model.step_count // int(room - 1))})"] if room >= 2 else []
+    ways += ["write them into a folder as they come (-o NAME.run)"] if trajectories == 1 else []
+    needed = f"{COPIES * each * kept / 1e9:.3g} GB of memory"
+    raise StateError(f"{states} need {needed}: {' or '.join(ways or ['run fewer'])}")
+
+
+def usable_memory() -> float:
+    """Bytes for this process; infinitely many where the system does not tell."""
+    found = [math.inf]
+    with suppress(AttributeError, OSError, ValueError):
+        found.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
+    with suppress(OSError, ValueError):
+        found.append(float(LIMIT_OF_GROUP.read_text()))
+    return min(found)
