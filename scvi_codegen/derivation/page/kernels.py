@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from itertools import count, takewhile
 
 import sympy
 from sympy import Symbol
@@ -17,7 +18,7 @@ from scvi_codegen.mechanics.forms import auxiliary_multipliers, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.outline import Function
 
-__all__ = ["kernels_of", "kernels_section", "operations_section"]
+__all__ = ["kernel_text", "kernels_of", "kernels_section", "operations_section"]
 
 COUNTS = re.compile(r" Operations: .*$")
 
@@ -63,7 +64,7 @@ def operations_section(program: Program) -> Section:
 def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Function]) -> Section:
     """One pair a kernel: formulas at the left, C at the right."""
     names = _names(system)
-    pairs = tuple(_pair(program, kernel, functions[kernel.name], names) for kernel in kernels_of(program))
+    pairs = tuple(_pair(program, kernel, functions, names) for kernel in kernels_of(program))
     text = (
         "A kernel is all that depends on the system: arithmetic in a straight line, at one point. Those called _lanes "
         "do the same for all points at once."
@@ -81,7 +82,16 @@ def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     }
 
 
-def _pair(program: Program, kernel: Kernel, function: Function, names: Mapping[Symbol, Symbol]) -> Beside:
+def kernel_text(functions: Mapping[str, Function], name: str) -> str:
+    """The C of a kernel; that of a large one is cut into parts, called by it in order."""
+    parts = takewhile(functions.__contains__, (f"{name}_{k}" for k in count(1)))
+    return "\n".join(functions[part].text for part in (*parts, name))
+
+
+def _pair(
+    program: Program, kernel: Kernel, functions: Mapping[str, Function], names: Mapping[Symbol, Symbol]
+) -> Beside:
+    function = functions[kernel.name]
     values, slopes = (
         [
             Formula(formula.xreplace(names) if k < MOST_FORMULAS else formula, Symbol(f"{name}_{k}"))
@@ -96,4 +106,4 @@ def _pair(program: Program, kernel: Kernel, function: Function, names: Mapping[S
         left.append(Formula(sympy.Tuple(*map(Symbol, program.parameter_names)), Symbol("parameters")))
     left += [*formulas(values, "value"), *formulas(slopes, "slope")]
     title = f"{kernel.name}({', '.join(function.arguments)})"
-    return Beside(title=title, left=tuple(left), right=(lines(function.text),))
+    return Beside(title=title, left=tuple(left), right=(lines(kernel_text(functions, kernel.name)),))
