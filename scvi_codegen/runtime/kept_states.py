@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +32,11 @@ class KeptStates:
     parameters: Array
     stepper: Integrator = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
+
+    @property
+    def forward(self) -> float:
+        """1, or -1 for a run back in time."""
+        return math.copysign(1.0, self.t[-1] - self.t[0])
 
     def __len__(self) -> int:
         return len(self.t)

@@ -114,7 +114,7 @@ class Observation:
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
         assert self.times is not None
-        forward = np.copysign(1.0, part.h)
+        forward = part.forward
         left, right = forward * part.t[0], forward * part.t[-1]
         after = forward * self.times >= left if first else forward * self.times > left
         times = self.times[after & (forward * self.times <= right)]
