@@ -37,6 +37,7 @@ from scvi_codegen.derivation.page.jacobian import entry_numbers
 from scvi_codegen.derivation.page.kernels import kernels_of
 from scvi_codegen.derivation.page.sparsity import jacobian_pattern
 from scvi_codegen.display.page.blocks import Formula, Paragraph
+from scvi_codegen.display.page.typesetting import SPACE
 from scvi_codegen.ir.sweeps import Sweep
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.rendering.outline import functions_of, reached
@@ -235,6 +236,12 @@ class TestPage:
         count = sum(len(functions[f"quadrature_slope{end}"].text.splitlines()) for end in ("_1", "_2", ""))
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page
+
+    def test_what_is_left_out_of_the_first_guess_is_counted(self):
+        assert "The first 12 of 16 first values." in kepler_page(sc.SVI(8))
+
+    def test_an_index_in_a_heading_is_a_variable(self):
+        assert f"<var>j</var>{SPACE}={SPACE}0</th>" in kepler_page(sc.SVI(2))
 
     def test_equal_derivations_give_equal_pages(self):
         assert derivation_html(sc.problem("kepler").system, sc.SVI(2)) == kepler_page(sc.SVI(2))

@@ -44,6 +44,17 @@ class TestInABrowser:
         boxes = "[...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth, e.clientWidth])"
         assert view.width > 390 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
 
+    def test_a_picture_of_one_panel_fits_a_phone_and_a_wider_one_says_that_it_scrolls(self, view):
+        figures = """[...document.querySelectorAll('figure .scroll')].map(e => {
+            const width = e.querySelector('svg').style.getPropertyValue('--width');
+            return [parseFloat(width) * 4 / 3, e.scrollWidth, e.clientWidth, getComputedStyle(e).backgroundImage];
+        })"""
+        found = view.evaluate(figures)
+        assert found
+        for own, inside, outside, hint in found:
+            assert hint.count("linear-gradient") == 4
+            assert own > 640 or inside <= outside
+
     def test_formulas_are_set_by_the_browser(self, view):
         boxes = view.evaluate(FORMULAS)
         assert len(boxes) > 10
