@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.mechanics import Mechanics
+from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
 from scvi_codegen.tables.basis import cardinal_integrals
 from scvi_codegen.tables.precision import Number, mp
@@ -107,7 +107,7 @@ def _gauss_tables(points: int) -> tuple[Array, Array, Array]:
 class Curve:
     """A curve from q0 at t over a step h, given by its velocity at the start and z = h (acceleration) at the points."""
 
-    mechanics: Mechanics
+    motion: ExactMotion
     grid: Grid
     t: Number
     h: Number
@@ -116,28 +116,28 @@ class Curve:
     z: Array
 
     @classmethod
-    def straight(cls, mechanics: Mechanics, grid: Grid, t: Number, h: Number, start: Array, end: Array) -> Curve:
+    def straight(cls, motion: ExactMotion, grid: Grid, t: Number, h: Number, start: Array, end: Array) -> Curve:
         """The uniform motion from ``start`` to ``end``."""
         rest = np.full((len(grid.abscissae), len(start)), mp.zero, dtype=object)
-        return cls(mechanics, grid, t, h, start, (end - start) / h, rest)
+        return cls(motion, grid, t, h, start, (end - start) / h, rest)
 
     @classmethod
     def launched(
-        cls, mechanics: Mechanics, grid: Grid, t: Number, h: Number, start: Array, velocity: Array, digits: int
+        cls, motion: ExactMotion, grid: Grid, t: Number, h: Number, start: Array, velocity: Array, digits: int
     ) -> Curve:
         """The solution of (2) with this start and velocity, piece after piece."""
         position, speed, found, length = start, velocity, [], h / grid.pieces
         for index in range(grid.pieces):
-            first = cls(mechanics, grid.piece, t + index * length, length, position, speed, np.empty((0,)))
+            first = cls(motion, grid.piece, t + index * length, length, position, speed, np.empty((0,)))
             curve = first._uniformly_accelerated()._solved(digits)
             found.append(curve.z * grid.pieces)
             position, speed = curve.ends()[1], curve.end_velocities()[1]
-        return cls(mechanics, grid, t, h, start, velocity, np.concatenate(found))
+        return cls(motion, grid, t, h, start, velocity, np.concatenate(found))
 
     def _uniformly_accelerated(self) -> Curve:
         rest = np.array([mp.zero] * len(self.position), dtype=object)
         at = (self.position, self.velocity, self.t, rest)
-        acceleration = -solver(self.mechanics.slopes(*at)[2])(self.mechanics.residual(*at))
+        acceleration = -solver(self.motion.residual_slopes(*at)[2])(self.motion.residual(*at))
         return replace(self, z=np.array([acceleration * self.h] * len(self.grid.abscissae), dtype=object))
 
     def _solved(self, digits: int) -> Curve:
@@ -172,11 +172,11 @@ class Curve:
         return list(zip(*self._states(), times, self.z / self.h, strict=True))
 
     def _residual(self) -> Array:
-        return np.array([self.mechanics.residual(*point) for point in self._points()], dtype=object)
+        return np.array([self.motion.residual(*point) for point in self._points()], dtype=object)
 
     def _slopes(self) -> tuple[Floats, Floats]:
         """Derivatives of all residuals by z, square, and by v0."""
-        by_q, by_v, by_a = np.array([self.mechanics.slopes(*point) for point in self._points()]).swapaxes(0, 1)
+        by_q, by_v, by_a = np.array([self.motion.residual_slopes(*point) for point in self._points()]).swapaxes(0, 1)
         h, A, c = float(self.h), self.grid.matrix, self.grid.abscissae.astype(float)
         blocks = np.einsum("ij,iab->iajb", A, by_v) + h * np.einsum("ij,iab->iajb", A @ A, by_q)
         size = np.arange(len(c))
@@ -216,17 +216,17 @@ class Curve:
     def end_momenta(self) -> tuple[Array, Array]:
         """Momenta at both ends."""
         (q0, q1), (v0, v1) = self.ends(), self.end_velocities()
-        return self.mechanics.momentum(q0, v0, self.t), self.mechanics.momentum(q1, v1, self.t + self.h)
+        return self.motion.momentum(q0, v0, self.t), self.motion.momentum(q1, v1, self.t + self.h)
 
     def action(self) -> Number:
         """The integral of L over the step."""
-        return self._integral([self.mechanics.lagrangian(q, v, t) for q, v, t, _ in self._points()]) * self.h
+        return self._integral([self.motion.lagrangian(q, v, t) for q, v, t, _ in self._points()]) * self.h
 
     def sizes(self) -> tuple[Number, Number, Number]:
         """The integral of ``|L|``, the largest position and the largest momentum."""
-        points, mechanics = self._points(), self.mechanics
-        action = self._integral([abs(mechanics.lagrangian(q, v, t)) for q, v, t, _ in points]) * abs(self.h)
-        momenta = np.array([mechanics.momentum(q, v, t) for q, v, t, _ in points])
+        points, motion = self._points(), self.motion
+        action = self._integral([abs(motion.lagrangian(q, v, t)) for q, v, t, _ in points]) * abs(self.h)
+        momenta = np.array([motion.momentum(q, v, t) for q, v, t, _ in points])
         return action, largest(np.array(self.ends())), largest(momenta)
 
     def _integral(self, values: list[Number]) -> Number:

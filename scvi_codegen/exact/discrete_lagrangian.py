@@ -18,7 +18,7 @@ import numpy as np
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
-from scvi_codegen.exact.mechanics import Mechanics
+from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import Number, Vector, mp
@@ -94,13 +94,13 @@ def exact_discrete_lagrangian(
 
     def solve(grid: Grid) -> Curve:
         nonlocal velocity
-        mechanics, times = problem.mechanics, (problem.t, problem.h)
+        motion, times = problem.motion, (problem.t, problem.h)
         if velocity is None and grid.pieces > MOST_STRAIGHT:
             raise NotConvergedError("Newton's iteration from the straight line stalls")
         if velocity is None:
-            first = Curve.straight(mechanics, grid, *times, start, end)
+            first = Curve.straight(motion, grid, *times, start, end)
         else:
-            first = Curve.launched(mechanics, grid, *times, start, velocity, digits)
+            first = Curve.launched(motion, grid, *times, start, velocity, digits)
         curve = first.joined_to(end, digits)
         velocity = curve.velocity
         return curve
@@ -134,12 +134,12 @@ def exact_map(
     start, momenta = problem.vector(q0, "q0"), problem.vector(p0, "p0")
     origin = f"the trajectory from q0 = {_shown(start)}, p0 = {_shown(momenta)}"
     try:
-        velocity = problem.mechanics.velocity(start, momenta, problem.t, digits)
-    except ArithmeticError as failure:
+        velocity = problem.motion.velocity(start, momenta, problem.t, digits)
+    except (ArithmeticError, StateError) as failure:
         raise StateError(f"{origin}: no velocity has this momentum ({failure})") from failure
 
     def solve(grid: Grid) -> Curve:
-        return Curve.launched(problem.mechanics, grid, problem.t, problem.h, start, velocity, digits)
+        return Curve.launched(problem.motion, grid, problem.t, problem.h, start, velocity, digits)
 
     return problem.answer(solve, f"{origin} was not found up to h = {mp.nstr(problem.h, 8)}: take a smaller step")
 
@@ -153,7 +153,7 @@ class _Problem:
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
         if self.h == 0:
             raise StateError("the step h is 0")
-        self.mechanics = Mechanics(system, _parameter_values(system, parameters))
+        self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 
     def vector(self, values: Sequence[Any], name: str) -> Array:
         """(m,) numbers."""

@@ -1,6 +1,7 @@
 """The exact motion of a system over a short time, in 60 digits, from its formula alone.
 
-It shares nothing with the compiler but the formula: SymPy's ``diff`` takes the derivatives, Hamilton's equations or
+It shares nothing with the compiler but the formula: SymPy's ``diff`` takes the derivatives (another way is left for
+those that only steer Newton's iteration), Hamilton's equations or
 those of Euler and Lagrange give the rates, and the midpoint rule, extrapolated to step size 0 (Gragg, Bulirsch, Stoer;
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, II.9), follows them. What is compiled is measured
 against this.
@@ -8,25 +9,26 @@ against this.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import sympy
-from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.exact.newton import Array as Numbers
+from scvi_codegen.exact.newton import Floats, NotConvergedError, Solve, newton, solver
+from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
 
-Numbers = NDArray[Any]
-"""Arrays of 60-digit numbers."""
-
-MOST_COLUMNS, MOST_HALVINGS, MOST_ITERATIONS = 24, 12, 60
-ACCURACY = mp.mpf(10) ** -45
+MOST_COLUMNS, MOST_HALVINGS = 24, 12
+DIGITS = 45
+ACCURACY = mp.mpf(10) ** -DIGITS
 
 
 def numbers(values: Any) -> Numbers:
@@ -36,12 +38,17 @@ def numbers(values: Any) -> Numbers:
 
 
 class ExactMotion:
-    """L or H of a system as a function of numbers, and the motion that follows; parameters have their defaults."""
+    """L or H of a system and what follows from it as functions of numbers, and the motion.
 
-    def __init__(self, system: MechanicalSystem) -> None:
+    Args:
+        system: what moves.
+        parameters: their values in order; left out, the defaults.
+    """
+
+    def __init__(self, system: MechanicalSystem, parameters: Sequence[Number] | None = None) -> None:
         self.system, self.hamiltonian = system, bool(system.auxiliaries)
         self.second = system.auxiliaries or system.velocities
-        self.parameters = [mp.mpf(value) for value in system.defaults]
+        self.parameters = [mp.mpf(value) for value in (system.defaults if parameters is None else parameters)]
         self.symbols = (*system.coordinates, *self.second, system.time, *system.parameters)
 
     @cached_property
@@ -64,10 +71,10 @@ class ExactMotion:
         return [[slope.diff(x) for x in variables] for slope in self._slopes]
 
     @cached_property
-    def _momentum_and_mass(self) -> Tape:
-        """DL/dv and d2L/dv2."""
+    def _mass(self) -> Tape:
+        """D2L/dv2, row by row."""
         m = len(self.second)
-        return Tape([*self._slopes, *(entry for row in self._curvature for entry in row[:m])], self.symbols)
+        return Tape([entry for row in self._curvature for entry in row[:m]], self.symbols)
 
     @cached_property
     def _right_hand_side(self) -> Tape:
@@ -83,7 +90,7 @@ class ExactMotion:
         """(m,) momenta dL/dv of a Lagrangian."""
         return self._values(self._by_second, q, v, t)
 
-    def velocity(self, q: Numbers, p: Numbers, t: Number) -> Numbers:
+    def velocity(self, q: Numbers, p: Numbers, t: Number, digits: int = DIGITS) -> Numbers:
         """(m,) velocities: dH/dp, or the v with dL/dv = p, by Newton's iteration from rest.
 
         Raises:
@@ -91,33 +98,26 @@ class ExactMotion:
         """
         if self.hamiltonian:
             return self._values(self._by_second, q, p, t)
-        v = numbers(np.zeros(len(q)))
         m = len(q)
-        for _ in range(MOST_ITERATIONS):
-            found = self._values(self._momentum_and_mass, q, v, t)
-            change = _solved(found[m:].reshape(m, m), found[:m] - p)
-            v, whole = self._moved(q, v, t, change)
-            if whole and max(map(abs, change)) <= ACCURACY * max(1, *map(abs, v)):
-                return v
-        raise StateError("the momenta of this state have no velocities that Newton's iteration finds")
 
-    def _moved(self, q: Numbers, v: Numbers, t: Number, change: Numbers) -> tuple[Numbers, bool]:
-        """The update, or so much of it that L is defined there; whether it is the whole."""
-        for halvings in range(MOST_ITERATIONS):
-            trial = v - change / 2**halvings
-            try:
-                self.momentum(q, trial, t)
-            except ArithmeticError:
-                continue
-            return trial, halvings == 0
-        raise StateError("the momenta of this state have no velocities that Newton's iteration finds")
+        def mass(v: Numbers) -> Solve:
+            return solver(self._values(self._mass, q, v, t).reshape(m, m).astype(float))
+
+        try:
+            return newton(lambda v: self.momentum(q, v, t) - p, mass, numbers(np.zeros(m)), digits)
+        except NotConvergedError as failure:
+            raise StateError(f"no velocity that Newton's iteration finds has these momenta: {failure}") from failure
+
+    def lagrangian(self, q: Numbers, v: Numbers, t: Number) -> Number:
+        """L of a Lagrangian."""
+        return self._values(self._formula, q, v, t)[0]
 
     def energy(self, q: Numbers, p: Numbers, t: Number) -> Number:
         """H, or p . v - L."""
         if self.hamiltonian:
             return self._values(self._formula, q, p, t)[0]
         v = self.velocity(q, p, t)
-        return p @ v - self._values(self._formula, q, v, t)[0]
+        return p @ v - self.lagrangian(q, v, t)
 
     def _rates(self, state: Numbers, t: Number) -> Numbers:
         """Of (q, p) where H is given, of (q, v) where L is."""
@@ -140,6 +140,33 @@ class ExactMotion:
     def acceleration(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """(m,) accelerations at (q, v) of a Lagrangian."""
         return self._rates(np.concatenate([q, v]), t)[len(q) :]
+
+    def residual(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Numbers:
+        """(m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq."""
+        m, found = len(q), self._values(self._right_hand_side, q, v, t)
+        slopes = found[m:].reshape(m, 2 * m + 1)
+        residual: Numbers = slopes[:, :m] @ a + slopes[:, m : 2 * m] @ v + slopes[:, 2 * m] - found[:m]
+        return residual
+
+    def residual_slopes(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Floats:
+        """(3, m, m) its derivatives by position, velocity and acceleration, in doubles."""
+        places, tape = self._slopes_of_residual
+        matrices = np.zeros((len(q), 3 * len(q)))
+        matrices[places] = [float(value) for value in tape([*q, *v, *a, t, *self.parameters])]
+        return np.stack(np.split(matrices, 3, axis=1))
+
+    @cached_property
+    def _slopes_of_residual(self) -> tuple[tuple[list[int], list[int]], Tape]:
+        """Where derivatives of the residual are not 0, rows and columns, and their values."""
+        q, v, t = self.system.coordinates, self.second, self.system.time
+        a = tuple(sympy.Dummy(real=True) for _ in q)
+        residual = [
+            sympy.Add(*(x * y for x, y in zip(row, (*a, *v, 1), strict=True)), -self.system.formula.diff(position))
+            for row, position in zip(self._curvature, q, strict=True)
+        ]
+        entries = jacobian(residual, (*q, *v, *a))
+        rows, columns = ([place[k] for place in entries] for k in range(2))
+        return (rows, columns), Tape(list(entries.values()), (*q, *v, *a, t, *self.system.parameters))
 
     def flow(self, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
         """(q, p) at t + h of the motion through (q, p) at t, to about 45 digits.

@@ -36,8 +36,19 @@ def largest(values: Array) -> Number:
     return max(map(abs, values.ravel()), default=mp.zero)
 
 
-def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digits: int) -> Array:
-    """The zero of ``residual`` near x: damped, with a double-precision Jacobian kept as long as it serves."""
+def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digits: int, stale: float = STALE) -> Array:
+    """The zero of ``residual`` near x, to so many digits of its largest entry: damped, its Jacobian in doubles.
+
+    Args:
+        residual: raises ``ArithmeticError`` where it is not defined.
+        linearised: solves with the Jacobian at a point; kept while updates shrink by ``stale``.
+        x: the first guess.
+        digits: of the largest entry of x.
+        stale: the dearer a Jacobian is beside a residual, the larger.
+
+    Raises:
+        NotConvergedError: if there is no zero near.
+    """
     scale, value, solve = largest(x), residual(x), linearised(x)
     update = solve(value)
     for _ in range(MOST_ITERATIONS):
@@ -46,7 +57,7 @@ def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digi
         if size <= scale * mp.mpf(10) ** -(digits + 2):
             return x - update
         x, value, update = damped(residual, solve, x, update)
-        if largest(update) > STALE * size:
+        if largest(update) > stale * size:
             solve = linearised(x)
             update = solve(value)
     raise NotConvergedError(f"no convergence in {MOST_ITERATIONS} iterations")

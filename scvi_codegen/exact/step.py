@@ -18,6 +18,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.motion import Numbers, exact_motion, numbers
+from scvi_codegen.exact.newton import NotConvergedError, Solve, newton
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
@@ -27,12 +28,13 @@ from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
 
-MOST_ITERATIONS = 60
+DIGITS = 45
+"""To which the equations are solved."""
 WIDTH = mp.mpf(10) ** -30
 """Relative, of the differences: slopes to 30 digits."""
 REFINEMENTS = 4
-STEADY = mp.mpf("0.1")
-"""The matrix is kept while updates shrink so fast."""
+STEADY = 0.1
+"""The matrix, from differences in 60 digits, is dear: it is kept while updates shrink so fast."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,30 +86,22 @@ class DerivedStep:
             StateError: if Newton's iteration does not converge.
         """
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
-        z = self._straight(known)
-        matrix, rows, last = None, self._rows(z, known), mp.inf
-        for _ in range(MOST_ITERATIONS):
-            if matrix is None:
-                matrix = self._inverse(self._exact_matrix(z, known), known)
-            change = matrix @ rows[: self.unknowns]
-            size = max(map(abs, change))
-            z, rows, whole = self._moved(z, change, known)
-            if whole and size <= mp.eps**0.75 * max(1, *map(abs, z)):
-                return self._end(z, rows, known)
-            if size > STEADY * last:
-                matrix = None
-            last = size
-        raise StateError(f"the derived equations were not solved in {MOST_ITERATIONS} iterations with h = {float(h):g}")
 
-    def _moved(self, z: Numbers, change: Numbers, known: _Known) -> tuple[Numbers, Numbers, bool]:
-        """Unknowns and rows after the update, or so much of it that the formula is defined; whether it is the whole."""
-        for halvings in range(MOST_ITERATIONS):
-            trial = z - change / 2**halvings
-            try:
-                return trial, self._rows(trial, known), halvings == 0
-            except ArithmeticError:
-                continue
-        raise StateError(f"the derived equations lead out of the domain of the formula with h = {float(known.h):g}")
+        def linearised(z: Numbers) -> Solve:
+            inverse = self._inverse(self._exact_matrix(z, known), known)
+            return lambda rows: inverse @ rows
+
+        try:
+            z = newton(
+                lambda z: self._rows(z, known)[: self.unknowns], linearised, self._straight(known), DIGITS, stale=STEADY
+            )
+            return self._end(z, self._rows(z, known), known)
+        except NotConvergedError as failure:
+            where = f"with h = {mp.nstr(known.h, 6)}"
+            raise StateError(f"the derived equations were not solved {where}: {failure}") from failure
+        except ArithmeticError as failure:
+            leaves = "the derived equations lead out of the domain of the formula"
+            raise StateError(f"{leaves} with h = {mp.nstr(known.h, 6)}") from failure
 
     def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
         """What one update of Newton's iteration makes of the straight line, the matrix from finite differences."""

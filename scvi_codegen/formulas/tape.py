@@ -1,4 +1,4 @@
-"""Expressions as straight-line arithmetic in 60 digits: each part is computed once, without a walk through trees."""
+"""Values of expressions in 60 digits, as straight-line arithmetic: each part once, without a walk through trees."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ class Tape:
     """
 
     def __init__(self, expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> None:
+        self.symbols = tuple(symbols)
         self._start: list[Number] = [mp.zero] * len(symbols)
         self._places: dict[sympy.Expr, int] = {symbol: place for place, symbol in enumerate(symbols)}
         self._steps: list[tuple[int, Callable[..., Number], tuple[int, ...]]] = []
@@ -34,7 +35,7 @@ class Tape:
         """The values at a point.
 
         Raises:
-            ArithmeticError: where one is not a finite real number.
+            ArithmeticError: where one is not real or not within the range of a C double.
         """
         values = [*numbers, *self._start[len(numbers) :]]
         try:
@@ -43,7 +44,7 @@ class Tape:
         except (ValueError, TypeError) as error:
             raise ArithmeticError(f"no real value: {error}") from error
         found = [values[place] for place in self._results]
-        if not all(isinstance(value, mp.mpf) and mp.isfinite(value) for value in found):
+        if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in found):
             raise ArithmeticError("a value is not a finite real number: the state has left the domain of the formula")
         return found
 
@@ -90,42 +91,18 @@ def _constant(expression: Any) -> Number:
     return CONSTANTS[expression]
 
 
-def evaluate(
-    expression: sympy.Expr, values: Mapping[sympy.Symbol, Number], known: dict[sympy.Expr, Number] | None = None
-) -> Number:
-    """Value of an expression of the grammar in the arithmetic of ``precision``, 60 digits.
+def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:
+    """Value of an expression at one point, in 60 digits.
 
     Args:
-        expression: an expression ``unsupported_part`` has nothing against.
+        expression: of the grammar.
         values: a number for each of its symbols.
-        known: values of parts computed before at the same point; filled on the way.
 
     Raises:
         ArithmeticError: if the value, or that of a part, is not real or not within the range of a C double.
     """
-    known = {} if known is None else known
-    if expression in known:
-        return known[expression]
+    parts = list(dict.fromkeys(sympy.preorder_traversal(expression)))
     try:
-        result = _evaluate_node(expression, values, known)
-    except (ValueError, TypeError) as error:
-        raise ArithmeticError(f"'{shortened(expression)}' has no real value") from error
-    if not isinstance(result, mp.mpf) or not abs(result) <= LARGEST:
-        raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number")
-    known[expression] = result
-    return result
-
-
-def _evaluate_node(expression: Any, values: Mapping[sympy.Symbol, Number], known: dict[sympy.Expr, Number]) -> Number:
-    if expression.is_Symbol:
-        return mp.mpf(values[expression])
-    if expression.is_Rational:
-        return mp.mpf(int(expression.p)) / int(expression.q)
-    if not expression.args:
-        return CONSTANTS[expression]
-    arguments = [evaluate(argument, values, known) for argument in expression.args]
-    if expression.is_Add:
-        return mp.fsum(arguments)
-    if expression.is_Mul:
-        return mp.fprod(arguments)
-    return mp.power(*arguments) if expression.is_Pow else getattr(mp, NAME_OF[expression.func])(*arguments)
+        return Tape(parts, list(values))(list(map(mp.mpf, values.values())))[0]
+    except ArithmeticError as error:
+        raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number") from error

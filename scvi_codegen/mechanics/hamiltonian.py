@@ -308,8 +308,8 @@ def _holds(system: MechanicalSystem, root: Expr, slope: Expr, x: Symbol, y: Symb
     tried = 0
     for point in sample_points([x], (*system.coordinates, system.time), system.constants):
         try:
-            value = evaluate(slope, point, {})
-            again = evaluate(root, point | {y: value}, {})
+            value = evaluate(slope, point)
+            again = evaluate(root, point | {y: value})
         except ArithmeticError:
             continue
         tried += 1

@@ -9,7 +9,7 @@ import numpy as np
 from sympy import Expr, Matrix, Symbol
 
 from scvi_codegen.formulas.derivatives import hessian
-from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["Entries", "coupled_blocks", "null_direction", "sample_points", "singular_part"]
@@ -57,11 +57,11 @@ def _is_singular(entries: Entries, size: int, points: Iterable[dict[Symbol, Numb
     """Whether a block is singular at every point at which it can be evaluated, and there is one."""
     if size == 1 and entries[0, 0].is_Rational:
         return False
-    evaluated = False
+    evaluated, tape = False, None
     for point in points:
-        known: dict[Expr, Number] = {}
+        tape = tape or Tape(list(entries.values()), list(point))
         try:
-            matrix = {place: evaluate(entry, point, known) for place, entry in entries.items()}
+            matrix = dict(zip(entries, tape(list(point.values())), strict=True))
         except ArithmeticError:
             continue
         evaluated = True

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.formulas.tape import Tape, evaluate
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
@@ -92,6 +92,8 @@ class Rates:
     def points(self, parameters: Mapping[Symbol, Number], count: int) -> Iterator[Sample]:
         """At most ``count`` points at which the system is defined, one by one in 60 digits."""
         generator = random.Random(SEED)
+        moved = (*self.transformed, *self.forces)
+        tape = Tape(moved, (*self.arguments, self.time, *parameters))
         for attempt in range(ATTEMPTS):
             if count == 0:
                 return
@@ -99,9 +101,9 @@ class Rates:
             for k, argument in enumerate(self.arguments):
                 size = 1.5 if k < len(self.momenta) else SPREADS[attempt % len(SPREADS)]
                 values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
-            known: dict[Expr, Number] = {}
             try:
-                found = self._sample(values, functools.partial(evaluate, values=values, known=known))
+                known = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
+                found = self._sample(values, functools.partial(_known_or_evaluated, known, values))
             except ArithmeticError:
                 continue
             count -= 1
@@ -114,6 +116,10 @@ class Rates:
         p, v = (second, transformed) if self.hamiltonian else (transformed, second)
         values |= dict(zip(self.momenta, p, strict=True))
         return Sample(t=values[self.time], state=(*q, *p), rates=(*v, *forces), value=value)
+
+
+def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Number], expression: Expr) -> Number:
+    return known[expression] if expression in known else evaluate(expression, values)
 
 
 def rates_of(system: MechanicalSystem) -> Rates:
