@@ -128,7 +128,7 @@ def test_model_files_hold_a_hamiltonian() -> None:
     [
         ("hamiltonian =", "lagrangian =", "momenta beside a lagrangian"),
         ('hamiltonian = "p*q"', 'hamiltonian = "p*q"\nlagrangian = "q"', "both of lagrangian and hamiltonian"),
-        ('hamiltonian = "p*q"', "", "neither of lagrangian and hamiltonian"),
+        ('hamiltonian = "p*q"', "", "no hamiltonian or lagrangian"),
         ('"p",', "1,", "momenta must be a list of names"),
     ],
 )
