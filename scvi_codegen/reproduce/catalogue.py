@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from itertools import chain
 
-from scvi_codegen.reproduce import claims, theorems
-from scvi_codegen.reproduce.correction import experiment as correction
+from scvi_codegen.reproduce import claims, correction, theorems
 from scvi_codegen.reproduce.kepler import figures_13_to_20, figures_23_to_30, overview
 from scvi_codegen.reproduce.laboratory.experiment import Experiment
 from scvi_codegen.reproduce.oscillators import duffing, oscillator, oscillator_orders, pendulum, two_point_pendulum

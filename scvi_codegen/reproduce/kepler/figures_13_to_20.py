@@ -1,6 +1,6 @@
 """Section 3.3.4: SVI and SC on Kepler's problem.
 
-Figs. 13-15, long runs, are here; 16 and 17 in :mod:`.kepler_more_points`, 18-20 in :mod:`.kepler_smaller_steps`.
+Figs. 13-15, long runs, are here; 16 and 17 in :mod:`.more_points`, 18-20 in :mod:`.smaller_steps`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.methods import SVI, SpectralCollocation
-from scvi_codegen.reproduce.kepler import more_points as kepler_more_points
-from scvi_codegen.reproduce.kepler import smaller_steps as kepler_smaller_steps
+from scvi_codegen.reproduce.kepler import more_points, smaller_steps
 from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
 from scvi_codegen.reproduce.kepler.motion import (
     SYSTEM,
@@ -215,7 +214,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         name="figure-15", title="Kepler, e = 0.5: angular momentum of SVI and SC over 318 revolutions", run=_figure_15
     ),
-    *kepler_more_points.EXPERIMENTS,
-    *kepler_smaller_steps.EXPERIMENTS,
+    *more_points.EXPERIMENTS,
+    *smaller_steps.EXPERIMENTS,
 )
 """Figs. 13-20."""

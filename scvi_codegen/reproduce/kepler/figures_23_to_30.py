@@ -1,7 +1,7 @@
 """Section 4.3.2: SCVI on Kepler's problem.
 
 Figs. 23-26, with two points, are here. With more points the printed equations and the variational ones part: Fig. 27 in
-:mod:`.kepler_phase_plane`, Figs. 28-30 in :mod:`.kepler_many_points`.
+:mod:`.phase_plane`, Figs. 28-30 in :mod:`.many_points`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI, SpectralCollocation
-from scvi_codegen.reproduce.kepler import many_points as kepler_many_points
-from scvi_codegen.reproduce.kepler import phase_plane as kepler_phase_plane
+from scvi_codegen.reproduce.kepler import many_points, phase_plane
 from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
 from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, perihelion, perihelion_turn, revolutions
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
@@ -339,7 +338,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(name="figure-24", title="Kepler: orbits of SCVI with two points, SC with three", run=_figure_24),
     Experiment(name="figure-25", title="Kepler: momentum of SCVI with two points, SC with three", run=_figure_25),
     Experiment(name="figure-26", title="Kepler: energies of SCVI with two points, SC with three", run=_figure_26),
-    *kepler_phase_plane.EXPERIMENTS,
-    *kepler_many_points.EXPERIMENTS,
+    *phase_plane.EXPERIMENTS,
+    *many_points.EXPERIMENTS,
 )
 """Figs. 23-30."""

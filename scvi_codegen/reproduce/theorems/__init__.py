@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from scvi_codegen.reproduce.theorems import collocation as collocation_theorem
-from scvi_codegen.reproduce.theorems import order as order_theorem
-from scvi_codegen.reproduce.theorems import rates as rate_theorems
+from scvi_codegen.reproduce.theorems import collocation, order, rates
 
 __all__ = ["EXPERIMENTS"]
 
-EXPERIMENTS = (collocation_theorem.EXPERIMENT, order_theorem.EXPERIMENT, *rate_theorems.EXPERIMENTS)
+EXPERIMENTS = (collocation.EXPERIMENT, order.EXPERIMENT, *rates.EXPERIMENTS)
 """In the paper's order."""
