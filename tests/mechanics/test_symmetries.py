@@ -311,8 +311,36 @@ def test_a_gauge_of_ones_own():
     assert not SVI(4).exactness.keeps(found)
 
 
+GAUGED = {
+    "periodic": ("x_dot**2/2 - k*x**2/2", ["cos(sqrt(k)*t)"], "sqrt(k)*x*sin(sqrt(k)*t) + p_x*cos(sqrt(k)*t)"),
+    "growing": ("x_dot**2/2 + k*x**2/2", ["exp(sqrt(k)*t)"], "-sqrt(k)*x*exp(sqrt(k)*t) + p_x*exp(sqrt(k)*t)"),
+    "transcendental in x": ("x_dot**2/2 + cos(x)*x_dot", ["1"], "p_x - cos(x) + 1"),
+}
+
+
+@pytest.mark.parametrize("name", GAUGED)
+def test_a_gauge_that_is_not_quadratic_is_found(name):
+    lagrangian, direction, expected = GAUGED[name]
+    system = LagrangianSystem.from_text(
+        name=name, coordinates=["x"], lagrangian=lagrangian, parameters={"k": 2.0} if "k*" in lagrangian else {}
+    )
+    found = check_symmetry(system, direction)
+    assert str(found.momentum_map) == expected
+    assert check_symmetry(system, direction, gauge=found.gauge).momentum_map == found.momentum_map
+
+
+def test_what_is_not_decided_is_not_denied():
+    drift = "exp(x**2)*sin(x)"
+    system = LagrangianSystem.from_text(
+        name="drift", coordinates=["x"], lagrangian=f"x_dot**2/2 + {drift}*x_dot", parameters={}
+    )
+    with pytest.raises(SystemDefinitionError, match=r"'drift' is not decided: .* give it as gauge"):
+        check_symmetry(system, ["1"])
+    assert check_symmetry(system, ["1"], gauge=drift).gauge != 0
+
+
 WRONG = {
-    "along it L changes by -mu*q1/(q1**2 + q2**2)**(3/2), not the time derivative of a polynomial f": ["1", "0"],
+    "along it L changes by -mu*q1/(q1**2 + q2**2)**(3/2), not the time derivative of any f(q, t)": ["1", "0"],
     "along it L changes by .*q1_dot": ["t", "0"],
     "L changes by .* \\+ q1_dot\\*\\*2 \\+ q2_dot\\*\\*2": ["q1", "q2"],
     "is no symmetry of 'Kepler problem'": ["-q2*(1 + 1e-9)", "q1"],

@@ -43,15 +43,19 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
     monomial_columns,
     rigid_columns,
 )
+from scvi_codegen.mechanics.symmetry.gauge import integrated, is_total_derivative
 from scvi_codegen.mechanics.symmetry.invariants import Polynomial, conserved
 from scvi_codegen.mechanics.symmetry.names import name_of
 from scvi_codegen.mechanics.symmetry.sampling import rates_of
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.precision import mp
 
 __all__ = ["Symmetry", "all_symmetries", "check_symmetry", "symmetries"]
 
 MOST_COORDINATES = 12
 LONGEST_SHOWN = 300
+DECIDED_AT = 3
+"""Points at which the change of L is looked at."""
 
 
 MOST_SHOWN = 12
@@ -163,12 +167,13 @@ def check_symmetry(
     Args:
         system: what moves.
         direction: xi, m expressions in coordinates, time and parameters, as SymPy or as text.
-        gauge: f with L_q . xi + L_v . dxi/dt = df/dt; by default one that is quadratic in q, if there is one.
+        gauge: f with L_q . xi + L_v . dxi/dt = df/dt; left out, it is searched among those quadratic in q and, of a
+            Lagrangian, integrated.
         name: what the conserved quantity is called.
 
     Raises:
-        SystemDefinitionError: with the change of L, if it is not the time derivative of f; naming the symbol, if one
-            is unknown.
+        SystemDefinitionError: with the change of L, if it is not the time derivative of f, or if that is not decided;
+            naming the symbol, if one is unknown.
 
     >>> from scvi_codegen.models.systems import kepler
     >>> print(check_symmetry(kepler(), ["-q2", "q1"]))
@@ -184,6 +189,9 @@ def check_symmetry(
     quadratic = system.dimension <= MOST_COORDINATES
     gauges = list(gauge_columns(system.dimension, quadratic=quadratic)) if f is None else []
     rows = [row for row in conserved(system, rates_of(system), [product, *gauges]) if 0 in row]
+    if not rows and f is None and not system.auxiliaries:
+        f = _integrated_gauge(system, xi)
+        product, gauges, rows = product - f, [], [{0: sympy.S.One}]
     if not rows:
         raise SystemDefinitionError(_defect(system, xi, f))
     terms = combined({c: x / rows[0][0] for c, x in rows[0].items() if c}, [product, *gauges])
@@ -196,6 +204,23 @@ def check_symmetry(
         direction=xi,
         gauge=(f or sympy.S.Zero) - added,
         momentum_map=product + added,
+    )
+
+
+def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
+    """The f of a direction whose f is not quadratic."""
+    change, motion = _change(system, xi), rates_of(system)
+    f = integrated(system, change)
+    if f is not None:
+        product = sympy.Add(*(a * b for a, b in zip(system.momentum_symbols, xi, strict=True)), -f)
+        if conserved(system, motion, [product]):
+            return f
+    parameters = {x: mp.mpf(value) for x, value in motion.constants.items()}
+    if is_total_derivative(system, change, motion.points(parameters, DECIDED_AT)) is False:
+        raise SystemDefinitionError(_defect(system, xi, None))
+    raise SystemDefinitionError(
+        f"whether ({', '.join(map(str, xi))}) is a symmetry of '{system.name}' is not decided: along it L changes by "
+        f"{_cut(change)}, whose f was not found; give it as gauge"
     )
 
 
@@ -312,12 +337,17 @@ def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str
     """What L changes by along a direction that is no symmetry."""
     change, what = _change(system, xi), "along it L changes by"
     if f is None:
-        reason = "not the time derivative of a polynomial f quadratic in q; any other f can be given as gauge"
+        searched = "a polynomial f quadratic in q; any other f can be given as gauge"
+        reason = f"not the time derivative of {searched if system.auxiliaries else 'any f(q, t)'}"
     else:
         change, what = change - _rate(system, f), "the change of L is not the derivative of the gauge but differs by"
         reason = "not 0"
-    shown = str(change) if len(str(change)) <= LONGEST_SHOWN else f"{str(change)[:LONGEST_SHOWN]} ..."
-    return f"({', '.join(map(str, xi))}) is no symmetry of '{system.name}': {what} {shown}, {reason}"
+    return f"({', '.join(map(str, xi))}) is no symmetry of '{system.name}': {what} {_cut(change)}, {reason}"
+
+
+def _cut(change: Expr) -> str:
+    text = str(change)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} ..."
 
 
 def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
