@@ -28,9 +28,9 @@ enum {
   KEPLER_SVI_4_NOT_FINITE = 3     /* an infinity or a NaN turned up */
 };
 
-/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of the
- * end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With absolute =
- * 1 the largest update itself must fall below tolerance. */
+/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of
+ * the end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With
+ * absolute = 1 the largest update itself must fall below tolerance. */
 typedef struct {
   double tolerance;
   int max_iterations;
@@ -83,7 +83,8 @@ int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, co
     const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace);
 
 /* A run with compensated sums and extrapolated guesses: start it, then advance it as often as wanted. Every `every`
- * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k). */
+ * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k).
+ * */
 void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p);
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations,

@@ -29,9 +29,9 @@ enum {
   PENDULUM_STOERMER_VERLET_NOT_FINITE = 3     /* an infinity or a NaN turned up */
 };
 
-/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of the
- * end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With absolute =
- * 1 the largest update itself must fall below tolerance. */
+/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of
+ * the end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With
+ * absolute = 1 the largest update itself must fall below tolerance. */
 typedef struct {
   double tolerance;
   int max_iterations;
@@ -77,7 +77,8 @@ int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const do
     const pendulum_stoermer_verlet_options *options, double *q1, double *p1, pendulum_stoermer_verlet_report *report, double *workspace);
 
 /* A run with compensated sums and extrapolated guesses: start it, then advance it as often as wanted. Every `every`
- * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k). */
+ * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k).
+ * */
 void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t, double h, const double *q, const double *p);
 int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long long steps, long long every, const double *parameters,
     const pendulum_stoermer_verlet_options *options, double *t, double *q, double *p, int *iterations,

@@ -21,14 +21,14 @@ def texts() -> dict[str, str]:
     files = {}
     for prefix, (name, method) in INTEGRATORS.items():
         source, _ = generate_source(problem(name).system, method, prefix=prefix)
-        files |= {f"{prefix}.h": source.header, f"{prefix}.c": source.code}
+        files |= source.files
     return files
 
 
 def main() -> None:
     """Write every file, and remove C files that are no longer made."""
     files = texts()
-    for path in {*FOLDER.glob("*.[ch]")} - {FOLDER / name for name in files}:
+    for path in {*FOLDER.glob("**/*.[ch]")} - {FOLDER / name for name in files}:
         path.unlink()
     for name, text in files.items():
         (FOLDER / name).write_text(text, encoding="utf-8", newline="\n")

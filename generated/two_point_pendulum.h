@@ -29,9 +29,9 @@ enum {
   TWO_POINT_PENDULUM_NOT_FINITE = 3     /* an infinity or a NaN turned up */
 };
 
-/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of the
- * end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With absolute =
- * 1 the largest update itself must fall below tolerance. */
+/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of
+ * the end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With
+ * absolute = 1 the largest update itself must fall below tolerance. */
 typedef struct {
   double tolerance;
   int max_iterations;
@@ -77,7 +77,8 @@ int two_point_pendulum_step(double t, double h, const double *q0, const double *
     const two_point_pendulum_options *options, double *q1, double *p1, two_point_pendulum_report *report, double *workspace);
 
 /* A run with compensated sums and extrapolated guesses: start it, then advance it as often as wanted. Every `every`
- * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k). */
+ * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k).
+ * */
 void two_point_pendulum_start(two_point_pendulum_run *run, double t, double h, const double *q, const double *p);
 int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, long long every, const double *parameters,
     const two_point_pendulum_options *options, double *t, double *q, double *p, int *iterations,

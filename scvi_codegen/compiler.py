@@ -205,6 +205,7 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         map_names=tuple(each.name for each in program.momentum_maps),
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
+        has_fallback=program.newton and program.sweep is not None,
         momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
     )
 

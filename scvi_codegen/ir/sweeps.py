@@ -29,6 +29,9 @@ __all__ = [
 
 LaneTable: TypeAlias = tuple[tuple[float, ...], ...]
 
+STALLED = 0.0625
+"""A sweep that shrinks the square of the last change by less has come to rounding."""
+
 
 @dataclass(frozen=True, slots=True)
 class SplitVector:
@@ -87,6 +90,9 @@ class SeparableSweep:
     mass: Kernel
 
     kind: ClassVar[str] = "separable"
+    sweeps_after: ClassVar[int] = 1
+    """The final one, with all digits of the coefficients."""
+    stalled: ClassVar[float] = STALLED
     mass_entries: ClassVar[tuple[tuple[int, int], ...]] = ()
     diagonal: ClassVar[bool] = True
 
@@ -161,6 +167,8 @@ class CoupledSweep(PointSweep):
     mass_entries: tuple[tuple[int, int], ...]
 
     kind: ClassVar[str] = "coupled"
+    sweeps_after: ClassVar[int] = 0
+    stalled: ClassVar[float] = STALLED
 
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
@@ -185,6 +193,8 @@ class HamiltonianSweep(PointSweep):
     """
 
     kind: ClassVar[str] = "hamiltonian"
+    sweeps_after: ClassVar[int] = 0
+    stalled: ClassVar[float] = STALLED
     projected: ClassVar[bool] = False
     diagonal: ClassVar[bool] = True
     mass_entries: ClassVar[tuple[tuple[int, int], ...]] = ()
@@ -288,6 +298,8 @@ class ShootingSweep(CurveSweep):
     consistency: tuple[float, ...]
 
     kind: ClassVar[str] = "shooting"
+    sweeps_after: ClassVar[int] = 0
+    stalled: ClassVar[float] = STALLED
 
     def memory(self, dimension: int) -> int:
         """Z of the last two steps, v0 and m."""
@@ -328,6 +340,9 @@ class CollocationSweep(CurveSweep):
     ends: PrintedEnds | None
 
     kind: ClassVar[str] = "collocation"
+    sweeps_after: ClassVar[int] = 0
+    stalled: ClassVar[float] = 0.5
+    """Runge-Kutta methods of few stages contract slowly."""
 
     def memory(self, dimension: int) -> int:
         """Z of the last two steps and v0."""

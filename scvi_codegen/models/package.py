@@ -1,6 +1,7 @@
 """A folder with everything one integrator needs: C for C programs, an importable package for Python.
 
     pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
+                   support/                         what it includes, the same C for every integrator
                    main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
                    __init__.py  interface.json      ``import pendulum_svi`` gives ``pendulum_svi.stepper``
                    model.toml  README.md            what it was made from, and how to use it
@@ -15,6 +16,7 @@ import hashlib
 import json
 import keyword
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -24,7 +26,7 @@ from typing import IO, TYPE_CHECKING
 
 from scvi_codegen.errors import ModelFileError, PackageError, StateError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.runtime.stepper import Stepper
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ __all__ = ["CERTIFICATE_FILE", "generate_package", "load_package"]
 
 INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1
+FILE_NAME = re.compile(r"(support/)?[\w.]+")
 OUTPUTS = 20
 
 OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
@@ -79,6 +82,7 @@ def generate_package(
         for name in stale:
             (target / name).unlink(missing_ok=True)
         for name, text in texts.items():
+            (target / name).parent.mkdir(exist_ok=True)
             write_atomically(target / name, partial(_write, text))
     except OSError as error:
         raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error
@@ -100,15 +104,21 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         if "__init__.py" not in record["files"]:
             raise PackageError(f"{target} is for a microcontroller: for Python generate it without --embedded")
         interface = Interface.from_json(json.dumps(record["interface"]))
-        header, code = ((target / f"{interface.prefix}.{kind}").read_text(encoding="utf-8") for kind in "hc")
+        header, code = (_read(target / f"{interface.prefix}.{kind}") for kind in "hc")
         declarations = "\n".join(record["declarations"])
+        support = tuple((name, _read(target / name)) for name in included(code))
     except OSError as error:
         raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, PackageError):
             raise
         raise PackageError(f"{target / INTERFACE_FILE} is damaged ({error!r}): generate the folder again") from error
-    return Stepper(Source(prefix=interface.prefix, header=header, code=code, declarations=declarations), interface)
+    source = Source(prefix=interface.prefix, header=header, code=code, declarations=declarations, support=support)
+    return Stepper(source, interface)
+
+
+def _read(file: Path) -> str:
+    return file.read_text(encoding="utf-8")
 
 
 def _write(text: str, file: IO[bytes]) -> None:
@@ -141,7 +151,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None) ->
     from scvi_codegen.rendering.text import render_example
 
     source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix, embedded=embedded)
-    texts = {f"{prefix}.h": source.header, f"{prefix}.c": source.code}
+    texts = source.files
     texts |= render_example(interface, _example(model), embedded or "double")
     described = _model_text(model)
     if described is not None:
@@ -246,7 +256,7 @@ def _stale(folder: Path, texts: Mapping[str, str]) -> list[str]:
     same = all(known.get(name) == _checksum(text.encode()) for name, text in texts.items() if name != INTERFACE_FILE)
     return [
         *([] if same else [CERTIFICATE_FILE]),
-        *(name for name in known if name not in texts and Path(name).name == name),
+        *(name for name in known if name not in texts and FILE_NAME.fullmatch(name)),
     ]
 
 

@@ -129,9 +129,7 @@ def compiler_title() -> str:
 
 def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
     parts = [
-        source.header,
-        source.code,
-        source.declarations,
+        json.dumps([each.to_record() for each in source.sources]),
         " ".join(compiler),
         _compiler_version(compiler),
         " ".join(flags),
@@ -261,11 +259,12 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     from cffi import FFI  # only building needs the parser; loading does not
     from cffi.recompiler import make_c_source  # what FFI.emit_c_code calls, without its message on stdout
 
-    (folder / f"{source.prefix}.h").write_text(source.header, encoding="utf-8")
-    (folder / f"{source.prefix}.c").write_text(source.code, encoding="utf-8")
+    for name, text in source.files.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
     binding = FFI()
-    binding.cdef(source.declarations)
-    preamble = f'#include "{source.prefix}.h"'
+    binding.cdef("".join(each.declarations for each in source.sources))
+    preamble = "".join(f'#include "{each.prefix}.h"\n' for each in source.sources)
     binding.set_source(folder.name, preamble)
     make_c_source(binding, folder.name, preamble, str(folder / "binding.c"), verbose=False)
     include = sysconfig.get_paths()["include"]
@@ -273,16 +272,18 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
     wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
     _run([*compiler, *shared, "-O1", "-c", "binding.c", "-o", "binding.o"], folder)
-    objects = ["-shared", *wanted, *python, "binding.o", "integrator.o"]
+    parts = [f"{each.prefix}.o" for each in source.sources]
+    objects = ["-shared", *wanted, *python, "binding.o", *parts]
     for define, libraries in _mathematics(flags):
-        _run([*compiler, *shared, *flags, *define, *wanted, "-c", f"{source.prefix}.c", "-o", "integrator.o"], folder)
+        for each in source.sources:
+            _run([*compiler, *shared, *flags, *define, *wanted, "-c", f"{each.prefix}.c"], folder)
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
         except BuildError:
             if not define:
                 raise
-    for name in ("binding.o", "integrator.o", "binding.c"):
+    for name in ("binding.o", *parts, "binding.c"):
         (folder / name).unlink()
 
 

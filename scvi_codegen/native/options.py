@@ -8,6 +8,7 @@ from typing import Any
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.rendering.target import MAX_ITERATIONS, TOLERANCE
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 
@@ -34,8 +35,8 @@ class SolverOptions:
         absolute: compare the update itself, the paper's rule max(|dQ|, |dP|) < TOL.
     """
 
-    tolerance: float = 2.0**-52
-    max_iterations: int = 50
+    tolerance: float = TOLERANCE
+    max_iterations: int = MAX_ITERATIONS
     absolute: bool = False
 
     def __post_init__(self) -> None:

@@ -2,65 +2,95 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cache
+from typing import TypeAlias
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
+from jinja2.runtime import Context
 
 from scvi_codegen.files.templates import template_folder
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.parts import Part, parts
-from scvi_codegen.rendering.printer import (
-    ARRAYS,
-    print_lane_statements,
-    print_number,
-    print_statements,
-)
+from scvi_codegen.rendering.functions import kernel_text, lane_kernel_text, lane_mass_text
+from scvi_codegen.rendering.layout import table, wrapped
+from scvi_codegen.rendering.printer import print_number
 
-__all__ = ["template_environment"]
+__all__ = ["support_text", "template_environment"]
 
-
-def _signature(code: Kernel | Part) -> str:
-    """C parameters of a kernel or of a part of one: only what it uses."""
-    declared = {"u": "const double *u", "t": "double t", "parameters": "const double *parameters"}
-    declared |= {"kept": "double *restrict kept"}
-    return ", ".join(declared.get(array, f"double *{array}") for array in ARRAYS if code.uses(array))
-
-
-def _lane_signature(code: Kernel | Part, sources: tuple[str, ...]) -> str:
-    """The same with vectors in place of numbers."""
-    vectors = ("*u", "*restrict kept", "*value", "*slope", *(("t",) if "t" in sources else ("*parameters",)))
-    signature = _signature(code)
-    for name in vectors:
-        signature = signature.replace(f"double {name}", f"lanes {name}")
-    return signature
-
-
-def _parts(kernel: Kernel) -> tuple[Part, ...]:
-    """The functions that a kernel calls, if it is cut into several."""
-    cut = parts(kernel)
-    return cut if len(cut) > 1 else ()
-
-
-def _call_arguments(kernel: Kernel, u: str, t: str, parameters: str, value: str, slope: str | None) -> str:
-    """The same parameters in a call."""
-    parts = [u] if kernel.uses_arguments else []
-    parts += [t] if kernel.uses_time else []
-    parts += [parameters] if kernel.uses_parameters else []
-    parts += [value]
-    parts += [slope] if slope is not None else []
-    return ", ".join(parts)
+Rows: TypeAlias = Sequence[Sequence[float]]
 
 
 def _power_of_h(k: int) -> str:
     """C text of h^k as a factor."""
-    product = "*".join(["h"] * abs(k))
+    product = " * ".join(["h"] * abs(k))
     if k == 0:
-        return "1.0"
-    return product if k > 0 else f"1.0/({product})"
+        return "1"
+    return product if k > 0 else f"1 / ({product})"
 
 
-def _counts(kernel: Kernel) -> str:
-    return ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
+@pass_context
+def _number(context: Context, value: float) -> str:
+    return print_number(value, context["target"])
+
+
+def _numbers(context: Context, values: Sequence[float]) -> list[str]:
+    return [_number(context, value) for value in values]
+
+
+@pass_context
+def _vector(context: Context, name: str, values: Sequence[float]) -> str:
+    """A table of numbers."""
+    return table(f"static const {context['target'].scalar} {name}[{len(values)}]", _numbers(context, values))
+
+
+@pass_context
+def _matrix(context: Context, name: str, rows: Rows) -> str:
+    """A table of rows of numbers."""
+    size = f"[{len(rows)}][{len(rows[0])}]"
+    return table(f"static const {context['target'].scalar} {name}{size}", [_numbers(context, row) for row in rows])
+
+
+def _integers(name: str, values: Sequence[int]) -> str:
+    """A table of whole numbers; the name has its size."""
+    return table(f"static const int {name}", list(map(str, values)))
+
+
+def _pairs(name: str, entries: Sequence[tuple[int, int]]) -> str:
+    """A table of pairs of places."""
+    return table(f"static const int {name}[{len(entries)}][2]", [f"{{{i}, {j}}}" for i, j in entries])
+
+
+@pass_context
+def _kernel_text(context: Context, kernel: Kernel, *, slopes: bool = False) -> str:
+    return kernel_text(kernel, context["target"], slopes=slopes)
+
+
+@pass_context
+def _lane_kernel_text(context: Context, kernel: Kernel) -> str:
+    return lane_kernel_text(kernel, context["program"].sweep, context["sweep"].meaning)
+
+
+@pass_context
+def _lane_mass_text(context: Context, kernel: Kernel) -> str:
+    meaning = context["sweep"].meaning
+    return lane_mass_text(kernel, context["program"].sweep, meaning, context["target"])
+
+
+FUNCTIONS: dict[str, Callable[..., str]] = {
+    "power_of_h": _power_of_h,
+    "vector": _vector,
+    "matrix": _matrix,
+    "integers": _integers,
+    "pairs": _pairs,
+}
+FILTERS: dict[str, Callable[..., object]] = {
+    "number": _number,
+    "kernel_text": _kernel_text,
+    "lane_kernel_text": _lane_kernel_text,
+    "lane_mass_text": _lane_mass_text,
+    "transposed": lambda rows: tuple(zip(*rows, strict=True)),
+    "wrapped": wrapped,
+}
 
 
 @cache
@@ -74,17 +104,12 @@ def template_environment() -> Environment:
         keep_trailing_newline=True,
         autoescape=False,
     )
-    environment.globals["power_of_h"] = _power_of_h
-    environment.filters |= {
-        "number": print_number,
-        "signature": _signature,
-        "parts": _parts,
-        "call_arguments": _call_arguments,
-        "counts": _counts,
-        "pairs": lambda entries: ", ".join(f"{{{i}, {j}}}" for i, j in entries),
-        "transposed": lambda rows: tuple(zip(*rows, strict=True)),
-        "lane_signature": _lane_signature,
-        "statements": print_statements,
-        "lane_statements": print_lane_statements,
-    }
+    environment.globals |= FUNCTIONS
+    environment.filters |= FILTERS
     return environment
+
+
+@cache
+def support_text(name: str) -> str:
+    """The text of a support header, by its name ``support/<what it holds>.h``."""
+    return (template_folder() / name).read_text(encoding="utf-8")

@@ -1,12 +1,12 @@
-"""Events in C: formulas to a kernel, and the search for its zeros appended to the text of an integrator.
+"""Events in C: formulas to a kernel, and the search for its zeros beside the text of an integrator.
 
 The search uses nothing of an integrator but its public functions, so that it stands behind every method and solver, and
-the text without events stays what it is. What it does on a step is said in ``templates/parts/events.c.jinja``:
+the text without events stays what it is. What it does on a step is said in ``templates/support/events.h``:
 
 * the functions are evaluated at its ends and at three states between them, each a step of a part of h, and polynomials
   of degree 4 drawn through the values;
 * a polynomial tells how often its function crosses zero. Where an extremum is so near zero that its sign is in doubt
-  (nearer than the last two Chebyshev coefficients), the step is split there, ``SPLITS`` times over, and the function
+  (nearer than the last two Chebyshev coefficients), the step is split there, some times over, and the function
   decides;
 * each crossing is enclosed by steps of parts of h until the ends are neighbouring numbers.
 
@@ -39,12 +39,11 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["with_events"]
 
 DEGREE = 4
-SPLITS = 6
 
 
 @lru_cache(maxsize=64)
 def with_events(source: Source, interface: Interface, functions: tuple[str | Expr, ...]) -> Source:
-    """The text of an integrator with the search for zeros of functions of its state behind it.
+    """The text of an integrator with the search for zeros of functions of its state beside it.
 
     Args:
         source, interface: of the integrator, without events.
@@ -55,13 +54,7 @@ def with_events(source: Source, interface: Interface, functions: tuple[str | Exp
         EventError: naming the symbol or function at fault.
     """
     kernel, uses_velocity = _kernel(interface, functions)
-    declarations, code = render_events(_search(interface, kernel, uses_velocity), source)
-    return replace(
-        source,
-        header=source.header.replace(source.declarations, source.declarations + declarations),
-        code=source.code + code,
-        declarations=source.declarations + declarations,
-    )
+    return replace(source, events=render_events(_search(interface, kernel, uses_velocity)))
 
 
 def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:
@@ -141,5 +134,4 @@ def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventS
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),
-        splits=SPLITS,
     )

@@ -19,6 +19,7 @@ HEAD = re.compile(
     r"\((?P<arguments>[^;{}]*)\)\n\{\n(?P<body>.*?)^\})$",
     re.MULTILINE | re.DOTALL,
 )
+HOT = re.compile(r"^#define HOT (.*)$", re.MULTILINE)
 WIDTH = 100
 
 
@@ -46,9 +47,16 @@ class Function:
 def functions_of(code: str) -> dict[str, Function]:
     """Every function with a body, by name, in the order of the text; of alternatives of the preprocessor the first."""
     found: dict[str, re.Match[str]] = {}
-    for match in HEAD.finditer(code):
+    for match in HEAD.finditer(_preprocessed(code)):
         found.setdefault(match["name"], match)
     return {name: _function(match, found) for name, match in found.items()}
+
+
+def _preprocessed(code: str) -> str:
+    """With the macros in function heads replaced: NAME begins an exported name, HOT says how a function is stored."""
+    prefix, stored = re.search(r"^#define NAME\(word\) (\w+)##word", code, re.MULTILINE), HOT.search(code)
+    text = re.sub(r"\bNAME\((\w+)\)", rf"{prefix[1]}\1", code) if prefix else code
+    return re.sub(r"^HOT ", f"{stored[1]} ", text, flags=re.MULTILINE) if stored else text
 
 
 def _function(match: re.Match[str], known: Mapping[str, re.Match[str]]) -> Function:

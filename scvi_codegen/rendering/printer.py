@@ -8,9 +8,11 @@ from typing import TypeAlias
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.ir.parts import Part, kept_numbers, parts
 from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.rendering.target import DOUBLE, Target
 
 __all__ = [
     "ARRAYS",
+    "INVERSE_ROOT",
     "constants",
     "lane_functions",
     "print_expression",
@@ -27,36 +29,43 @@ trajectories."""
 ARRAYS = ("u", "t", "parameters", "kept", "value", "slope")
 """What a kernel and its parts may use, in the order of their arguments."""
 
+INVERSE_ROOT = "inverse_root_"
+OWN_FUNCTIONS = (INVERSE_ROOT, "lanes_")
+
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
 
 
-def print_number(value: float) -> str:
-    """A C double literal that reads back as the same binary64 number."""
-    return repr(float(value))
+def print_number(value: float, target: Target = DOUBLE) -> str:
+    """A C literal that reads back as the same number of the target."""
+    return target.number(value)
 
 
-def print_expression(expression: Expression) -> str:
+def print_expression(expression: Expression, target: Target = DOUBLE) -> str:
     """C text of an expression over ``u``, ``t``, ``parameters`` and temporaries ``w<k>``."""
-    return _print(expression, 0)
+    return _print(expression, 0, target)
 
 
-def _print(expression: Expression, context: int) -> str:
+def _print(expression: Expression, context: int, target: Target) -> str:
     if isinstance(expression, Constant):
-        text = print_number(expression.value)
+        text = print_number(expression.value, target)
         return f"({text})" if text.startswith("-") and context else text
     if isinstance(expression, Load):
         return _load(expression)
     operator, operands = expression.operator, expression.operands
     if operator not in PRECEDENCE:
-        return f"{operator}({', '.join(_print(operand, 0) for operand in operands)})"
+        return f"{_function(operator, target)}({', '.join(_print(operand, 0, target) for operand in operands)})"
     level = PRECEDENCE[operator]
     if operator == "neg":
-        text = f"-{_print(operands[0], level + 1)}"
+        text = f"-{_print(operands[0], level + 1, target)}"
     else:
         left, right = operands
-        sign = f" {operator} " if level == 1 else operator
-        text = f"{_print(left, level)}{sign}{_print(right, level + 1)}"
+        text = f"{_print(left, level, target)} {operator} {_print(right, level + 1, target)}"
     return f"({text})" if level < context else text
+
+
+def _function(operator: str, target: Target) -> str:
+    """Those of libm have a name for each type, our own have one."""
+    return operator if operator.startswith(OWN_FUNCTIONS) else target.function(operator)
 
 
 def _load(load: Load) -> str:
@@ -96,15 +105,15 @@ def _expressions(part: Part) -> Iterator[Expression]:
             pending.extend(expression.operands)
 
 
-def print_statements(code: Kernel | Part) -> list[str]:
+def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
     """The statements of a kernel of numbers, or of one of its parts."""
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
-        return [f"double kept[{kept_numbers(cut)}];", *map(_call, cut)]
+        return [f"{target.scalar} kept[{kept_numbers(cut)}];", *map(_call, cut)]
     return [
-        f"const double w{k} = {print_expression(expression)};"
+        f"const {target.scalar} w{k} = {print_expression(expression, target)};"
         if kind == "w"
-        else f"{kind}[{k}] = {print_expression(expression)};"
+        else f"{kind}[{k}] = {print_expression(expression, target)};"
         for kind, k, expression in cut[0].statements
     ]
 

@@ -1,33 +1,96 @@
-"""C text and what is needed to call it: all that a stepper remembers of the symbolic world."""
+"""C text and what is needed to call it: all that a stepper remembers of the symbolic world.
+
+An integrator is one header and one source, ``<prefix>.h`` and ``<prefix>.c``. The source includes support headers,
+plain C that is the same for every integrator, from a folder ``support`` beside it; amalgamated they stand in it.
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from scvi_codegen.version import __version__
 
-__all__ = ["Interface", "Source"]
+__all__ = ["Interface", "Source", "included"]
+
+
+TEXTS = ("header", "code", "declarations")
+INCLUDED = re.compile(r'^#include "(support/\w+\.h)"\n', re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """C text of an integrator, files ``<prefix>.h`` and ``<prefix>.c``; ``declarations`` is the header's inner part."""
+    """C text of an integrator.
+
+    Attributes:
+        prefix: beginning of every exported C name.
+        header, code: texts of ``<prefix>.h`` and ``<prefix>.c``.
+        declarations: the header's inner part.
+        support: name and text of each header that the code includes from beside it, in order.
+        events: the search for zero crossings, a header and a source of its own behind this one.
+    """
 
     prefix: str
     header: str
     code: str
     declarations: str
+    support: tuple[tuple[str, str], ...] = ()
+    events: Source | None = None
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Text by file name, ``/`` between folders."""
+        own = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
+        return own | (self.events.files if self.events else {})
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """What is compiled: this one, and the search for events if there is one."""
+        return (self, self.events) if self.events else (self,)
+
+    def amalgamated(self) -> Source:
+        """The same with each support header in the place where it is included."""
+        texts = dict(self.support)
+        code = INCLUDED.sub(lambda include: texts[include[1]] if include[1] in texts else include[0], self.code)
+        events = self.events.amalgamated() if self.events else None
+        return replace(self, code=code, support=(), events=events)
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain data, texts line by line, read back by :meth:`from_record`."""
+        return {
+            "prefix": self.prefix,
+            **{name: getattr(self, name).split("\n") for name in TEXTS},
+            "support": {name: text.split("\n") for name, text in self.support},
+            "events": self.events.to_record() if self.events else None,
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Source:
+        """The source that :meth:`to_record` gave, also one of version 0.1, which has no support headers."""
+        events = record.get("events")
+        return cls(
+            prefix=record["prefix"],
+            **{name: "\n".join(record[name]) for name in TEXTS},
+            support=tuple((name, "\n".join(lines)) for name, lines in record.get("support", {}).items()),
+            events=cls.from_record(events) if events else None,
+        )
 
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`."""
-        return json.dumps(asdict(self))
+        return json.dumps(self.to_record())
 
     @classmethod
     def from_json(cls, text: str) -> Source:
         """The source written by :meth:`to_json`."""
-        return cls(**json.loads(text))
+        return cls.from_record(json.loads(text))
+
+
+def included(code: str) -> tuple[str, ...]:
+    """The support headers that a text includes, in order."""
+    return tuple(INCLUDED.findall(code))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +107,7 @@ class Interface:
         unknowns: length of the run's memory of its last stages.
         workspace: doubles of workspace per call.
         has_action: whether the method has a discrete Lagrangian.
+        has_fallback: whether Newton's iteration is tried where sweeps fail.
         map_names, map_formulas: of the momentum maps, what symmetries conserve.
         map_exact: whether the method is known to conserve them exactly, to round-off.
         momentum_names: of a Hamiltonian; see :attr:`momenta`.
@@ -64,6 +128,7 @@ class Interface:
     map_formulas: tuple[str, ...] = ()
     map_exact: tuple[bool, ...] = ()
     momentum_names: tuple[str, ...] = ()
+    has_fallback: bool = False
 
     @property
     def dimension(self) -> int:

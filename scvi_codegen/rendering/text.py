@@ -16,19 +16,14 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.parts import parts
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
-from scvi_codegen.rendering.environment import template_environment
-from scvi_codegen.rendering.printer import (
-    constants,
-    lane_functions,
-    scalar_functions,
-)
-from scvi_codegen.rendering.single_precision import SINGLE_UNIT, check_single, to_single
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
+from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
+from scvi_codegen.rendering.source import Interface, Source, included
+from scvi_codegen.rendering.target import DOUBLE, MAX_ITERATIONS, SINGLE, Target
 
 __all__ = [
-    "DEFAULT_TOLERANCE",
     "EMBEDDED",
-    "MAX_ITERATIONS",
     "Embedded",
     "EventSearch",
     "ExampleRun",
@@ -43,45 +38,21 @@ Embedded: TypeAlias = Literal["double", "single"]
 
 EMBEDDED: tuple[Embedded, ...] = get_args(Embedded)
 
-DEFAULT_TOLERANCE = 2.0**-52
-"""Relative update below which Newton's iteration has converged: the round-off unit of binary64."""
+TARGETS: dict[Embedded, Target] = {"double": DOUBLE, "single": SINGLE}
 
-MAX_ITERATIONS = 50
-
-ROUNDOFF_LEVEL = 1e-11
-
-SINGLE_ROUNDOFF_LEVEL = 1e-4
-
-KEEP_CHANGE = 1e-2
-
-KEEP_RATE = 0.1
-
-GOOD_GUESS = 1e-3
-"""Relative error below which the next guess is continued from two steps, not one."""
-
-MOST_TRIALS = 200
-
-SMALL_PART = 0.03
-
-STEEPNESS = 8.0
-
-BISECTIONS = 30
-"""Halvings of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60."""
-
-POINT_SOURCES = ("u", "t")
-
-TRAJECTORY_SOURCES = ("u", "parameters")
+DECLARATIONS = {
+    "stepper": "parts/declarations.h.jinja",
+    "ensemble": "parts/ensemble_declarations.h.jinja",
+    "events": "parts/events_declarations.h.jinja",
+}
+"""Inner part of a header by the name of its template."""
 
 ENSEMBLE_LANES = 8
-
-INVERSE_ROOT = "inverse_root_"
+"""Trajectories at a time: a vector of AVX-512, two of AVX2, four of NEON."""
 
 LARGEST_INLINED = 150
 """Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies
 3 per cent, a chain of 64 masses 20."""
-
-VECTOR_LIBRARY = ("sin", "cos", "exp", "log", "pow")
-"""What glibc's libmvec has for every x86-64 vector width since 2.22."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +79,6 @@ class EventSearch:
         nodes: (d + 1,) where they are evaluated on a part of a step, as fractions of it.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: of the last two of these, what part of them is in doubt.
-        splits: how many times over a step is split at most.
     """
 
     prefix: str
@@ -118,44 +88,35 @@ class EventSearch:
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
-    splits: int
 
 
 def render(program: Program) -> Source:
     """Header and source of a program; equal programs give equal bytes."""
-    return _render(program.prefix, _context(program))
+    return _render(program.prefix, _context(program, DOUBLE))
 
 
 def render_embedded(program: Program, precision: Embedded) -> Source:
-    """The same for a microcontroller: iterations bounded when it is compiled, in the precision of its registers.
+    """The same for a microcontroller: one file, iterations bounded when it is compiled, the scalars of its registers.
 
     Raises:
         MethodError: for a number that single precision cannot hold.
     """
+    target = TARGETS[precision]
+    target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
-    context = _context(program) | {
-        "embedded": True,
-        "most_iterations": MAX_ITERATIONS,
-        "max_iterations": bound,
-        "iteration_limit": f"least(options->max_iterations, {bound})",
-        "halvings": 52,
-    }
-    if precision == "double":
-        return _render(program.prefix, context)
-    check_single((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program)))))
-    levels = {"real": "float", "halvings": 23, "tolerance": SINGLE_UNIT, "roundoff_level": SINGLE_ROUNDOFF_LEVEL}
-    source = _render(program.prefix, context | levels)
-    header, code, declarations = map(to_single, (source.header, source.code, source.declarations))
-    return Source(prefix=source.prefix, header=header, code=code, declarations=declarations)
+    bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
+    return _render(program.prefix, _context(program, target) | bounded).amalgamated()
 
 
-def _render(prefix: str, context: Mapping[str, object]) -> Source:
+def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     environment = template_environment()
+    code = environment.get_template(f"{entry}.c.jinja").render(context)
     return Source(
         prefix=prefix,
-        header=environment.get_template("stepper.h.jinja").render(context),
-        code=environment.get_template("stepper.c.jinja").render(context),
-        declarations=environment.get_template("parts/declarations.h.jinja").render(context),
+        header=environment.get_template(f"{entry}.h.jinja").render(context),
+        code=code,
+        declarations=environment.get_template(DECLARATIONS[entry]).render(context),
+        support=tuple((name, support_text(name)) for name in included(code)),
     )
 
 
@@ -168,57 +129,44 @@ def render_ensemble(program: Program) -> Source | None:
     context = {
         "program": program,
         "prefix": prefix,
-        "cut": _is_cut(sweep.kernels),
-        "tolerance": DEFAULT_TOLERANCE,
+        "target": DOUBLE,
         "max_iterations": MAX_ITERATIONS,
         "width": ENSEMBLE_LANES,
-        "lane_meaning": "trajectories",
-        **_vector_context(sweep, TRAJECTORY_SOURCES),
+        "points": sweep.points,
+        "cut": _is_cut(sweep.kernels),
+        "needs_velocities": isinstance(sweep, CoupledSweep),
+        "hot": "static",
+        "sweep": sweep_text(sweep, TRAJECTORIES, ENSEMBLE_LANES, newton=False, hamiltonian=False),
     }
-    environment = template_environment()
-    return Source(
-        prefix=prefix,
-        header=environment.get_template("ensemble.h.jinja").render(context),
-        code=environment.get_template("ensemble.c.jinja").render(context),
-        declarations=environment.get_template("parts/ensemble_declarations.h.jinja").render(context),
-    )
+    return _render(prefix, context, "ensemble")
 
 
-def render_events(search: EventSearch, source: Source) -> tuple[str, str]:
-    """Declarations and code of the search for events, to stand behind those of an integrator."""
-    needed = _inverse_roots(scalar_functions(search.kernel))
+def render_events(search: EventSearch) -> Source:
+    """The search for events, a header and a source behind those of an integrator."""
     context = {
+        "search": search,
         "prefix": search.prefix,
-        "dimension": search.dimension,
+        "target": DOUBLE,
         "kernel": search.kernel,
-        "uses_velocity": search.uses_velocity,
-        "nodes": search.nodes,
-        "coefficients": search.coefficients,
-        "doubts": search.doubts,
-        "splits": search.splits,
-        "events": search.kernel.values,
-        "small_part": SMALL_PART,
-        "steepness": STEEPNESS,
-        "trials": MOST_TRIALS,
-        "bisections": BISECTIONS,
-        "inverse_roots": [k for k in needed if f" {INVERSE_ROOT}{k}(double" not in source.code],
+        "cut": _is_cut((search.kernel,)),
+        "inverse_roots": _inverse_roots(scalar_functions(search.kernel)),
     }
-    environment = template_environment()
-    return (
-        environment.get_template("parts/events_declarations.h.jinja").render(context),
-        environment.get_template("parts/events.c.jinja").render(context),
-    )
+    return _render(f"{search.prefix}_events", context, "events")
 
 
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
     """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
-    context = {"interface": interface, "prefix": interface.prefix, "start": start}
+    target = TARGETS[precision]
+    target.check((*start.q, *start.p, *start.parameters, start.t, start.h))
+    context = {
+        "interface": interface,
+        "prefix": interface.prefix,
+        "start": start,
+        "target": target,
+        "real": target.scalar,
+    }
     environment = template_environment()
-    texts = {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
-    if precision == "single":
-        check_single((*start.q, *start.p, *start.parameters, start.t, start.h))
-        texts["main.c"] = to_single(texts["main.c"])
-    return texts
+    return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
 
 
 def workspace_size(program: Program) -> int:
@@ -236,25 +184,22 @@ def scratch_size(program: Program) -> int:
     return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
 
 
-def _context(program: Program) -> dict[str, object]:
+def _context(program: Program, target: Target) -> dict[str, object]:
     return {
         "program": program,
         "prefix": program.prefix,
+        "target": target,
+        "real": target.scalar,
         "kernels": program.kernels,
         "cut": _is_cut((*_scalar_kernels(program), *(program.sweep.kernels if program.sweep else ()))),
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, _scalar_kernels(program)))),
-        "legendre": program.legendre,
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
-        "tolerance": DEFAULT_TOLERANCE,
         "max_iterations": MAX_ITERATIONS,
-        "iteration_limit": "options->max_iterations",
+        "most_iterations": "INT_MAX",
         "embedded": False,
-        "real": "double",
-        "roundoff_level": ROUNDOFF_LEVEL,
-        "keep_change": KEEP_CHANGE,
-        "keep_rate": KEEP_RATE,
-        **_lane_context(program.sweep),
+        "written_out": False,
+        **_lane_context(program),
     }
 
 
@@ -267,12 +212,14 @@ def _is_cut(kernels: Iterable[Kernel]) -> bool:
     return any(len(parts(kernel)) > 1 for kernel in kernels)
 
 
-def _lane_context(sweep: Sweep | None) -> dict[str, object]:
+def _lane_context(program: Program) -> dict[str, object]:
     """What the templates of the fixed-point solver need; nothing without one."""
+    sweep = program.sweep
     if sweep is None:
-        return {}
-    hot = "static inline __attribute__((always_inline)) " if _size(sweep) <= LARGEST_INLINED else "static "
-    return _vector_context(sweep, POINT_SOURCES) | {"width": sweep.lanes, "lane_meaning": "points", "hot": hot}
+        return {"sweep": None}
+    hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
+    text = sweep_text(sweep, POINTS, sweep.lanes, newton=program.newton, hamiltonian=program.hamiltonian)
+    return {"sweep": text, "hot": hot}
 
 
 def _size(sweep: Sweep) -> int:
@@ -280,34 +227,6 @@ def _size(sweep: Sweep) -> int:
     return sum(sum(kernel.operation_counts().values()) for kernel in sweep.kernels)
 
 
-def _vector_context(sweep: Sweep, sources: tuple[str, ...]) -> dict[str, object]:
-    """Kernels in vectors, with the functions they call; ``sources`` differ from lane to lane."""
-    kernels = applied = sweep.kernels
-    if isinstance(sweep, SeparableSweep) and sources == TRAJECTORY_SOURCES:
-        applied = (*kernels, sweep.mass)
-    functions = set().union(*(lane_functions(kernel, sources) for kernel in applied))
-    roots = _inverse_roots(functions)
-    return {
-        "sweep": sweep,
-        "lane_kernels": kernels,
-        "lane_functions": sorted(functions - {f"{INVERSE_ROOT}{k}" for k in roots} | ({"sqrt"} if roots else set())),
-        "inverse_roots_in_lanes": roots,
-        "root_for_inverses": "sqrt" not in functions,
-        "series": _binomial_series,
-        "good_guess": GOOD_GUESS**2,
-        "vector_library": VECTOR_LIBRARY,
-        "vector_sources": sources,
-    }
-
-
 def _inverse_roots(functions: set[str]) -> list[int]:
     """The k of all ``inverse_root_k``."""
     return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in functions if name.startswith(INVERSE_ROOT))
-
-
-def _binomial_series(k: int) -> list[float]:
-    """Coefficients of e, .., e^4 in (1 - e)^(-k/2)."""
-    coefficients = [1.0]
-    for j in range(1, 5):
-        coefficients.append(coefficients[-1] * (k / 2 + j - 1) / j)
-    return coefficients[1:]

@@ -93,7 +93,7 @@ def _certificate(subject: Subject, checks: tuple[Check, ...], seconds: float) ->
         system=subject.system.name,
         method=subject.method.name,
         version=_version(),
-        checksum=hashlib.sha256((stepper.source.header + stepper.source.code).encode()).hexdigest(),
+        checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
         flags=stepper.flags,
         q=tuple(given.q.tolist()),
         p=tuple(given.p.tolist()),

@@ -31,8 +31,6 @@ SHORTEST_WAY = 1e6
 SMALLER, MOST_SWEEPS = 256, 10
 """An iteration that contracts in proportion to h, somehow at h, takes 52 bits / 8 bits a sweep at h / 256; some more
 for the first and the last one."""
-FALLBACK = "solve_again"
-"""The C function that calls Newton's iteration where sweeps fail."""
 MOST_TRIED = 30
 RUN_STEPS, LOOKED_AT = 12, (0, 1, 2, 5, 11)
 """Of a run: the first steps have less to remember."""
@@ -125,7 +123,7 @@ def _size(vector: Numbers, scales: Array) -> float:
 
 def _fallback(subject: Subject) -> Finding | None:
     """Newton's iteration in the artefact itself, reached where so few sweeps do not converge."""
-    if subject.newton is None or FALLBACK not in subject.stepper.source.code:
+    if subject.newton is None or not subject.stepper.interface.has_fallback:
         return None
     first = subject.states[0]
     for factor in (1, 2, 4, 8):

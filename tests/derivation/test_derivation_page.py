@@ -157,7 +157,7 @@ class TestPage:
     def test_every_kernel_and_every_function_of_the_step_is_there(self):
         system = sc.problem("double-pendulum").system
         program = program_of(system, sc.SVI(2), prefix="double_pendulum")
-        functions = functions_of(render(program).code)
+        functions = functions_of(render(program).amalgamated().code)
         page = derivation_html(system, sc.SVI(2))
         shown = re.findall(r"<summary>(\w+)\(", page)
         assert {kernel.name for kernel in kernels_of(program)} <= set(shown)
@@ -185,7 +185,7 @@ class TestPage:
 
     def test_operations_are_counted(self):
         program = program_of(sc.problem("kepler").system, sc.SVI(2), prefix="kepler_problem")
-        functions = functions_of(render(program).code)
+        functions = functions_of(render(program).amalgamated().code)
         page = kepler_page(sc.SVI(2))
         for kernel in kernels_of(program):
             row = re.search(
@@ -232,7 +232,7 @@ class TestPage:
         assert re.search(r"The first \d of 18 equations\.", page)
         assert "144 rows and columns" in page
         assert "they are left out here" in page
-        functions = functions_of(sc.generate_source(system, sc.SVI(8))[0].code)
+        functions = functions_of(sc.generate_source(system, sc.SVI(8))[0].amalgamated().code)
         count = sum(len(functions[f"quadrature_slope{end}"].text.splitlines()) for end in ("_1", "_2", ""))
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page

@@ -59,7 +59,7 @@ def eight_digits(x: Any) -> Any:
     return type(x)(mp.nstr(mp.mpf(x), 8))
 
 
-def eight_digits_text(x: float) -> str:
+def eight_digits_text(x: float, target: object = None) -> str:
     return f"{x:.7e}"
 
 
@@ -80,9 +80,9 @@ def transposed(rows: Any) -> Any:
 
 
 def without_negation(original: Any) -> Any:
-    def printed(expression: Any, context: int) -> Any:
+    def printed(expression: Any, context: int, target: Any) -> Any:
         negated = isinstance(expression, Operation) and expression.operator == "neg"
-        return original(expression.operands[0] if negated else expression, context)
+        return original(expression.operands[0] if negated else expression, context, target)
 
     return printed
 

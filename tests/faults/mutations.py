@@ -126,15 +126,15 @@ MUTATIONS = (
     ),
     # The C text.
     text("the force of the sweeps negated", case("driven/svi"), r"value\[0\] = ", "value[0] = -", within="force_lanes"),
-    text("a term of the force dropped", case("driven/svi"), r" - parameters\[0\]\*u\[0\]", "", within="force_lanes"),
+    text("a term of the force dropped", case("driven/svi"), r" - parameters\[0\] \* u\[0\]", "", within="force_lanes"),
     text(
         "a term of Newton's residual dropped",
         case("driven/svi"),
-        r" - parameters\[0\]\*u\[0\]",
+        r" - parameters\[0\] \* u\[0\]",
         "",
         within="quadrature_slope",
     ),
-    text("a factor in a slope", case("driven/svi"), r"3\.0\*", "2.0*", within="quadrature_slope"),
+    text("a factor in a slope", case("driven/svi"), r"3\.0 \*", "2.0 *", within="quadrature_slope"),
     text("h for h^2", case("driven/svi"), r"data->square = h \* h;", "data->square = h;"),
     text(
         "a run one step ahead in time",
@@ -149,7 +149,7 @@ MUTATIONS = (
         r"moved->relative <= options->tolerance",
         "moved->relative <= 1e-5",
     ),
-    text("sweeps accept too early", case("kepler/svi-3"), r"<= tolerance \* tolerance", "<= 1e-12"),
+    text("sweeps accept too early", case("kepler/svi-3"), r"<= options->tolerance \* options->tolerance", "<= 1e-12"),
     text(
         "Newton's residual wrong with kept factors",
         case("pendulum/svi"),

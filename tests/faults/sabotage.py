@@ -62,7 +62,7 @@ class Sabotage:
 
         def make(render: Callable[[Any], Any]) -> Callable[[Any], Any]:
             def rendered(program: Any) -> Any:
-                source = render(program)
+                source = render(program).amalgamated()
                 code, edits = re.subn(pattern, replacement, source.code, count=1)
                 self.edits += edits
                 return replace(source, code=code)

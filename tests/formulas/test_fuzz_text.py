@@ -114,7 +114,9 @@ def try_system(number: int) -> bool:
     def compiled() -> None:
         method = random.choice((SVI(2), SCVI(2), Gauss(2), SVI(3, "gauss-lobatto:4")))
         source, _ = generate_source(build(**common), method)
-        assert not re.search(r"[^\w](?:nan|inf|zoo|oo|I)[^\w(]", re.sub(r"/\*.*?\*/", "", source.code, flags=re.DOTALL))
+        assert not re.search(
+            r"[^\w](?:nan|inf|zoo|oo|I)[^\w(]", re.sub(r"/\*.*?\*/", "", source.amalgamated().code, flags=re.DOTALL)
+        )
 
     try:
         with guarded(may_compile=True), warnings.catch_warnings():
@@ -353,7 +355,7 @@ def try_identifier(random: Random) -> None:
     if system is not None:
         names = (*system.coordinates, *system.momenta, *system.parameters)
         assert all(IDENTIFIER.fullmatch(symbol.name) for symbol in names)
-        code = code_of(generate_source(system, SVI(1, "gauss-legendre:1"), solver="newton")[0].code)
+        code = code_of(generate_source(system, SVI(1, "gauss-legendre:1"), solver="newton")[0].amalgamated().code)
         assert name not in re.findall(r"\w+", code) or len(name) < 9
 
 

@@ -46,7 +46,7 @@ def pendulum() -> Model:
 def test_writes_all_that_belongs_to_an_integrator(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
     assert folder == tmp_path / "made" / "pendulum_svi"
-    names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h"
+    names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h support"
     assert sorted(path.name for path in folder.iterdir()) == names.split()
     assert load_model(folder / "model.toml") == pendulum
     assert "pendulum_svi_step" in (folder / "README.md").read_text()
@@ -54,8 +54,8 @@ def test_writes_all_that_belongs_to_an_integrator(pendulum, tmp_path):
 
 def test_equal_models_give_equal_bytes(pendulum, tmp_path):
     one, two = (generate_package(pendulum, tmp_path / parent / "same") for parent in ("a", "b"))
-    for path in one.iterdir():
-        assert path.read_bytes() == (two / path.name).read_bytes()
+    for path in filter(Path.is_file, one.rglob("*")):
+        assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
 
 
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])

@@ -111,7 +111,7 @@ def write(sources: Sequence[Source], folder: Path) -> list[str]:
     """Write headers and sources; the names of the sources."""
     for source in sources:
         (folder / f"{source.prefix}.h").write_text(source.header, encoding="utf-8")
-        (folder / f"{source.prefix}.c").write_text(source.code, encoding="utf-8")
+        (folder / f"{source.prefix}.c").write_text(source.amalgamated().code, encoding="utf-8")
     return [f"{source.prefix}.c" for source in sources]
 
 
@@ -159,7 +159,7 @@ def check_symbols(prefix: str, folder: Path) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_asks_for_no_memory_writes_nothing_and_keeps_nothing(method):
     for source, _ in generated(method).values():
-        text = re.sub(r"/\*.*?\*/", "", source.header + source.code, flags=re.DOTALL)
+        text = re.sub(r"/\*.*?\*/", "", source.header + source.amalgamated().code, flags=re.DOTALL)
         assert re.findall(r"\b(?:[mc]alloc|realloc|alloca|free|f?printf|puts|fopen|exit|abort|assert)\b", text) == []
         assert re.findall(r"\bstatic\s+(?!const\b)(?!inline\b)[^(;]*[=;]", text) == []
         assert re.findall(r"\b(?:errno|setjmp|volatile|register|goto)\b", text) == []
@@ -210,7 +210,7 @@ from test_c_text import METHODS, generated
 names = "svi-1-gauss-legendre-1", "scvi-2-chebyshev-lobatto-gauss-legendre-2", "gauss-2", "sc-3-chebyshev-lobatto"
 for method in names:
     for name, (source, interface) in generated(method).items():
-        text = source.header + source.code + source.declarations + interface.to_json()
+        text = "".join(source.files.values()) + source.declarations + interface.to_json()
         print(method, name, hashlib.sha256(text.encode()).hexdigest())
 """
 
@@ -235,12 +235,12 @@ def test_text_is_the_same_in_every_process(tmp_path):
 def test_text_is_ascii_with_unix_line_ends_and_no_trailing_blanks():
     for method in METHODS:
         for source, _ in generated(method).values():
-            for text in (source.header, source.code):
+            for text in source.files.values():
                 assert text.isascii()
                 assert "\r" not in text
                 assert "\t" not in text
                 assert re.findall(r"[ \t]+$", text, re.MULTILINE) == []
-                assert text.endswith(("}\n", "#endif\n"))
+                assert text.endswith("\n")
 
 
 # Names and titles that would break C.

@@ -23,8 +23,8 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
-from scvi_codegen.rendering.single_precision import SPELLING, check_single, to_single
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.target import SINGLE
 from scvi_codegen.rendering.text import EMBEDDED, Embedded
 
 HERE = Path(__file__).parent / "embedded"
@@ -201,32 +201,20 @@ def test_iterations_are_bounded_when_it_is_compiled_whatever_the_options_say(bou
 # Single precision.
 
 
-DOUBLE = """#include "double.h" /* 1.0 double sin */
-double x = 0.1, y = sin(2.0)*1e-05 + 3.5e+2/.5; puts("double 1.0");
-int k = 10, double_sin = 1LL; DBL_EPSILON; a.b1 = 2.;"""
-SINGLE = """#include "double.h" /* 1.0 double sin */
-float x = 0.100000001f, y = sinf(2.0f)*9.99999975e-06f + 350.0f/0.5f; puts("double 1.0");
-int k = 10, double_sin = 1LL; FLT_EPSILON; a.b1 = 2.0f;"""
-
-
-def test_the_text_in_single_precision_differs_in_spelling_only():
-    assert to_single(DOUBLE) == SINGLE
-
-
 @pytest.mark.parametrize(
     "value", [*np.float32([0.1, 1 / 3, np.pi, 2.0**-126, 3.4028234e38, 1 + 2.0**-23]).tolist(), 0.0]
 )
 def test_literals_read_back_as_the_nearest_number(value):
-    text = to_single(repr(value))
+    text = SINGLE.number(value)
     assert text.endswith("f")
     assert np.float32(text[:-1]) == np.float32(value)
 
 
 def test_what_is_left_of_a_zero_in_a_table_becomes_zero_and_a_number_of_a_model_is_refused():
-    assert to_single("1.7e-63") == "0.0f"
+    assert SINGLE.number(1.7e-63) == "0.0f"
     for value in (1e-39, 1e39, -1e300):
         with pytest.raises(MethodError, match="single precision cannot hold"):
-            check_single([1.0, value])
+            SINGLE.check([1.0, value])
 
 
 @pytest.mark.parametrize("number", ["1e-45", "1e40"])
@@ -242,10 +230,6 @@ def test_models_with_numbers_beyond_single_precision_are_refused(number):
         generate_source(system, SVI(1), embedded="double")
         with pytest.raises(MethodError, match="other units"):
             generate_source(system, SVI(1), embedded="single")
-
-
-def test_every_function_of_a_lagrangian_has_a_name_in_single_precision():
-    assert set(FUNCTIONS.values()) <= set(SPELLING)
 
 
 def test_energy_does_not_drift_in_single_precision(tmp_path):

@@ -30,7 +30,10 @@ def fresh() -> dict[str, str]:
 
 def stored() -> dict[str, str]:
     """Text by file name, as it stands in the folder."""
-    return {path.name: path.read_bytes().decode("utf-8") for path in sorted(FOLDER.glob("*.[ch]"))}
+    return {
+        path.relative_to(FOLDER).as_posix(): path.read_bytes().decode("utf-8")
+        for path in sorted(FOLDER.glob("**/*.[ch]"))
+    }
 
 
 def test_no_file_is_missing_or_orphaned():
@@ -70,4 +73,5 @@ def test_no_text_holds_a_date_a_path_or_a_version():
 
 def test_the_readme_names_every_integrator():
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
-    assert {Path(name).stem for name in stored()} == set(re.findall(r"^\| `(\w+)`", readme, re.MULTILINE))
+    names = {Path(name).stem for name in stored() if "/" not in name}
+    assert names == set(re.findall(r"^\| `(\w+)`", readme, re.MULTILINE))

@@ -57,7 +57,7 @@ def derivation_html(
 
 def _sections(system: MechanicalSystem, method: Method, solver: str, start: Start | None) -> Iterator[Section]:
     program = program_of(system, method, solver=solver, prefix=c_identifier(system.name))
-    functions = functions_of(render(program).code)
+    functions = functions_of(render(program).amalgamated().code)
     stages = with_auxiliaries(system, method.paper_form(system))
     derived = written_out(system, method, stages)
     yield system_section(system)

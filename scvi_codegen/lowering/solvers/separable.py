@@ -65,5 +65,5 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> SeparableSweep |
         end_momentum=pad_split(tables.end_momentum, lanes),
         guess=guess,
         force=system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
-        mass=system_kernel(system, "mass", forms.mass.values(), of=()),
+        mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
     )

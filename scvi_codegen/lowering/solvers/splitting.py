@@ -26,6 +26,6 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
         kicks=lower_vector(kicks),
         drifts=lower_vector(drifts),
         abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
-        force=system_kernel(twin, "force", forms.force, of=twin.coordinates),
-        mass=system_kernel(twin, "mass", forms.mass.values(), of=()),
+        force=system_kernel(twin, "force", forms.force, of=twin.coordinates, purpose="L_q at u = q."),
+        mass=system_kernel(twin, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
     )

@@ -57,7 +57,7 @@ ROOT = Step(
     "than the tolerance.",
     evidence={
         "newton": (
-            "factorise(",
+            "linearise(",
             "apply_update(",
             "measure(&moved, change, size_p)",
             "has_converged(",
@@ -95,7 +95,7 @@ SVI_STEPS = (
         number=3,
         text="choose an initial guess for the solution at the collocation points Q_k",
         counterpart="The curve of the step before, continued; the straight line where there is none or it fails.",
-        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "STRAIGHT[b] * v[i]")},
+        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "place_on_line(")},
     ),
     Step(
         number=4,
@@ -126,7 +126,7 @@ SCVI_STEPS = (
         "inverting the continuous Legendre transformation",
         counterpart="The curve of the step before, continued; the straight line with the velocity that belongs to p_k "
         "where there is none or it fails.",
-        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "STRAIGHT[b] * v[i]")},
+        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "place_on_line(")},
     ),
     Step(
         number=4,
@@ -160,7 +160,7 @@ def table_10(results: Mapping[str, Result]) -> Result:
 
 
 def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], remark: tuple[str, ...] = ()) -> Result:
-    code = generate_source(planar_pendulum(), method, solver="newton", prefix=PREFIX)[0].code
+    code = generate_source(planar_pendulum(), method, solver="newton", prefix=PREFIX)[0].amalgamated().code
     functions = functions_of(code)
     missing = {step.number: _missing(step, code, functions) for step in steps}
     found = [number for number, fragments in missing.items() if not fragments]

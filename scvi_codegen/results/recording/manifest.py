@@ -20,7 +20,6 @@ __all__ = ["MANIFEST", "Build", "Manifest", "read_manifest", "write_manifest"]
 
 MANIFEST = "manifest.json"
 FORMAT = 1
-TEXTS = ("header", "code", "declarations")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,14 +101,13 @@ class Manifest:
 
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`, with the C code line by line."""
-        source = asdict(self.source)
         document = {
             "format": FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
             "builds": [asdict(build) for build in self.builds],
             "interface": json.loads(self.interface.to_json()),
-            "source": source | {name: source[name].split("\n") for name in TEXTS},
+            "source": self.source.to_record(),
         }
         return json.dumps(document, indent=1) + "\n"
 
@@ -119,7 +117,6 @@ class Manifest:
         document = json.loads(text)
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
-        source = document["source"]
         plain = {field: document[field] for field in PLAIN}
         options = document["options"]
         return cls(
@@ -127,7 +124,7 @@ class Manifest:
             options=None if options is None else SolverOptions(**options),
             builds=tuple(Build(**build) for build in document["builds"]),
             interface=Interface.from_json(json.dumps(document["interface"])),
-            source=Source(prefix=source["prefix"], **{name: "\n".join(source[name]) for name in TEXTS}),
+            source=Source.from_record(document["source"]),
         )
 
 

@@ -1,0 +1,92 @@
+/* The Legendre transform and its inverse, of velocities where a Lagrangian is given, of momenta where a Hamiltonian is.
+ * Before it: the kernel legendre, y = L_v (H_p) at u = (q, x) and its slopes dy/dx, and MASS_ENTRY, their places. */
+
+#define TRANSFORM_ROUNDING (64 * REAL_EPSILON) /* a misfit of this part of y may be rounding of its terms */
+
+/* y at u = (q, x), and dy/dx in the first numbers of scratch. */
+static void transform_and_slopes(real t, const real *u, const real *parameters, real *y, real *scratch)
+{
+  const band shape = band_of(1);
+  real *mass = scratch, *slope = scratch + band_size(&shape);
+  legendre(u, t, parameters, y, slope);
+  memset(mass, 0, sizeof(real) * band_size(&shape));
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    mass[shape.first + PLACE[MASS_ENTRY[e][1]] * shape.stride + PLACE[MASS_ENTRY[e][0]]] = slope[e];
+}
+
+/* max |value - y|. */
+static real largest_misfit(const real *value, const real *y)
+{
+  real largest = 0;
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, MATH(fabs)(value[i] - y[i]));
+  return largest;
+}
+
+static int transform(real t, const real *q, const real *x, const real *parameters, real *y, real *workspace)
+{
+  real u[2 * M], value[M];
+  memcpy(u, q, sizeof(real) * M);
+  memcpy(u + M, x, sizeof(real) * M);
+  transform_and_slopes(t, u, parameters, value, workspace);
+  if (!all_finite(value, M))
+    return NOT_FINITE;
+  memcpy(y, value, sizeof(real) * M);
+  return OK;
+}
+
+/* Newton's iteration for y(q, x) = y from the x in u, halving updates that leave the domain or do not bring y nearer.
+ * */
+static int invert_from(real t, real *u, const real *y, const real *parameters, real *mass)
+{
+  const band shape = band_of(1);
+  real value[M], update[M], pivot[M], misfit;
+  transform_and_slopes(t, u, parameters, value, mass);
+  misfit = largest_misfit(value, y);
+  for (int k = 0; k < MAX_ITERATIONS; k++) {
+    real scale = 1, nearer, start[M], roundoff = 0;
+    if (!all_finite(value, M) || !all_finite(mass, (int)band_size(&shape)))
+      return NOT_FINITE;
+    if (misfit == 0)
+      return OK;
+    if (!factorise(mass, &shape, pivot))
+      return SINGULAR;
+    for (int i = 0; i < M; i++) {
+      update[PLACE[i]] = y[i] - value[i];
+      roundoff = larger(roundoff, TRANSFORM_ROUNDING * MATH(fabs)(y[i]));
+    }
+    back_substitute(mass, &shape, pivot, update);
+    memcpy(start, u + M, sizeof(real) * M);
+    do {
+      for (int i = 0; i < M; i++)
+        u[M + i] = start[i] + scale * update[PLACE[i]];
+      transform_and_slopes(t, u, parameters, value, mass);
+      nearer = all_finite(value, M) ? largest_misfit(value, y) : (real)INFINITY;
+      scale /= 2;
+    } while (!(nearer < misfit) && misfit > roundoff && scale > REAL_EPSILON);
+    if (!(nearer < misfit)) { /* round-off: keep the better x */
+      memcpy(u + M, start, sizeof(real) * M);
+      return misfit <= roundoff ? OK : NOT_CONVERGED;
+    }
+    misfit = nearer;
+  }
+  return NOT_CONVERGED;
+}
+
+static int inverse_transform(real t, const real *q, const real *y, const real *parameters, real *x, real *workspace)
+{
+  int status = SINGULAR;
+  for (int attempt = 0; attempt < 3; attempt++) { /* from x = 0, from x = y, from x = 1 */
+    real u[2 * M];
+    for (int i = 0; i < M; i++) {
+      u[i] = q[i];
+      u[M + i] = attempt == 1 ? y[i] : (real)(attempt == 2);
+    }
+    status = invert_from(t, u, y, parameters, workspace);
+    if (status == OK) {
+      memcpy(x, u + M, sizeof(real) * M);
+      return status;
+    }
+  }
+  return status;
+}

@@ -1,0 +1,96 @@
+/* Sweeps of one trajectory: what is kept of its last steps, and when a step is done. Before it: points.h,
+ * contraction.h, and the tables LAST_ALONE, LAST, BEFORE, which continue what was kept into the next step. */
+
+/* What is kept at the points, of the last step and of the one before. */
+typedef double *history;
+
+static inline void lanes_load(const double *memory, lanes *x)
+{
+  memcpy(x, memory, sizeof(double) * M * LANES);
+}
+
+static inline void lanes_store(const lanes *x, double *memory)
+{
+  memcpy(memory, x, sizeof(double) * M * LANES);
+}
+
+/* Where to compute what is to be kept. */
+static inline coordinates *kept(history past, coordinates *own)
+{
+  (void)past;
+  return own;
+}
+
+/* What is kept at the points, continued into this step from the last one or from the last two. */
+static inline void continue_curve(const double *past, long long steps, lanes (*x)[M])
+{
+  lanes before[1][M];
+  lanes_load(past, x[0]);
+  lanes_load(past + M * LANES, before[0]);
+  for (int i = 0; i < M; i++)
+    x[0][i] = steps == 1 ? apply(LAST_ALONE, 0, x, i) : apply(LAST, 0, x, i) + apply(BEFORE, 0, before, i);
+}
+
+static inline void remember_curve(lanes (*x)[M], history past)
+{
+  memcpy(past + M * LANES, past, sizeof(double) * M * LANES);
+  lanes_store(x[0], past);
+}
+
+/* The velocities of a motion on a straight line. */
+static inline int start_velocities(const step_data *step, lanes (*z)[M])
+{
+  double v[M];
+  const int status = NAME(velocity)(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
+  for (int i = 0; status == OK && i < M; i++)
+    z[0][i] = lanes_of(v[i]);
+  return status;
+}
+
+/* How the sweeps of a step come on. */
+typedef struct {
+  double first, last;
+  int status;
+} progress;
+
+static inline progress before_sweeps(void)
+{
+  const progress none = {0.0, INFINITY, 0};
+  return none;
+}
+
+static inline int needs_sweep(const progress *now)
+{
+  return now->status == 0;
+}
+
+static inline void take_change(progress *now, double change, const solver_options *options, int k,
+    solver_report *report)
+{
+  now->status = sweep_status(change, now->last, options, k);
+  now->first = k == 0 ? change : now->first;
+  now->last = change;
+  report->iterations++;
+}
+
+/* What the sweeps came to. */
+static inline int outcome(const progress *now, solver_report *report)
+{
+  report->change = sqrt(now->last);
+  if (now->status < 0)
+    return now->last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  return OK;
+}
+
+/* Whether the increments are to be added. */
+static inline int accept(const step_data *step, const double *dq, const double *dp, solver_report *report)
+{
+  (void)step, (void)report;
+  return all_finite(dq, M) && all_finite(dp, M);
+}
+
+static inline long long next_guess(long long steps, const progress *now, const solver_report *report)
+{
+  (void)report;
+  return steps_to_continue(steps, now->first);
+}

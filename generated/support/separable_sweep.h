@@ -1,0 +1,105 @@
+/* A step by sweeps for constant diagonal masses and forces of position and time. Before it: points.h or trajectories.h
+ * with what follows them, the tables, the kernels force_lanes and mass. The method's numbers are those of a table and
+ * of its _LOW partner together. */
+
+/* What the steps of a run share: h^2 = square + square_low, h w = kick + kick_low. */
+typedef struct {
+  weight kick[GROUPS], kick_low[GROUPS];
+  number inverse_mass[M];
+  double square, square_low;
+} sweep_data;
+
+static void prepare_sweep(const step_data *step, sweep_data *data)
+{
+  const double h = step->h;
+  data->square = h * h;
+  data->square_low = fma(h, h, -data->square);
+  for (int n = 0; n < GROUPS; n++) {
+    data->kick[n] = h * POINT_END_MOMENTUM[n];
+    data->kick_low[n] = fused_weights(h, POINT_END_MOMENTUM[n], -data->kick[n]) + h * POINT_END_MOMENTUM_LOW[n];
+  }
+  mass(NULL, step->t, step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
+}
+
+static inline void forces(const step_data *step, lanes (*X)[M], lanes (*F)[M])
+{
+  for (int n = 0; n < GROUPS; n++)
+    force_lanes(X[n], step->t + step->h * ABSCISSA[n], step->parameters, F[n]);
+}
+
+/* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
+static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
+{
+  const lanes sum = x + y, part = sum - x;
+  return sum + (((x - (sum - part)) + (y - part)) + rest);
+}
+
+/* The increments of one step and their low parts. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest;
+ * then once more with all digits of the coefficients. The forces are kept. */
+HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, number *dq, number *dp,
+    const solver_options *options, solver_report *report)
+{
+  coordinates X[GROUPS], base[GROUPS], own[GROUPS], *F = kept(past, own);
+  number drift[M], drift_low[M], inverse_size[M];
+  progress now = before_sweeps();
+  int status;
+  for (int i = 0; i < M; i++) {
+    const number v = data->inverse_mass[i] * step->p0[i];
+    const number v_low = fused_numbers(data->inverse_mass[i], step->p0[i], -v);
+    drift[i] = step->h * v;
+    drift_low[i] = fused_numbers(number_of(step->h), v, -drift[i]) +
+        step->h * (v_low + data->inverse_mass[i] * step->carry_p[i]);
+    for (int n = 0; n < GROUPS; n++)
+      X[n][i] = base[n][i] = step->q0[i] + DRIFT[n] * drift[i];
+  }
+  if (*steps > 0) {
+    continue_curve(past, *steps, F);
+    for (int i = 0; i < M; i++)
+      for (int n = 0; n < GROUPS; n++)
+        X[n][i] += (data->square * data->inverse_mass[i]) * F[n][i];
+  }
+  forces(step, X, F);
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = magnitude(step->q0[i]) + magnitude(drift[i]) +
+        magnitude(data->square * data->inverse_mass[i] * at_start(F, i));
+  invert_sizes(options, 1.0, inverse_size);
+  for (int k = 0; needs_sweep(&now); k++) {
+    lanes change = lanes_of(0.0);
+    for (int i = 0; i < M; i++)
+      for (int n = 0; n < GROUPS; n++) {
+        const lanes x = base[n][i] + (data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i);
+        const lanes moved = (x - X[n][i]) * inverse_size[i];
+        change += moved * moved;
+        X[n][i] = x;
+      }
+    forces(step, X, F);
+    take_change(&now, total_change(change), options, k, report);
+  }
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++) {
+      const lanes sum = apply(PRODUCT, n, F, i), low = apply(PRODUCT_LOW, n, F, i);
+      const lanes rest = step->carry_q[i] + DRIFT[n] * drift_low[i] + DRIFT_LOW[n] * drift[i];
+      X[n][i] = sum_of_three(lanes_of_number(step->q0[i]),
+          DRIFT[n] * drift[i] + data->inverse_mass[i] * (data->square * sum),
+          rest + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
+    }
+  forces(step, X, F);
+  for (int i = 0; i < M; i++) {
+    const number sum = weigh_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, F, i);
+    const number kick = data->inverse_mass[i] * (data->square * sum), part = (drift[i] + kick) - drift[i];
+    dq[i] = drift[i] + kick;
+    dq[M + i] = (drift[i] - (dq[i] - part)) + (kick - part) +
+        (drift_low[i] + data->inverse_mass[i] * (data->square_low * sum));
+    dp[i] = weigh_twice(data->kick, data->kick_low, F, i);
+  }
+  if (!accept(step, dq, dp, report))
+    return NOT_FINITE;
+  remember_curve(F, past);
+  *steps = next_guess(*steps, &now, report);
+  return OK;
+}

@@ -1,0 +1,36 @@
+/* A step by sweeps, and what is tried where they fail. Before it: a sweep, and fall_back. */
+typedef sweep_data solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  prepare_sweep(step, data);
+}
+
+/* The increments where the curve continued from former steps leads nowhere: by sweeps from the straight line, else as
+ * fall_back can. */
+static int solve_again(int status, const step_data *step, const solver_data *data, double *memory, long long *guess,
+    double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
+{
+  long long steps = 0;
+  if (*guess > 0)
+    status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != OK) {
+    status = fall_back(status, step, dq, dp, options, report, workspace);
+    steps = 0;
+  }
+  if (status == OK)
+    *guess = steps;
+  return status;
+}
+
+/* The increments by sweeps. On success guess says from how many steps the next is continued. */
+HOT int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const solver_options *options, solver_report *report, double *workspace)
+{
+  long long steps = *guess;
+  const int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != OK)
+    return solve_again(status, step, data, memory, guess, dq, dp, options, report, workspace);
+  *guess = steps;
+  return status;
+}

@@ -1,0 +1,42 @@
+/* Vectors of LANES numbers, which GCC and Clang map to whatever the processor has. Before it: LANES, a power of two. */
+#pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
+
+typedef double lanes __attribute__((vector_size(8 * LANES)));
+typedef union {
+  lanes all;
+  double lane[LANES];
+} lane_view;
+
+static inline lanes lanes_of(double x)
+{
+  const lanes zero = {0.0};
+  return zero + x;
+}
+
+/* a b + c with one rounding, on which a small c has its say. */
+static inline lanes multiply_add(lanes a, lanes b, lanes c)
+{
+  lane_view x = {a}, y = {b}, z = {c};
+  for (int j = 0; j < LANES; j++)
+    z.lane[j] = fma(x.lane[j], y.lane[j], z.lane[j]);
+  return z.all;
+}
+
+/* lanes_f, the function f of libm lane by lane. */
+#define LANES_FUNCTION(f)                \
+  static inline lanes lanes_##f(lanes x) \
+  {                                      \
+    lane_view view = {x};                \
+    for (int j = 0; j < LANES; j++)      \
+      view.lane[j] = f(view.lane[j]);    \
+    return view.all;                     \
+  }
+
+#define LANES_FUNCTION_OF_TWO(f)                     \
+  static inline lanes lanes_##f(lanes x, lanes y)    \
+  {                                                  \
+    lane_view view = {x}, other = {y};               \
+    for (int j = 0; j < LANES; j++)                  \
+      view.lane[j] = f(view.lane[j], other.lane[j]); \
+    return view.all;                                 \
+  }

@@ -1,0 +1,86 @@
+"""Kernels as C functions, of numbers and of vectors. All have the same arguments, whether they use them or not.
+
+A kernel that is cut calls its parts, functions of their own with the arguments that they use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.parts import Part, parts
+from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.rendering.lanes import Lanes
+from scvi_codegen.rendering.layout import wrapped, wrapped_comment
+from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
+from scvi_codegen.rendering.target import Target
+
+__all__ = ["kernel_text", "lane_kernel_text", "lane_mass_text"]
+
+LAID_OUT = "  /* clang-format off */\n{}\n  /* clang-format on */"
+"""Around statements of several lines, which are broken where they are full, not where their structure says."""
+
+PART = "static SCVI_NOINLINE"
+
+
+def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
+    """A function of numbers, with its comment; ``slopes`` asks for their argument also where there are none."""
+    real = target.scalar
+    declared = {name: f"{real} *{name}" for name in ARRAYS}
+    declared |= {"u": f"const {real} *u", "t": f"{real} t", "parameters": f"const {real} *parameters"}
+    declared["kept"] = f"{real} *restrict kept"
+    texts = [_function(PART, part, _used(part, declared), print_statements(part, target)) for part in _parts(kernel)]
+    arguments = _arguments(kernel, declared, slopes=slopes)
+    return "\n\n".join([*texts, _whole("static", kernel, arguments, print_statements(kernel, target))])
+
+
+def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
+    """A function of vectors."""
+    declared = {name: f"lanes *{name}" for name in ARRAYS}
+    declared |= {"u": "const lanes *u", "t": f"{lanes.type_of('t')} t", "kept": "lanes *restrict kept"}
+    declared["parameters"] = f"const {lanes.type_of('parameters')} *parameters"
+    sources = lanes.sources
+    texts = [
+        _function(PART, part, _used(part, declared), print_lane_statements(part, sweep, sources))
+        for part in _parts(kernel)
+    ]
+    statements = print_lane_statements(kernel, sweep, sources)
+    return "\n\n".join([*texts, _whole("static inline", kernel, _arguments(kernel, declared), statements)])
+
+
+def lane_mass_text(kernel: Kernel, sweep: Sweep, lanes: Lanes, target: Target) -> str:
+    """The constant masses: numbers of one trajectory, or vectors of many."""
+    return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, sweep, lanes)
+
+
+def _parts(kernel: Kernel) -> tuple[Part, ...]:
+    """The functions that a kernel calls, if it is cut into several."""
+    cut = parts(kernel)
+    return cut if len(cut) > 1 else ()
+
+
+def _used(part: Part, declared: Mapping[str, str]) -> list[str]:
+    return [declared[name] for name in ARRAYS if part.uses(name)]
+
+
+def _arguments(kernel: Kernel, declared: Mapping[str, str], *, slopes: bool = False) -> list[str]:
+    last = ["slope"] if len(kernel.results) > kernel.values or slopes else []
+    return [declared[name] for name in ("u", "t", "parameters", "value", *last)]
+
+
+def _whole(storage: str, kernel: Kernel, arguments: Sequence[str], statements: Sequence[str]) -> str:
+    """A kernel with its comment; what it does not use is named first."""
+    counts = ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
+    names = [argument.split()[-1].lstrip("*") for argument in arguments]
+    unused = ", ".join(f"(void){name}" for name in names if name != "value" and not kernel.uses(name))
+    body = [*([f"{unused};"] if unused else []), *statements]
+    comment = wrapped_comment(f"{kernel.purpose} Operations: {counts}.".strip())
+    return f"{comment}\n{_function(storage, kernel, arguments, body)}"
+
+
+def _function(storage: str, code: Kernel | Part, arguments: Sequence[str], statements: Sequence[str]) -> str:
+    lines = [wrapped(statement) for statement in statements]
+    body = "\n".join(lines)
+    laid_out = LAID_OUT.format(body) if any("\n" in line for line in lines) else body
+    head = wrapped(f"{storage} void {code.name}({', '.join(arguments)})", indent=0)
+    return f"{head}\n{{\n{laid_out}\n}}"

@@ -1,0 +1,55 @@
+"""C text on lines of at most 120 characters: tables of numbers, statements, comments."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Sequence
+
+__all__ = ["WIDTH", "table", "wrapped", "wrapped_comment"]
+
+WIDTH = 120
+CONTINUATION = 4
+OPERATOR = re.compile(r" ([-+*/=]) ")
+
+
+def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]]) -> str:
+    """``declaration = {...};`` of numbers, or of rows of numbers, on one line if they fit."""
+    braced = [row if isinstance(row, str) else f"{{{', '.join(row)}}}" for row in rows]
+    line = f"{declaration} = {{{', '.join(braced)}}};"
+    if len(line) <= WIDTH:
+        return line
+    lines = _lines(", ".join(braced), "    ", "    ") if isinstance(rows[0], str) else _rows(braced)
+    return "\n".join([f"{declaration} = {{", *lines]) + "};"
+
+
+def _rows(braced: Sequence[str]) -> list[str]:
+    """A line a row, or several where it is too long."""
+    lines: list[str] = []
+    for k, row in enumerate(braced):
+        lines += _lines(row + "," * (k + 1 < len(braced)), "    ", "     ")
+    return lines
+
+
+def wrapped(statement: str, indent: int = 2) -> str:
+    """A statement that continues on further lines where it is too long, after an operator or comma."""
+    first = " " * indent
+    joined = OPERATOR.sub("\0\\1 ", statement)  # no break before an operator
+    return "\n".join(_lines(joined, first, first + " " * CONTINUATION)).replace("\0", " ")
+
+
+def wrapped_comment(text: str) -> str:
+    """A comment in the first column."""
+    return "\n".join(_lines(f"/* {text} */", "", " * "))
+
+
+def _lines(text: str, first: str, following: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=following,
+        replace_whitespace=False,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

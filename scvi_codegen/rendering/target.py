@@ -1,0 +1,88 @@
+"""What the C is written for: the scalar type, and all that follows from it.
+
+Arithmetic is lowered to numbers of Python; how they are spelled, which functions of libm take them and how exact they
+are belongs to a target. The support headers know it by the header of its name.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from scvi_codegen.errors import MethodError
+
+__all__ = ["DOUBLE", "MAX_ITERATIONS", "SINGLE", "TOLERANCE", "Target"]
+
+TOLERANCE = 2.0**-52
+"""Relative update below which an iteration has converged, if nothing else is said: the round-off unit of binary64."""
+
+MAX_ITERATIONS = 50
+"""After which a step fails, if nothing else is said: Newton's iteration takes 3 to 6 and sweeps 5 to 20."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """A scalar type of C.
+
+    Attributes:
+        name: for people, as in :data:`~scvi_codegen.rendering.text.EMBEDDED`.
+        scalar: the type, and the name of its support header.
+        suffix: of the functions of libm and of literals.
+        digits: of a literal that reads back as the same number; 0: the shortest that does.
+        tolerance: see :data:`TOLERANCE`.
+        halvings: of 1 to the round-off unit.
+        smallest, largest: numbers with all digits.
+    """
+
+    name: str
+    scalar: str
+    suffix: str
+    digits: int
+    tolerance: float
+    halvings: int
+    smallest: float
+    largest: float
+
+    def number(self, value: float) -> str:
+        """A literal that reads back as the number of the target nearest to ``value``."""
+        if not self.digits:
+            return repr(float(value))
+        (nearest,) = struct.unpack("f", struct.pack("f", float(value)))
+        text = f"{nearest:.{self.digits}g}"
+        return f"{text}{self.suffix}" if "." in text or "e" in text else f"{text}.0{self.suffix}"
+
+    def function(self, name: str) -> str:
+        """The name of a function of libm."""
+        return f"{name}{self.suffix}"
+
+    def check(self, values: Iterable[float]) -> None:
+        """Raise :class:`MethodError` for numbers of a model that the target cannot hold."""
+        for value in values:
+            if value != 0.0 and not self.smallest <= abs(value) <= self.largest:
+                raise MethodError(
+                    f"{self.name} precision cannot hold the number {value!r}: choose other units, or 'double'"
+                )
+
+
+DOUBLE = Target(
+    name="double",
+    scalar="double",
+    suffix="",
+    digits=0,
+    tolerance=TOLERANCE,
+    halvings=52,
+    smallest=5e-324,
+    largest=(2.0 - 2.0**-52) * 2.0**1023,
+)
+
+SINGLE = Target(
+    name="single",
+    scalar="float",
+    suffix="f",
+    digits=9,
+    tolerance=2.0**-23,
+    halvings=23,
+    smallest=2.0**-126,
+    largest=(2.0 - 2.0**-23) * 2.0**127,
+)

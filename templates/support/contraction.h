@@ -1,0 +1,55 @@
+/* When sweeps have come near enough to their fixed point. Before it: STALLED, and SWEEPS_AFTER, how many sweeps follow
+ * the last one that is measured. Changes are squared, as are the thresholds here. */
+
+#define MARGIN 16.0 /* what is left is to be less than a quarter of the tolerance */
+#define FASTEST_CONTRACTION 1e-6 /* what a thousandfold contraction in one sweep is believed to be */
+#define SLOWEST_CONTRACTION 0.25 /* and what slower ones are taken for, as long as nothing else is known */
+#define ROUNDING_LEVEL 1e-25 /* changes below 3e-13 of the state may be rounding */
+#define PROGRESS_LEVEL 1e-20 /* above 1e-10, sweeps that gain less than a factor of 1.4 are given up */
+#define FIRST_SWEEPS 4 /* but not at once: the first ones need not contract */
+#define GOOD_GUESS 1e-6 /* a guess this near, 1e-3 of the state, is continued from two steps the next time */
+
+static inline double smaller(double a, double b)
+{
+  return a < b ? a : b;
+}
+
+/* What follows a sweep would change the points by, with a margin: the rate of contraction is that from the sweep
+ * before, whose change is infinite before the first. */
+static inline double expected_change(double change, double last, int absolute)
+{
+  const double seen = smaller(larger(change / last, FASTEST_CONTRACTION), SLOWEST_CONTRACTION);
+  const double ratio = last < INFINITY ? seen : 1.0;
+  return absolute ? change : MARGIN * ratio * change * (SWEEPS_AFTER ? ratio : 1.0);
+}
+
+/* Whether a sweep that changed the points by the root of `change` (relative to the state) was good enough: what follows
+ * it would change them by less than a quarter of the tolerance, or rounding stops the shrinking: 1; 0: go on; -1: it
+ * contracts too slowly or not at all. Without branches, for many at once. */
+static inline int sweep_status(double change, double last, const solver_options *options, int k)
+{
+  const int small = expected_change(change, last, options->absolute) <= options->tolerance * options->tolerance;
+  const int stopped = (change == 0.0) | ((k > 0) & (change >= last * STALLED) & (change < ROUNDING_LEVEL));
+  const int slow =
+      (k >= options->max_iterations) | ((k > FIRST_SWEEPS) & (change > 0.5 * last) & (change > PROGRESS_LEVEL));
+  return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
+}
+
+/* 1 / (size + a little of the largest), so that a coordinate that rests at 0 has a size too; or what makes changes of x
+ * changes of q. An infinite size gives NaN. */
+static inline void invert_sizes(const solver_options *options, double absolute, number *size)
+{
+  number largest = number_of(0.0);
+  for (int i = 0; i < M; i++)
+    largest = larger_number(largest, size[i]);
+  for (int i = 0; i < M; i++)
+    size[i] =
+        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
+}
+
+/* From how many steps the next guess is best continued: a polynomial of high degree through two is the better one while
+ * guesses are good, and the worse one when the steps are long. */
+static inline long long steps_to_continue(long long steps, double first_change)
+{
+  return steps > 0 && first_change < GOOD_GUESS ? 2 : 1;
+}

@@ -1,0 +1,108 @@
+/* A step by sweeps for any regular Lagrangian. Before it: points.h or trajectories.h with what follows them,
+ * point_weights.h, a mass, the tables, the kernels point_lanes and force_lanes; PROJECTED where the unknowns are not
+ * the velocities at the points. */
+
+/* Positions and velocities at point n of the curve that z gives. */
+static inline void place(const step_data *step, int n, lanes (*scaled)[M], lanes (*z)[M], lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    u[i] = step->q0[i] + (step->carry_q[i] + apply(POSITION, n, scaled, i));
+#ifdef PROJECTED
+    u[M + i] = apply(VELOCITY, n, z, i);
+#else
+    u[M + i] = z[n][i];
+#endif
+  }
+}
+
+/* The increments of one step. The velocities z are corrected by mass^-1 (P - L_v) until they rest; the increments are
+ * made from the forces at the points they rest at. The velocities are kept. */
+HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, number *dq, number *dp,
+    const solver_options *options, solver_report *report)
+{
+  coordinates own[GROUPS], *z = kept(past, own);
+  lanes u[2 * M], value[GROUPS][2 * M], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
+  number inverse_size[M];
+  progress now = before_sweeps();
+  int status = OK;
+  if (*steps > 0)
+    continue_curve(past, *steps, z);
+  else
+    status = start_velocities(step, z);
+  if (status != OK)
+    return status;
+  for (int k = 0; needs_sweep(&now); k++) {
+    lanes change = lanes_of(0.0);
+    scale(data->position_weight, z, scaled);
+    if (!DIAGONAL)
+      memset(mass, 0, sizeof mass);
+    for (int n = 0; n < GROUPS; n++) {
+      place(step, n, scaled, z, u);
+      point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
+      for (int i = 0; i < M; i++)
+        impulse[n][i] = data->momentum_weight[n] * value[n][i];
+    }
+#ifdef PROJECTED
+    {
+      lanes momentum[GROUPS][M], residual[GROUPS][M];
+      for (int n = 0; n < GROUPS; n++)
+        memcpy(momentum[n], value[n] + M, sizeof momentum[n]);
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++) {
+          const lanes P = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, impulse, i));
+          residual[n][i] = P - apply(PROJECTION, n, momentum, i);
+        }
+      for (int n = 0; n < GROUPS; n++) {
+        for (int i = 0; i < M; i++)
+          r[n][i] = apply(VELOCITY, n, residual, i);
+        factor_mass(mass[n]);
+        solve_mass(mass[n], r[n]);
+      }
+      memcpy(residual, r, sizeof r);
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++) {
+          r[n][i] = apply(PROJECTION, n, residual, i);
+          z[n][i] += r[n][i];
+        }
+    }
+#else
+    for (int n = 0; n < GROUPS; n++) {
+      for (int i = 0; i < M; i++)
+        r[n][i] = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, impulse, i)) - value[n][M + i];
+      factor_mass(mass[n]);
+      solve_mass(mass[n], r[n]);
+      for (int i = 0; i < M; i++)
+        z[n][i] += r[n][i];
+    }
+#endif
+    if (k == 0) {
+      for (int i = 0; i < M; i++)
+        inverse_size[i] = magnitude(at_start(z, i)) + magnitude(at_end(z, i));
+      invert_sizes(options, fabs(step->h), inverse_size);
+    }
+    for (int n = 0; n < GROUPS; n++)
+      for (int i = 0; i < M; i++) {
+        const lanes moved = r[n][i] * inverse_size[i];
+        change += moved * moved;
+      }
+    take_change(&now, total_change(change), options, k, report);
+  }
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  scale(data->position_weight, z, scaled);
+  for (int n = 0; n < GROUPS; n++) {
+    place(step, n, scaled, z, u);
+    force_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, r[n]);
+  }
+  scale(data->momentum_weight, r, impulse);
+  for (int i = 0; i < M; i++) {
+    dq[i] = weigh(POINT_END_POSITION, scaled, i);
+    dp[i] = weigh(POINT_END_MOMENTUM, impulse, i);
+  }
+  if (!accept(step, dq, dp, report))
+    return NOT_FINITE;
+  remember_curve(z, past);
+  *steps = next_guess(*steps, &now, report);
+  return OK;
+}

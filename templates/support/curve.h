@@ -1,0 +1,66 @@
+/* Curves of a step given by initial velocities v0 and scaled accelerations z = h a at nodes. Before it:
+ * one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
+typedef struct {
+  double v0[M];
+  lanes z[1][M];
+} curve_data;
+
+enum { CURVE_MEMORY = 2 * M * LANES + M }; /* z of the last step and of the one before, v0 */
+
+static void save_curve(curve_data *curve, history past)
+{
+  remember_curve(curve->z, past);
+  memcpy(past + 2 * M * LANES, curve->v0, sizeof curve->v0);
+}
+
+static inline lanes apply_to(const lanes *table, lanes x)
+{
+  return lanes_apply(table, &x);
+}
+
+/* v1 = v0 + sum b z. */
+static inline double end_velocity(const curve_data *curve, int i)
+{
+  return curve->v0[i] + lanes_total(NODE_MASK * NODE_END * curve->z[0][i]);
+}
+
+/* The curve of the last steps continued, or a straight line. */
+static int first_curve(const step_data *step, const double *past, long long steps, curve_data *curve)
+{
+  if (steps > 0) {
+    lanes_load(past, curve->z[0]);
+    memcpy(curve->v0, past + 2 * M * LANES, sizeof curve->v0);
+    for (int i = 0; i < M; i++)
+      curve->v0[i] = end_velocity(curve, i);
+    continue_curve(past, steps, curve->z);
+    return nearby_velocity(step, curve->v0);
+  }
+  for (int i = 0; i < M; i++)
+    curve->z[0][i] = lanes_of(0.0);
+  return NAME(velocity)(step->t, step->q0, step->p0, step->parameters, curve->v0, step->scratch);
+}
+
+/* 1 / (|v0| + |v1|), which makes changes of velocities relative. */
+static inline void measure_curve(const step_data *step, const curve_data *curve, const solver_options *options,
+    double *inverse_size)
+{
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = fabs(curve->v0[i]) + fabs(end_velocity(curve, i));
+  invert_sizes(options, fabs(step->h), inverse_size);
+}
+
+/* Positions and velocities at the nodes. */
+static inline void place_nodes(const step_data *step, const curve_data *curve, lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    u[M + i] = curve->v0[i] + apply_to(COLLOCATION, curve->z[0][i]);
+    u[i] = step->q0[i] + (step->carry_q[i] + apply_to(COLLOCATION, step->h * u[M + i]));
+  }
+}
+
+/* q1 - q0. */
+static inline void end_increment(const step_data *step, const curve_data *curve, double *dq)
+{
+  for (int i = 0; i < M; i++)
+    dq[i] = lanes_total(NODE_MASK * NODE_END * (step->h * (curve->v0[i] + apply_to(COLLOCATION, curve->z[0][i]))));
+}

@@ -1,0 +1,31 @@
+/* The discrete Lagrangian and its Legendre transforms. Before it: newton.h, and action, which sums the Lagrangian along
+ * the curve given by z. */
+
+int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
+    const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
+{
+  const solver_options standard = NAME(default_options)();
+  const real carry_q[M] = {0};
+  solver_report unread;
+  const newton_data data = newton_in(workspace + SCRATCH);
+  real v[M], start_p[M], increment[M];
+  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace, 1};
+  int keep = 0, status;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  for (int i = 0; i < M; i++)
+    v[i] = (q1[i] - q0[i]) / h;
+  status = NAME(momentum)(t, q0, v, parameters, start_p, workspace);
+  if (status == OK) {
+    place_on_line(v, start_p, data.z);
+    status = newton(&step, &data, q1, start_p, increment, &keep, options ? options : &standard, report);
+  }
+  if (status != OK)
+    return status;
+  for (int i = 0; i < M; i++) {
+    p0[i] = start_p[i];
+    p1[i] = start_p[i] + increment[i];
+  }
+  *action = action_along(&step, data.z);
+  return OK;
+}

@@ -1,0 +1,43 @@
+/* Momenta at both ends of a curve by quadrature; the first gives the initial velocity. Before it: curve_points.h, the
+ * tables of what the points give to p0 and p1, the kernel action_lanes. */
+typedef struct {
+  lanes start, end; /* h times the weights of forces */
+} sweep_data;
+
+static void prepare_sweep(const step_data *step, sweep_data *data)
+{
+  data->start = step->h * START_FORCE;
+  data->end = step->h * END_FORCE;
+}
+
+/* Forces and momenta at the points. */
+static inline void act(const step_data *step, const curve_data *curve, lanes *action)
+{
+  lanes u[2 * M];
+  place_points(step, curve, u);
+  action_lanes(u, step->t + step->h * POINT_TIME, step->parameters, action);
+}
+
+/* Corrects the initial velocity; how much it moved, relative and squared. */
+static inline double correct_start(const step_data *step, const sweep_data *data, const lanes *mass,
+    const double *inverse_size, curve_data *curve)
+{
+  lanes action[2 * M];
+  double misfit[M];
+  act(step, curve, action);
+  for (int i = 0; i < M; i++)
+    misfit[i] =
+        -(step->p0[i] + (step->carry_p[i] + lanes_total(data->start * action[i] + START_MOMENTUM * action[M + i])));
+  return correct_velocity(mass, misfit, inverse_size, curve->v0);
+}
+
+/* p1 - p0 of a curve. */
+static inline void momentum_increment(const step_data *step, const sweep_data *data, const curve_data *curve,
+    const double *dq, double *dp)
+{
+  lanes action[2 * M];
+  (void)dq;
+  act(step, curve, action);
+  for (int i = 0; i < M; i++)
+    dp[i] = lanes_total(data->end * action[i] + END_MOMENTUM * action[M + i]);
+}

@@ -1,0 +1,35 @@
+/* The momentum at the end of a curve is that of its velocity there; the initial velocity is known. Before it: curve.h.
+ * */
+typedef struct {
+  int unused;
+} sweep_data;
+
+static void prepare_sweep(const step_data *step, sweep_data *data)
+{
+  (void)step;
+  data->unused = 0;
+}
+
+static inline double correct_start(const step_data *step, const sweep_data *data, const lanes *mass,
+    const double *inverse_size, curve_data *curve)
+{
+  (void)step, (void)data, (void)mass, (void)inverse_size, (void)curve;
+  return 0.0;
+}
+
+/* p1 - p0, p1 the momentum at the end of a curve that has moved by dq. */
+static void momentum_increment(const step_data *step, const sweep_data *data, const curve_data *curve, const double *dq,
+    double *dp)
+{
+  double u[2 * M];
+  (void)data;
+  for (int i = 0; i < M; i++) {
+    u[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
+    u[M + i] = end_velocity(curve, i);
+  }
+  if (NAME(momentum)(step->t + step->h, u, u + M, step->parameters, dp, step->scratch) != OK)
+    for (int i = 0; i < M; i++)
+      dp[i] = NAN;
+  for (int i = 0; i < M; i++)
+    dp[i] = (dp[i] - step->p0[i]) - step->carry_p[i];
+}

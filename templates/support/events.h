@@ -1,0 +1,334 @@
+/* The search for zero crossings, by nothing of an integrator but its public functions. Before it: numbers.h, the kernel
+ * event_functions, EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES, EVENT_NODES: where on a part of a step functions are
+ * evaluated, as fractions of it, EVENT_COEFFICIENTS: from values there to coefficients of x^k, with x from -1 to 1 on the
+ * part, and EVENT_DOUBTS: what part of the last two of these is in doubt. */
+enum {
+  EVENT_SPLITS = 6, /* a step is split into parts at most so many times over */
+  EVENT_TRIALS = 200, /* at most so many states are tried for one crossing: bisection takes 52 */
+  EVENT_BISECTIONS = 30, /* of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60 */
+  EVENT_NO_ROOM = -1
+};
+
+#define EVENT_SMALL_PART 0.03 /* a polynomial in doubt by less than this part of its range follows its function */
+#define EVENT_STEEPNESS 8.0 /* a zero is simple where the slope is more than so many doubts */
+
+typedef NAME(watch) event_watch;
+typedef NAME(crossing) event_crossing;
+
+int NAME(event_values)(real t, const real *q, const real *p, const real *parameters, real *value, real *workspace)
+{
+  real u[3 * M];
+  int status = OK;
+  memcpy(u, q, sizeof(real) * M);
+  memcpy(u + M, p, sizeof(real) * M);
+  if (EVENTS_USE_VELOCITIES)
+    status = NAME(velocity)(t, q, p, parameters, u + 2 * M, workspace);
+  if (status != OK)
+    return status;
+  event_functions(u, t, parameters, value);
+  return all_finite(value, EVENTS) ? OK : NOT_FINITE;
+}
+
+/* The state at a fraction of a step, and the functions there. */
+typedef struct {
+  real fraction, g[EVENTS], q[M], p[M];
+} event_sample;
+
+/* A step whose inside is searched, and where its crossings go. */
+typedef struct {
+  real t, end, h;
+  const real *q, *p, *parameters;
+  const solver_options *options;
+  event_watch *watch;
+  event_crossing *found;
+  long long room, *filled;
+  solver_report *report;
+  real *workspace;
+} event_step;
+
+/* The functions at the state of a sample; says which is not finite. */
+static int evaluate_functions(const event_step *step, real t, event_sample *sample)
+{
+  const int status = NAME(event_values)(t, sample->q, sample->p, step->parameters, sample->g, step->workspace);
+  if (status == NOT_FINITE)
+    for (int e = EVENTS - 1; e >= 0; e--)
+      if (!all_finite(sample->g + e, 1))
+        step->watch->undefined = e + 1;
+  return status;
+}
+
+/* The sample after a fraction of the step, which is a step of its own. */
+static int take_sample(const event_step *step, real fraction, event_sample *sample)
+{
+  solver_report own;
+  const int status = NAME(step)(step->t, fraction * step->h, step->q, step->p, step->parameters, step->options,
+      sample->q, sample->p, &own, step->workspace);
+  sample->fraction = fraction;
+  step->report->iterations += own.iterations;
+  step->report->change = own.change;
+  return status == OK ? evaluate_functions(step, step->t + fraction * step->h, sample) : status;
+}
+
+static int changes_sign(real from, real to)
+{
+  return (from < 0.0 && to >= 0.0) || (from > 0.0 && to <= 0.0);
+}
+
+/* sum_k c[k] x^k */
+static real polynomial(const real *c, int degree, real x)
+{
+  real sum = c[degree];
+  for (int k = degree - 1; k >= 0; k--)
+    sum = sum * x + c[k];
+  return sum;
+}
+
+/* Where c changes sign in -1 < x < 1, ascending: once at most between neighbouring extrema. */
+static int polynomial_crossings(const real *c, int degree, real *x)
+{
+  real derivative[EVENT_DEGREE + 1] = {0.0}, ends[EVENT_DEGREE + 2];
+  int count = 0, parts = 1;
+  if (degree < 1)
+    return 0;
+  for (int k = 1; k <= degree; k++)
+    derivative[k - 1] = k * c[k];
+  ends[0] = -1.0;
+  parts += polynomial_crossings(derivative, degree - 1, ends + 1);
+  ends[parts] = 1.0;
+  for (int i = 0; i < parts; i++) {
+    real low = ends[i], high = ends[i + 1];
+    const real start = polynomial(c, degree, low);
+    if (!changes_sign(start, polynomial(c, degree, high)))
+      continue;
+    for (int k = 0; k < EVENT_BISECTIONS; k++) {
+      const real middle = 0.5 * (low + high);
+      if (changes_sign(start, polynomial(c, degree, middle)))
+        high = middle;
+      else
+        low = middle;
+    }
+    x[count++] = 0.5 * (low + high);
+  }
+  return count;
+}
+
+/* The polynomial through values at the nodes; how far it is in doubt (its last two Chebyshev coefficients), and how far it
+ * moves away from its value in the middle. */
+static void interpolate(const real *g, real *c, real *doubt, real *range)
+{
+  *range = 0.0;
+  for (int k = 0; k <= EVENT_DEGREE; k++) {
+    c[k] = 0.0;
+    for (int j = 0; j <= EVENT_DEGREE; j++)
+      c[k] += EVENT_COEFFICIENTS[k][j] * g[j];
+    *range += k > 0 ? fabs(c[k]) : 0.0;
+  }
+  *doubt = EVENT_DOUBTS[0] * fabs(c[EVENT_DEGREE - 1]) + EVENT_DOUBTS[1] * fabs(c[EVENT_DEGREE]);
+}
+
+static real nearer_middle(real a, real b)
+{
+  return fabs(a) < fabs(b) ? a : b;
+}
+
+/* Where the sign of the polynomial c, or whether it crosses zero but once, is in doubt (of such places that nearest to the
+ * middle), or 2; its extrema, ascending. */
+static real doubtful_place(const real *c, real doubt, real *extrema, int *count)
+{
+  real derivative[EVENT_DEGREE], zeros[EVENT_DEGREE], place = 2.0;
+  const int zero_count = polynomial_crossings(c, EVENT_DEGREE, zeros);
+  for (int k = 1; k <= EVENT_DEGREE; k++)
+    derivative[k - 1] = k * c[k];
+  *count = polynomial_crossings(derivative, EVENT_DEGREE - 1, extrema);
+  for (int i = 0; i < zero_count; i++)
+    if (fabs(polynomial(derivative, EVENT_DEGREE - 1, zeros[i])) <= EVENT_STEEPNESS * doubt)
+      place = nearer_middle(zeros[i], place);
+  for (int i = 0; i < *count; i++)
+    if (fabs(polynomial(c, EVENT_DEGREE, extrema[i])) <= doubt)
+      place = nearer_middle(extrema[i], place);
+  return place;
+}
+
+/* Narrows a change of sign down to neighbouring fractions; high is the later end. After a secant the end that it moved is
+ * followed by states beyond it, twice as far each time, until one lies on the other side. */
+static int enclose_crossing(const event_step *step, int e, event_sample low, event_sample *high)
+{
+  const real least = 2.0 * DBL_EPSILON;
+  real moved = 0.0;
+  int beyond = 0; /* 1: low is followed, -1: high is */
+  for (int k = 0; k < EVENT_TRIALS && high->g[e] != 0.0 && high->fraction - low.fraction > 2.0 * least; k++) {
+    const real width = high->fraction - low.fraction, leap = fmin(2.0 * moved, 0.5 * width);
+    real fraction = low.fraction + low.g[e] / (low.g[e] - high->g[e]) * width;
+    event_sample now;
+    int status;
+    if (beyond)
+      fraction = beyond > 0 ? low.fraction + leap : high->fraction - leap;
+    fraction = fmin(fmax(fraction, low.fraction + least), high->fraction - least);
+    status = take_sample(step, fraction, &now);
+    if (status != OK)
+      return status;
+    if (changes_sign(low.g[e], now.g[e])) {
+      moved = high->fraction - fraction;
+      beyond = beyond > 0 ? 0 : -1;
+      *high = now;
+    } else {
+      moved = fraction - low.fraction;
+      beyond = beyond < 0 ? 0 : 1;
+      low = now;
+    }
+  }
+  return OK;
+}
+
+/* Adds the crossing between two samples, if its direction is wanted. */
+static int add_crossing(const event_step *step, int e, const event_sample *from, const event_sample *to)
+{
+  const int direction = from->g[e] < 0.0 ? 1 : -1;
+  event_sample at = *to;
+  event_crossing *crossing = step->found + *step->filled;
+  int status;
+  if (step->watch->direction[e] == -direction)
+    return OK;
+  if (*step->filled == step->room)
+    return EVENT_NO_ROOM;
+  status = enclose_crossing(step, e, *from, &at);
+  if (status != OK)
+    return status;
+  crossing->t = at.fraction < 1.0 ? step->t + at.fraction * step->h : step->end;
+  crossing->function = e;
+  memcpy(crossing->q, at.q, sizeof at.q);
+  memcpy(crossing->p, at.p, sizeof at.p);
+  ++*step->filled;
+  return OK;
+}
+
+/* The crossings of one function from one sample to another, with samples at the extrema between them. */
+static int add_crossings(const event_step *step, int e, const event_sample *left, const event_sample *right,
+    const real *extrema, int count)
+{
+  event_sample from = *left, to;
+  for (int i = 0; i <= count; i++) {
+    int status = OK;
+    if (i < count)
+      status = take_sample(step, extrema[i], &to);
+    else
+      to = *right;
+    if (status == OK && changes_sign(from.g[e], to.g[e]))
+      status = add_crossing(step, e, &from, &to);
+    if (status != OK)
+      return status;
+    from = to;
+  }
+  return OK;
+}
+
+/* The crossings of one function on a part of a step, from its values at the inner nodes if they are known. The part is
+ * split in the middle if the polynomial through them does not follow the function, and where it has an extremum so near
+ * zero that its sign is in doubt. */
+static int search_part(const event_step *step, int e, const event_sample *left, const event_sample *right,
+    const real *known, int splits)
+{
+  const real half = 0.5 * (right->fraction - left->fraction), middle = left->fraction + half;
+  real g[EVENT_DEGREE + 1], c[EVENT_DEGREE + 1], extrema[EVENT_DEGREE], doubt, range, split, before = left->g[e];
+  int count, follows, crossed = 0, status = OK;
+  event_sample sample;
+  g[0] = left->g[e];
+  g[EVENT_DEGREE] = right->g[e];
+  for (int j = 1; j < EVENT_DEGREE; j++) {
+    if (!known) {
+      status = take_sample(step, left->fraction + EVENT_NODES[j] * 2.0 * half, &sample);
+      if (status != OK)
+        return status;
+    }
+    g[j] = known ? known[j - 1] : sample.g[e];
+  }
+  interpolate(g, c, &doubt, &range);
+  follows = doubt <= EVENT_SMALL_PART * range;
+  if (fabs(c[0]) > range + (follows ? doubt : range))
+    return status; /* far from zero */
+  split = doubtful_place(c, doubt, extrema, &count);
+  if (split < 1.0 || !follows)
+    split = split > 1.0 ? 0.0 : fmin(fmax(split, -0.5), 0.5);
+  for (int i = 0; i <= count; i++) {
+    const real value = i < count ? polynomial(c, EVENT_DEGREE, extrema[i]) : g[EVENT_DEGREE];
+    crossed |= changes_sign(before, value);
+    before = value;
+    if (i < count)
+      extrema[i] = middle + half * extrema[i];
+  }
+  if (split > 1.0 || splits == 0)
+    return crossed || split < 1.0 ? add_crossings(step, e, left, right, extrema, count) : status;
+  status = take_sample(step, middle + half * split, &sample);
+  if (status == OK)
+    status = search_part(step, e, left, &sample, NULL, splits - 1);
+  return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
+}
+
+/* The crossings of all functions on a step, in no order. */
+static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
+{
+  real inner[EVENTS][EVENT_DEGREE - 1];
+  for (int j = 1; j < EVENT_DEGREE; j++) {
+    event_sample sample;
+    const int status = take_sample(step, EVENT_NODES[j], &sample);
+    if (status != OK)
+      return status;
+    for (int e = 0; e < EVENTS; e++)
+      inner[e][j - 1] = sample.g[e];
+  }
+  for (int e = 0; e < EVENTS; e++) {
+    const int status = search_part(step, e, left, right, inner[e], EVENT_SPLITS);
+    if (status != OK)
+      return status;
+  }
+  return OK;
+}
+
+/* Crossings of one step in order of time; those after the one that ends the search are dropped. */
+static void settle_crossings(const event_step *step, long long first)
+{
+  for (long long i = first + 1; i < *step->filled; i++)
+    for (long long k = i; k > first && (step->found[k].t - step->found[k - 1].t) * step->h < 0.0; k--) {
+      const event_crossing later = step->found[k - 1];
+      step->found[k - 1] = step->found[k];
+      step->found[k] = later;
+    }
+  for (long long i = first; i < *step->filled; i++) {
+    int *remaining = step->watch->remaining + step->found[i].function;
+    if (*remaining > 0 && --*remaining == 0) {
+      step->watch->ended = 1;
+      *step->filled = i + 1;
+    }
+  }
+}
+
+int NAME(crossings)(event_watch *watch, long long count, const real *h, const real *t, const real *q,
+    const real *p, const real *parameters, const solver_options *options, long long room,
+    event_crossing *found, long long *filled, solver_report *report, real *workspace)
+{
+  event_sample left, right;
+  memset(report, 0, sizeof *report);
+  for (long long k = 0; k < count && !watch->ended; k++) {
+    const long long start = k > 0 ? k - 1 : 0, first = *filled;
+    const event_step step = {t[start], t[k], h[start], q + start * M, p + start * M, parameters, options, watch, found, room,
+        filled, report, workspace};
+    int status;
+    report->t = t[start];
+    right.fraction = k > 0 ? 1.0 : 0.0;
+    memcpy(right.q, q + k * M, sizeof right.q);
+    memcpy(right.p, p + k * M, sizeof right.p);
+    status = evaluate_functions(&step, t[k], &right);
+    if (status == OK && k > 0) {
+      left.fraction = 0.0;
+      status = search_step(&step, &left, &right);
+    }
+    if (status != OK) {
+      *filled = first;
+      return status == EVENT_NO_ROOM ? OK : status;
+    }
+    settle_crossings(&step, first);
+    report->steps = k;
+    left = right;
+  }
+  return OK;
+}

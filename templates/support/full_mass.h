@@ -1,0 +1,32 @@
+/* Mass matrices in every lane, in their lower triangles. Before it: points.h or trajectories.h. */
+enum { DIAGONAL = 0,
+  MASS = M * M };
+
+/* L D L^T of the mass, without pivoting, 1 / D on the diagonal; a vanishing pivot gives NaN. */
+static inline void factor_mass(lanes *mass)
+{
+  for (int j = 0; j < M; j++) {
+    const lanes inverse = 1.0 / mass[j * M + j];
+    for (int i = j + 1; i < M; i++) {
+      const lanes entry = mass[i * M + j], factor = entry * inverse;
+      for (int k = j + 1; k < i; k++)
+        mass[i * M + k] -= entry * mass[k * M + j];
+      mass[i * M + i] -= entry * factor;
+      mass[i * M + j] = factor;
+    }
+    mass[j * M + j] = inverse;
+  }
+}
+
+/* r = mass^-1 r, with the factors of the mass. */
+static inline void solve_mass(const lanes *mass, lanes *r)
+{
+  for (int j = 0; j < M; j++) {
+    for (int i = j + 1; i < M; i++)
+      r[i] -= mass[i * M + j] * r[j];
+    r[j] *= mass[j * M + j];
+  }
+  for (int j = M - 1; j > 0; j--)
+    for (int i = 0; i < j; i++)
+      r[i] -= mass[j * M + i] * r[j];
+}

@@ -1,0 +1,93 @@
+/* Sweeps of many trajectories: what is kept of their last steps, and when a step is done. Before it: trajectories.h,
+ * contraction.h, and the tables LAST_ALONE, LAST, BEFORE, which continue what was kept into the next step. A step fails
+ * for single trajectories, which become inactive, never for all. */
+
+/* What is kept at the points, of the last step and of the one before, in whose place the next comes. */
+typedef struct {
+  lanes (*last)[M], (*before)[M];
+} history;
+
+/* Where to compute what is to be kept. */
+static inline coordinates *kept(history past, coordinates *own)
+{
+  (void)own;
+  return past.before;
+}
+
+/* What is kept at the points, continued into this step from the last one or from the last two. */
+static inline void continue_curve(history past, long long steps, lanes (*x)[M])
+{
+  for (int i = 0; i < M; i++) {
+    lanes next[S];
+    for (int n = 0; n < S; n++)
+      next[n] = steps == 1 ? apply(LAST_ALONE, n, past.last, i) : apply(LAST, n, past.last, i) + apply(BEFORE, n, x, i);
+    for (int n = 0; n < S; n++)
+      x[n][i] = next[n];
+  }
+}
+
+static inline void remember_curve(lanes (*x)[M], history past)
+{
+  (void)x, (void)past; /* it is there already */
+}
+
+/* The velocities of a motion on a straight line, which are there before the first step. */
+static inline int start_velocities(const step_data *step, lanes (*z)[M])
+{
+  (void)step, (void)z;
+  return OK;
+}
+
+/* How the sweeps of a step come on. */
+typedef struct {
+  lanes first, last;
+  int pending;
+} progress;
+
+static inline progress before_sweeps(void)
+{
+  const progress none = {lanes_of(0.0), lanes_of(INFINITY), 1};
+  return none;
+}
+
+static inline int needs_sweep(const progress *now)
+{
+  return now->pending;
+}
+
+/* Trajectories that contract too slowly or left the domain become inactive. */
+static inline void take_change(progress *now, lanes change, const solver_options *options, int k, solver_report *report)
+{
+  const lane_view after = {change}, before = {now->last};
+  int pending = 0;
+  for (int j = 0; j < LANES; j++) {
+    const int status = sweep_status(after.lane[j], before.lane[j], options, k);
+    report->active[j] = status < 0 ? 0.0 : report->active[j];
+    pending += (report->active[j] > 0.0) & (status == 0);
+  }
+  now->pending = pending > 0;
+  now->first = k == 0 ? change : now->first;
+  now->last = change;
+  report->sweeps++;
+}
+
+static inline int outcome(const progress *now, const solver_report *report)
+{
+  (void)now, (void)report;
+  return OK;
+}
+
+static inline int accept(const step_data *step, const lanes *dq, const lanes *dp, const solver_report *report)
+{
+  (void)step, (void)dq, (void)dp, (void)report;
+  return 1;
+}
+
+static inline long long next_guess(long long steps, const progress *now, const solver_report *report)
+{
+  const lane_view view = {now->first};
+  double largest = 0.0;
+  for (int j = 0; j < LANES; j++)
+    largest = report->active[j] > 0.0 ? larger(view.lane[j], largest) : largest;
+  return steps_to_continue(steps, largest);
+}

@@ -1,0 +1,169 @@
+/* Newton's iteration on the stage equations. Before it: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT,
+ * MOMENTA and MOVES, and evaluate, which gives the equations and their Jacobian. */
+
+#define STOPPED_SHRINKING ((real)0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
+#define KEEP_CHANGE ((real)1e-2) /* factors are kept while updates are below this part of the state */
+#define KEEP_RATE ((real)0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
+
+/* How far the last update moved the stages and the end momentum: the largest ratio to its own size, the ratio of the
+ * largest to the largest size, and the largest itself. */
+typedef struct {
+  real relative, overall, absolute;
+} movement;
+
+static movement no_movement(void)
+{
+  const movement none = {0, 0, 0};
+  return none;
+}
+
+static void measure(movement *moved, const real *change, const real *size)
+{
+  real largest_change = 0, largest_size = 0;
+  for (int i = 0; i < M; i++) {
+    const real ratio = change[i] != 0 ? MATH(fabs)(change[i]) / size[i] : 0;
+    moved->relative = larger(moved->relative, ratio);
+    largest_change = larger(largest_change, MATH(fabs)(change[i]));
+    largest_size = larger(largest_size, size[i]);
+  }
+  if (largest_change > moved->overall * largest_size)
+    moved->overall = largest_change / largest_size;
+  moved->absolute = larger(moved->absolute, largest_change);
+}
+
+/* What Newton's iteration works with: unknowns; rows and their update; pivots and factors of the Jacobian. Where
+ * factors go from step to step (POINT > 0), they were made at point: t, q0 with what rounding cut off, unknowns. */
+typedef struct {
+  real *z, *point, *rows, *update, *pivot, *factors;
+} newton_data;
+
+static newton_data newton_in(real *workspace)
+{
+  newton_data data;
+  data.z = workspace;
+  data.point = data.z + N;
+  data.rows = data.point + POINT;
+  data.update = data.rows + N + M;
+  data.pivot = data.update + N + M;
+  data.factors = data.pivot + N + M;
+  return data;
+}
+
+/* The stages of a motion on a straight line with velocity v and momentum p0. */
+static void place_on_line(const real *v, const real *p0, real *z)
+{
+  for (int i = 0; i < M; i++)
+    for (int b = 0; b < B; b++)
+      z[i * B + b] = STRAIGHT[b] * v[i] + MOMENTA[b] * p0[i];
+}
+
+/* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
+static void apply_update(const newton_data *data, const band *shape, real h, real *p0, const real *size_p,
+    const real *size_q, movement *moved)
+{
+  const int blocks = shape->rows / M;
+  real change[M];
+  for (int i = 0; i < M; i++)
+    memcpy(data->update + PLACE[i] * blocks, data->rows + i * (B + 1), sizeof(real) * (size_t)blocks);
+  back_substitute(data->factors, shape, data->pivot, data->update);
+  for (int i = 0; i < M; i++) {
+    const real *update = data->update + PLACE[i] * blocks;
+    change[i] = 0;
+    for (int b = 0; b < B; b++) {
+      data->z[i * B + b] -= update[b];
+      change[i] = larger(change[i], MATH(fabs)(h * MOVES[b] * update[b]));
+    }
+  }
+  measure(moved, change, size_q);
+  for (int i = 0; p0 && i < M; i++) {
+    change[i] = data->update[PLACE[i] * blocks + B];
+    p0[i] -= change[i];
+  }
+  if (p0)
+    measure(moved, change, size_p);
+}
+
+/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
+ * longer shrinking. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off
+ * from slow progress. */
+static int has_converged(const solver_options *options, const movement *moved, real last, int trials)
+{
+  if (trials < 2)
+    return 0;
+  if (options->absolute)
+    return moved->absolute < options->tolerance;
+  return moved->relative <= options->tolerance ||
+      (trials > 2 && moved->overall <= ROUNDOFF_LEVEL && moved->relative >= STOPPED_SHRINKING * last);
+}
+
+/* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
+static void add_boundary(const step_data *step, const newton_data *data, const real *q1, int with_jacobian,
+    const band *shape)
+{
+  for (int i = 0; i < M; i++) {
+    real *row = data->rows + i * (B + 1) + B;
+    *row = -(q1[i] - step->q0[i]) / step->h;
+    for (int b = 0; b < B; b++)
+      *row += END_POSITION[b] * data->z[i * B + b];
+  }
+  for (int i = 0; with_jacobian && i < M; i++) {
+    real *corner = data->factors + shape->first + PLACE[i] * (B + 1) * (shape->stride + 1);
+    for (int b = 0; b < B; b++) {
+      corner[B * shape->stride + b] = MOMENTUM_ROW[b];
+      corner[b * shape->stride + B] = END_POSITION[b];
+    }
+  }
+}
+
+/* Factors of the Jacobian just evaluated; remembers where. Returns 0 if it is singular. */
+static int linearise(const step_data *step, const newton_data *data, const band *shape)
+{
+  if (POINT) {
+    data->point[0] = step->t;
+    memcpy(data->point + 1, step->q0, sizeof(real) * M);
+    memcpy(data->point + 1 + M, step->carry_q, sizeof(real) * M);
+    memcpy(data->point + 1 + 2 * M, data->z, sizeof(real) * N);
+  }
+  return factorise(data->factors, shape, data->pivot);
+}
+
+/* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. The factors,
+ * of an earlier step if *keep, serve as long as updates are small and shrink fast. With an end position q1, p0 is
+ * unknown too and found in place. */
+static int newton(const step_data *step, const newton_data *data, const real *q1, real *p0, real *increment, int *keep,
+    const solver_options *options, solver_report *report)
+{
+  const band shape = band_of(q1 ? B + 1 : B);
+  real size_q[M], size_p[M], change[M], last = (real)INFINITY;
+  movement moved = no_movement();
+  int trials = 0;
+  memset(increment, 0, sizeof(real) * M);
+  for (int k = 0;; k++) {
+    evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
+    for (int i = 0; i < M; i++) {
+      change[i] = data->rows[i * (B + 1) + B] - increment[i];
+      increment[i] = data->rows[i * (B + 1) + B];
+    }
+    if (q1)
+      add_boundary(step, data, q1, !*keep, &shape);
+    if (!all_finite(data->rows, N + M) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
+      return NOT_FINITE;
+    if (k > 0) {
+      measure(&moved, change, size_p);
+      report->change = options->absolute ? moved.absolute : moved.relative;
+      if (has_converged(options, &moved, last, trials))
+        return OK;
+      last = moved.relative;
+    }
+    if (k >= least(options->max_iterations, MOST_ITERATIONS))
+      return NOT_CONVERGED;
+    trials = *keep ? trials + 1 : 3;
+    if (!*keep && !linearise(step, data, &shape))
+      return SINGULAR;
+    moved = no_movement();
+    apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
+    *keep = has_converged(options, &moved, last, trials) ||
+        (moved.overall < KEEP_CHANGE && moved.relative < KEEP_RATE * last);
+    report->iterations++;
+  }
+}

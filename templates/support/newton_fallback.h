@@ -1,0 +1,12 @@
+/* Where sweeps fail, Newton's iteration. Before it: newton.h. */
+static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *workspace)
+{
+  const newton_data newtons = newton_in(workspace);
+  int keep;
+  status = newton_from_line(step, &newtons, dp, &keep, options, report);
+  gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
+  memset(dq + M, 0, sizeof(double) * M);
+  memset(dp + M, 0, sizeof(double) * M);
+  return status;
+}

@@ -1,0 +1,24 @@
+/* Comparisons and checks of numbers. Before it: real. */
+
+/* fmax without its care for NaN, and without a call. */
+static inline real larger(real a, real b)
+{
+  return a > b ? a : b;
+}
+
+/* Whether no x is an infinity or a NaN. */
+static int all_finite(const real *x, int n)
+{
+  real sum = 0;
+  for (int i = 0; i < n; i++)
+    sum += 0 * x[i];
+  return sum == 0;
+}
+
+/* inverse_root_k, x^(-k/2), k odd: INVERSE_ROOT(k, inverse^((k+1)/2)). */
+#define INVERSE_ROOT(k, inverses)             \
+  static inline real inverse_root_##k(real x) \
+  {                                           \
+    const real inverse = 1 / x;               \
+    return inverses * MATH(sqrt)(x);          \
+  }

@@ -1,0 +1,20 @@
+/* What the steps of a run share where velocities and forces at points are summed. Before it: the tables. */
+typedef struct {
+  weight position_weight[GROUPS], momentum_weight[GROUPS]; /* h beta, h w: the same rounded numbers everywhere */
+} sweep_data;
+
+static void prepare_sweep(const step_data *step, sweep_data *data)
+{
+  for (int n = 0; n < GROUPS; n++) {
+    data->position_weight[n] = step->h * POSITION_WEIGHT[n];
+    data->momentum_weight[n] = step->h * MOMENTUM_WEIGHT[n];
+  }
+}
+
+/* h times the weights, times what is at the points. */
+static inline void scale(const weight *weights, lanes (*x)[M], lanes (*scaled)[M])
+{
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      scaled[n][i] = weights[n] * x[n][i];
+}

@@ -1,0 +1,91 @@
+/* Lanes are trajectories: one vector holds what LANES of them have at one point. Before it: vectors.h. The same names
+ * are in points.h. */
+enum { GROUPS = S }; /* vectors for all points */
+
+typedef lanes coordinates[M]; /* what all coordinates have at a point */
+
+typedef lanes number; /* what each trajectory has once */
+typedef double weight; /* what a point has, for all trajectories */
+
+static inline number number_of(double x)
+{
+  return lanes_of(x);
+}
+
+static inline lanes lanes_of_number(number x)
+{
+  return x;
+}
+
+static inline number magnitude(number x)
+{
+  lane_view view = {x};
+  for (int j = 0; j < LANES; j++)
+    view.lane[j] = fabs(view.lane[j]);
+  return view.all;
+}
+
+static inline number larger_number(number a, number b)
+{
+  lane_view largest = {a}, view = {b};
+  for (int j = 0; j < LANES; j++)
+    largest.lane[j] = larger(largest.lane[j], view.lane[j]);
+  return largest.all;
+}
+
+static inline number fused_numbers(number a, number b, number c)
+{
+  return multiply_add(a, b, c);
+}
+
+static inline weight fused_weights(double a, weight b, weight c)
+{
+  return fma(a, b, c);
+}
+
+/* sum_j table_nj x_j of one coordinate, in two sums that do not wait for each other. */
+static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
+{
+  lanes a = table[n][0] * x[0][i], b = lanes_of(0.0);
+  for (int j = 1; j + 1 < S; j += 2) {
+    b += table[n][j] * x[j][i];
+    a += table[n][j + 1] * x[j + 1][i];
+  }
+  if (S % 2 == 0)
+    b += table[n][S - 1] * x[S - 1][i];
+  return a + b;
+}
+
+/* sum_n weights_n x_n; then with the low parts of the weights. */
+static inline number weigh(const weight *weights, lanes (*x)[M], int i)
+{
+  number sum = lanes_of(0.0);
+  for (int n = 0; n < S; n++)
+    sum += weights[n] * x[n][i];
+  return sum;
+}
+
+static inline number weigh_twice(const weight *weights, const weight *low, lanes (*x)[M], int i)
+{
+  number sum = lanes_of(0.0);
+  for (int n = 0; n < S; n++)
+    sum += multiply_add(lanes_of(weights[n]), x[n][i], low[n] * x[n][i]);
+  return sum;
+}
+
+/* What x is at the first point, and at the last. */
+static inline number at_start(lanes (*x)[M], int i)
+{
+  return x[0][i];
+}
+
+static inline number at_end(lanes (*x)[M], int i)
+{
+  return x[S - 1][i];
+}
+
+/* What becomes of a change of each point: that of the trajectory. */
+static inline number total_change(lanes change)
+{
+  return change;
+}
