@@ -127,7 +127,7 @@ class StepEquations:
 
     def _conserved(self) -> Iterator[str]:
         if self.symmetries:
-            yield "\nconserved (momentum maps of symmetries)"
+            yield "\nconserved (momentum maps of symmetries affine in the coordinates, which are what is searched)"
         for symmetry in self.symmetries:
             yield f"  {symmetry}{'' if self.method.exactness.keeps(symmetry) else '  (not guaranteed by this method)'}"
 

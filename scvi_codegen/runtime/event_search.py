@@ -15,13 +15,13 @@ from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.kept_states import KeptStates
 
-__all__ = ["EventSearch", "crossings_of"]
+__all__ = ["CrossingSearch", "crossings_of"]
 
 ROOM = 256
 """Crossings that one call can report; a step with more makes room for twice as many."""
 
 
-class EventSearch:
+class CrossingSearch:
     """The crossings of a stepper's events along consecutive parts of one run.
 
     Attributes:
@@ -112,7 +112,7 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
 
     Raises:
         StateError: if states between were not kept.
-        EventError, StepFailedError: as :meth:`EventSearch.search`.
+        EventError, StepFailedError: as :meth:`CrossingSearch.search`.
     """
     lengths, spans, tolerance = states.lengths.copy(), np.diff(states.t), grid_tolerance(states)[:-1]
     short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
@@ -121,7 +121,7 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
             "events are looked for between consecutive steps, but this trajectory was kept with every > 1 or t_eval"
         )
     lengths[:-1][short] = spans[short]  # an event ended the last step
-    search = EventSearch(stepper)
+    search = CrossingSearch(stepper)
     for number in range(len(stepper.events)):
         search.watch.remaining[number] = 0
     search.search(replace(states, lengths=lengths))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.runtime.dense_output import lengths_at, states_at
-from scvi_codegen.runtime.event_search import EventSearch
+from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import SLICE_SECONDS, record_states, trajectory_of
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -39,7 +39,7 @@ class Observation:
 
     def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None) -> None:
         self.run, self.every, self.times = run, checked_count(every, "every", least=1), times
-        self.search = EventSearch(run.stepper) if run.stepper.events else None
+        self.search = CrossingSearch(run.stepper) if run.stepper.events else None
         self.states: list[tuple[Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations = 0
 

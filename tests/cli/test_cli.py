@@ -421,6 +421,8 @@ class TestListings:
 
     def test_tableaux_in_radicals_and_in_decimals(self):
         assert "1/2 - sqrt(3)/6 |" in output_of("methods", "--tableau", "gauss:2")
+        assert "37/225 - 169*sqrt(6)/1800" in output_of("methods", "--tableau", "radau-iia:3")
+        assert "\nb_1 = 1/4 - sqrt(30)/72\n" in output_of("methods", "--tableau", "gauss:4")
         text = output_of("methods", "--tableau", "gauss:5")
         assert "order 10, symplectic, symmetric, A-stable" in text
         assert len(text.splitlines()) == 8

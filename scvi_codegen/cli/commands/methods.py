@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import click
 
 from scvi_codegen.cli.wording import table
 from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification
 from scvi_codegen.tables.closed_forms import exact_tableau
+from scvi_codegen.tables.nodes import Expressions
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.tableau import tableau_by_name
 
@@ -20,7 +23,8 @@ EXAMPLES: dict[str, dict[str, int | list[float]]] = {
     "composition": {"order": 8},
 }
 EXAMPLE_STAGES = 3
-LONGEST_EXACT = 24
+LONGEST_EXACT = 32
+"""Characters of an entry that stands in a tableau; longer ones stand below it."""
 
 
 @click.command()
@@ -43,7 +47,9 @@ def methods_table() -> str:
 
 
 def tableau_text(name: str) -> str:
-    """Butcher tableau of a name such as ``gauss:3``, in radicals where they are short, else in 17 digits.
+    """Butcher tableau of a name such as ``gauss:3``, in radicals where these are known, else in 17 digits.
+
+    Radicals that are too long for a tableau stand below that of 17 digits, an entry a line.
 
     Raises:
         MethodError: if there is no such tableau.
@@ -51,12 +57,14 @@ def tableau_text(name: str) -> str:
     tableau = tableau_by_name(name)
     rows = [[_decimal(c), *map(_decimal, line)] for c, line in zip(tableau.c, tableau.A, strict=True)]
     rows.append(["", *map(_decimal, tableau.b)])
-    exact = exact_tableau(tableau)
+    exact, below = exact_tableau(tableau), list[str]()
     if exact is not None:
         A, b, c = exact
         radicals = [[str(x), *map(str, line)] for x, line in zip(c, A, strict=True)] + [["", *map(str, b)]]
         if max(len(entry) for line in radicals for entry in line) <= LONGEST_EXACT:
             rows = radicals
+        else:
+            below = ["", *_entries(A, b, c)]
     widths = [max(len(line[k]) for line in rows) for k in range(len(rows[0]))]
     lines = [
         f"{line[0]:>{widths[0]}} | "
@@ -66,7 +74,14 @@ def tableau_text(name: str) -> str:
     rule = "-" * (widths[0] + 1) + "+" + "-" * (len(lines[0]) - widths[0] - 2)
     facts = f"order {tableau.order}, {_yes_or_not(tableau.is_symplectic)}symplectic, "
     facts += f"{_yes_or_not(tableau.is_symmetric)}symmetric, {_yes_or_not(tableau.is_a_stable)}A-stable"
-    return "\n".join([f"{tableau.name}: {facts}", *lines[:-1], rule, lines[-1]])
+    return "\n".join([f"{tableau.name}: {facts}", *lines[:-1], rule, lines[-1], *below])
+
+
+def _entries(A: Sequence[Expressions], b: Expressions, c: Expressions) -> Iterator[str]:
+    """A line for each."""
+    yield from (f"c_{i} = {x}" for i, x in enumerate(c, 1))
+    yield from (f"a_{i},{j} = {x}" for i, line in enumerate(A, 1) for j, x in enumerate(line, 1))
+    yield from (f"b_{j} = {x}" for j, x in enumerate(b, 1))
 
 
 def _example(name: str) -> Method:
