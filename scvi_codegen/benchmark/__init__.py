@@ -13,6 +13,7 @@
     compositions  SVI against explicit compositions
     hand_written  generated C against hand-written C
     start_up      from text to the first step
+    compile_times the same for larger systems (in compile_systems), by what takes the time
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation we know of, which are named; no step or tolerance chosen with the answer known, but whole curves.
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.benchmark.cases import CASES
+from scvi_codegen.benchmark.compile_times import run_compile_times
 from scvi_codegen.benchmark.compositions import run_compositions
 from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.drift import run_drift
@@ -54,6 +56,7 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "compositions": run_compositions,
     "hand-written": run_hand_written,
     "start-up": run_start_up,
+    "compile": run_compile_times,
 }
 """All that can be measured: name on the command line -> function that does it."""
 

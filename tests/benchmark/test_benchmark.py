@@ -12,6 +12,8 @@ from mpmath import mp
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import (
     cases,
+    compile_systems,
+    compile_times,
     compositions,
     hand_written,
     measuring,
@@ -28,6 +30,8 @@ from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.errors import StateError, SystemDefinitionError
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet
 from scvi_codegen.native import building
 
@@ -393,6 +397,49 @@ class TestTables:
         assert [row["error"] for row in found.rows] == [1e-4, 1e-8, 1e-12]
         assert all("stoermer-verlet" in row for row in found.rows)
         assert found.rows[-1]["fastest"] != "stoermer-verlet"
+
+    @pytest.mark.parametrize(
+        ("write", "size", "dimension"),
+        [("links", 3, 3), ("chain", 4, 4), ("bodies", 3, 9), ("lennard_jones", 3, 9), ("cloth", 2, 12)],
+    )
+    def test_systems_to_compile_have_finite_forces_where_they_begin(self, write, size, dimension):
+        written = getattr(compile_systems, write)(size)
+        system = LagrangianSystem.from_text(
+            name=written.name,
+            coordinates=written.coordinates,
+            lagrangian=written.lagrangian,
+            parameters=written.parameters,
+        )
+        at = dict(zip(system.coordinates, written.start, strict=True)) | system.constants
+        at |= dict.fromkeys(system.velocities, 0.0)
+        slopes = gradient(system.lagrangian, system.coordinates)
+        assert (system.dimension, len(slopes)) == (dimension, dimension)
+        assert all(
+            math.isfinite(float(slope.xreplace({x: sympy.Float(value) for x, value in at.items()})))
+            for slope in slopes.values()
+        )
+
+    def test_two_post_newtonian_bodies_far_apart_are_newtonian(self):
+        read = [
+            LagrangianSystem.from_text(
+                name=each.name,
+                coordinates=each.coordinates,
+                lagrangian=each.lagrangian,
+                parameters=each.parameters,
+            )
+            for each in (compile_systems.post_newtonian(2), compile_systems.bodies(2))
+        ]
+        c2 = next(parameter for parameter in read[0].parameters if parameter.name == "c2")
+        difference = sympy.limit(read[0].lagrangian - read[1].lagrangian, c2, sympy.oo)
+        assert sympy.expand(difference) == 0
+
+    def test_compiling_is_measured(self, monkeypatch):
+        monkeypatch.setattr(compile_times, "COMPILED", {"Kepler": compile_times.COMPILED["Kepler"]})
+        (row,) = compile_times.run_compile_times(bench.Plan(), lambda text: None).rows
+        assert row["coordinates"] == 2
+        assert row["lines_of_C"] > 100
+        assert row["compiler_cpu_s"] > 0.0
+        assert row["read_s"] + row["symmetries_s"] < row["first_step_s"]
 
     def test_start_up(self):
         cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows
