@@ -100,8 +100,8 @@ def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[Sl
         top = sum(len(other.results) for other in family.scatters[:s])
         for g, gather in enumerate(family.gathers):
             left = sum(len(other.arguments) for other in family.gathers[:g])
-            places = [(i, j) for i in range(len(scatter.results)) for j in range(len(gather.arguments))]
-            found = [(i, j) for i, j in places if (top + i, left + j) in entries]
+            rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
+            found = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
             if found:
                 blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=tuple(found)))
                 slopes.extend(entries[top + i, left + j] for i, j in found)
