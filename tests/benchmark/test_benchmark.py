@@ -430,8 +430,9 @@ class TestTables:
             for each in (compile_systems.post_newtonian(2), compile_systems.bodies(2))
         ]
         c2 = next(parameter for parameter in read[0].parameters if parameter.name == "c2")
-        difference = sympy.limit(read[0].lagrangian - read[1].lagrangian, c2, sympy.oo)
-        assert sympy.expand(difference) == 0
+        small = sympy.Symbol("small", positive=True)
+        far = read[0].lagrangian.xreplace({c2: 1 / small}).subs(small, 0)
+        assert sympy.expand(far - read[1].lagrangian) == 0
 
     def test_compiling_is_measured(self, monkeypatch):
         monkeypatch.setattr(compile_times, "COMPILED", {"Kepler": compile_times.COMPILED["Kepler"]})
