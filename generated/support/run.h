@@ -55,11 +55,13 @@ void NAME(start)(run_memory *run, real t, real h, const real *q, const real *p)
 
 /* What a step changes, at hand while a call lasts. */
 typedef struct {
-  real q[M], p[M], carry_q[M], carry_p[M];
+  real t, t_low, q[M], p[M], carry_q[M], carry_p[M];
 } state;
 
 static void load_state(const run_memory *run, state *now)
 {
+  now->t = run->t;
+  now->t_low = run->t_low;
   memcpy(now->q, run->q, sizeof now->q);
   memcpy(now->p, run->p, sizeof now->p);
   memcpy(now->carry_q, run->carry_q, sizeof now->carry_q);
@@ -68,6 +70,8 @@ static void load_state(const run_memory *run, state *now)
 
 static void save_state(const state *now, run_memory *run)
 {
+  run->t = now->t;
+  run->t_low = now->t_low;
   memcpy(run->q, now->q, sizeof now->q);
   memcpy(run->p, now->p, sizeof now->p);
   memcpy(run->carry_q, now->carry_q, sizeof now->carry_q);
@@ -103,7 +107,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     const long long before = report->iterations;
     int status;
     step.first = k == 0;
-    report->t = step.t = run->t;
+    report->t = step.t = now.t;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
     if (status == OK && (!reaches(now.q, dq) || !reaches(now.p, dp)))
@@ -116,10 +120,10 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;
     run->step++;
-    add_to_time(&run->t, &run->t_low, run->h);
+    add_to_time(&now.t, &now.t_low, step.h);
     report->steps++;
     if (run->step % every == 0) {
-      t[stored] = run->t;
+      t[stored] = now.t;
       memcpy(q + stored * M, now.q, sizeof(real) * M);
       memcpy(p + stored * M, now.p, sizeof(real) * M);
       iterations[stored] = (int)run->iterations;

@@ -139,8 +139,8 @@ MUTATIONS = (
     text(
         "a run one step ahead in time",
         case("driven/svi"),
-        r"step\.t = run->t;",
-        "step.t = run->t + run->h;",
+        r"step\.t = now\.t;",
+        "step.t = now.t + run->h;",
     ),
     text("L added in the energy", case("driven/svi"), r"sum = -value\[0\];", "sum = value[0];"),
     text(
