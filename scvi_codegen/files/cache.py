@@ -205,7 +205,8 @@ def _last_use(path: Path) -> float:
 
 
 def _size(path: Path) -> int:
-    files = [path] if path.is_file() else list(path.glob("*"))
+    """Bytes of a file, or of all in a folder that others may be removing."""
+    files = [path] if path.is_file() else [Path(place, name) for place, _, names in os.walk(path) for name in names]
     total = 0
     for file in files:
         with suppress(OSError):

@@ -237,7 +237,7 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
             _compile(source, compiler, flags, built)
         checksum = hashlib.sha256(_library(built).read_bytes()).hexdigest()
         (built / "manifest.json").write_text(json.dumps({"sha256": checksum, "prefix": source.prefix}))
-        for file in built.iterdir():
+        for file in built.rglob("*"):
             file.chmod(file.stat().st_mode & ~0o022)
         try:
             built.replace(entry)
