@@ -14,8 +14,8 @@ import numpy as np
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
 from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
-from scvi_codegen.pictures.motion import Array, Motion
-from scvi_codegen.pictures.shapes import Shape, shape_of
+from scvi_codegen.pictures.motion import Array, DrawnMotion
+from scvi_codegen.pictures.shapes import MovingPoints, shape_of
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -34,7 +34,7 @@ SIZE = 4.8
 
 
 def animate(
-    trajectory: Motion,
+    trajectory: DrawnMotion,
     path: str | os.PathLike[str] | None = None,
     *,
     seconds: float = 8.0,
@@ -78,8 +78,8 @@ class Film:
         seconds: how long it lasts.
     """
 
-    trajectory: Motion
-    shape: Shape
+    trajectory: DrawnMotion
+    shape: MovingPoints
     seconds: float
 
     @cached_property
@@ -127,7 +127,7 @@ class Film:
 class _Scene:
     """Axes with points, a line through them, and trails, set to a state at a time."""
 
-    def __init__(self, figure: Any, motion: Motion, shape: Shape) -> None:
+    def __init__(self, figure: Any, motion: DrawnMotion, shape: MovingPoints) -> None:
         self.motion, self.shape = motion, shape
         self.places = shape.points(motion.q, motion.p)
         dimension = self.places.shape[2]

@@ -9,7 +9,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.pictures.canvas import color, panel
-from scvi_codegen.pictures.motion import Array, Motion, Motions, several
+from scvi_codegen.pictures.motion import Array, DrawnMotion, Motions, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
 
 
 def plot_momentum_maps(
-    trajectory: Motion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
+    trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:
     """Draw how much each momentum map has changed over time, relative to the largest size of its terms.
 
@@ -60,14 +60,14 @@ def plot_momentum_maps(
     return drawn
 
 
-def draw_energy_error(axes: Axes, motion: Motion) -> None:
+def draw_energy_error(axes: Axes, motion: DrawnMotion) -> None:
     """The curve of a single motion, with its title."""
     error, scaled = _energy_error(motion)
     _draw_error(axes, motion.t, error, 0)
     axes.set(xlabel="t", title="relative energy error" if scaled else "energy error")
 
 
-def _energy_error(motion: Motion) -> tuple[Array, bool]:
+def _energy_error(motion: DrawnMotion) -> tuple[Array, bool]:
     energy = motion.energy()
     scale = abs(energy[0])
     return np.abs(energy - energy[0]) / (scale or 1.0), bool(scale)

@@ -13,7 +13,7 @@ from scvi_codegen.errors import StateError
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface
 
-__all__ = ["Array", "Motion", "Motions", "Mover", "column", "several"]
+__all__ = ["Array", "DrawnMotion", "Motions", "Mover", "column", "several"]
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class Mover(Protocol):
         """(n,) energies of (n, m) states."""
 
 
-class Motion(Protocol):
+class DrawnMotion(Protocol):
     """States along a run: t (n,), q (n, m), p (n, m), with step size h and parameters."""
 
     @property
@@ -54,11 +54,11 @@ class Motion(Protocol):
     def momentum_errors(self) -> Array: ...  # noqa: D102
 
 
-Motions: TypeAlias = Motion | Sequence[Motion]
+Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]
 """One, or several of the same system."""
 
 
-def several(motions: Motions) -> Sequence[Motion]:
+def several(motions: Motions) -> Sequence[DrawnMotion]:
     """One or several motions as several.
 
     Raises:

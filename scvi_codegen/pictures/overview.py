@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.pictures.canvas import COLORS, check_plot_path, new_figure, plain, save, style
 from scvi_codegen.pictures.conserved import draw_energy_error
-from scvi_codegen.pictures.motion import Motion
+from scvi_codegen.pictures.motion import DrawnMotion
 from scvi_codegen.pictures.paths import draw_paths, path_panels
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_trajectory"]
 
 
-def plot_trajectory(trajectory: Motion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
+def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
     """Draw the motion on the left, the relative energy error over time on the right.
 
     Args:
@@ -43,7 +43,7 @@ def plot_trajectory(trajectory: Motion, path: str | os.PathLike[str] | None = No
     return axes
 
 
-def _draw(trajectory: Motion, axes: tuple[Axes, ...]) -> None:
+def _draw(trajectory: DrawnMotion, axes: tuple[Axes, ...]) -> None:
     interface, figure = trajectory.stepper.interface, axes[0].figure
     draw_paths(axes[:-1], trajectory)
     draw_energy_error(axes[-1], trajectory)

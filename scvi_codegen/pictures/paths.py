@@ -11,7 +11,7 @@ import numpy as np
 
 from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.motion import Array, Motion, Motions, column, several
+from scvi_codegen.pictures.motion import Array, DrawnMotion, Motions, column, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ MOST_POINTS = 20_000
 MOST_CURVES = 6
 
 
-def plot_motion(trajectory: Motion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
+def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw where a trajectory goes: orbits, a plane of coordinates, the phase plane of one, or all over time.
 
     Args:
@@ -70,7 +70,7 @@ def plot_phase(
     return drawn
 
 
-def path_panels(motion: Motion) -> int:
+def path_panels(motion: DrawnMotion) -> int:
     """How many panels say where it goes: two for what moves in space, or has a few coordinates."""
     coordinates = motion.stepper.interface.coordinates
     found = bodies(coordinates)
@@ -78,7 +78,7 @@ def path_panels(motion: Motion) -> int:
     return 2 if spatial or (not found and 3 <= len(coordinates) <= MOST_CURVES) else 1
 
 
-def draw_paths(panels: Sequence[Axes], motion: Motion) -> None:
+def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
     """Draw into as many panels as there are.
 
     One coordinate is drawn in the phase plane, bodies by their orbits, a few coordinates in their first planes, many
@@ -98,13 +98,13 @@ def draw_paths(panels: Sequence[Axes], motion: Motion) -> None:
         _draw_image(panels[0], motion)
 
 
-def _draw_phase_plane(axes: Axes, motion: Motion) -> None:
+def _draw_phase_plane(axes: Axes, motion: DrawnMotion) -> None:
     interface = motion.stepper.interface
     _draw_curve(axes, motion.q[:, 0], motion.p[:, 0], color(0))
     axes.set(xlabel=interface.coordinates[0], ylabel=interface.momenta[0], title="phase plane")
 
 
-def _draw_plane(axes: Axes, motion: Motion, plane: tuple[int, int]) -> None:
+def _draw_plane(axes: Axes, motion: DrawnMotion, plane: tuple[int, int]) -> None:
     x, y = (motion.q[:, index] for index in plane)
     _draw_curve(axes, x, y, color(0))
     names = [motion.stepper.interface.coordinates[index] for index in plane]
@@ -113,7 +113,7 @@ def _draw_plane(axes: Axes, motion: Motion, plane: tuple[int, int]) -> None:
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _draw_orbits(axes: Axes, motion: Motion, found: Sequence[Body], plane: tuple[int, int]) -> None:
+def _draw_orbits(axes: Axes, motion: DrawnMotion, found: Sequence[Body], plane: tuple[int, int]) -> None:
     for number, body in enumerate(found):
         x, y = (motion.q[:, body.columns[index]] for index in plane)
         _draw_curve(axes, x, y, color(number), body.name or None)
@@ -145,7 +145,7 @@ def _extent(values: Array) -> float:
     return float(np.ptp(values)) if len(values) else 0.0
 
 
-def _draw_image(axes: Axes, motion: Motion) -> None:
+def _draw_image(axes: Axes, motion: DrawnMotion) -> None:
     """Many coordinates: one row each, colour for the value."""
     every = max(1, len(motion.t) // 2000)
     values = motion.q[::every].T

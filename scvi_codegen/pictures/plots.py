@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scvi_codegen.pictures.conserved import plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.motion import Motion
+from scvi_codegen.pictures.motion import DrawnMotion
 from scvi_codegen.pictures.overview import plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion, plot_phase
 from scvi_codegen.pictures.section import plot_section
@@ -27,7 +27,7 @@ class Plots:
     Each draws on the axes ``ax`` or on new ones, writes to a .png or .svg if a path is given, and returns the axes.
     """
 
-    trajectory: Motion
+    trajectory: DrawnMotion
 
     def __call__(self, path: Path = None) -> tuple[Axes, ...]:
         """Where it goes and how well it keeps its energy, as :func:`scvi_codegen.plot_trajectory`."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.motion import Array, Motion, Motions, column, several
+from scvi_codegen.pictures.motion import Array, DrawnMotion, Motions, column, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,7 @@ def plot_section(
     return drawn
 
 
-def _at_crossings(motion: Motion, name: str, event: int) -> Array:
+def _at_crossings(motion: DrawnMotion, name: str, event: int) -> Array:
     """(k,) values of a coordinate or momentum at the crossings of an event."""
     if not -len(motion.events) <= event < len(motion.events):
         raise StateError(

@@ -11,9 +11,9 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.bodies import bodies
-from scvi_codegen.pictures.motion import Array, Motion
+from scvi_codegen.pictures.motion import Array, DrawnMotion
 
-__all__ = ["Shape", "shape_of"]
+__all__ = ["MovingPoints", "shape_of"]
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
 LENGTHS = ("l", "L", "length")
@@ -24,7 +24,7 @@ GENERIC = 0.3, 0.17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Shape:
+class MovingPoints:
     """How to draw a state.
 
     Attributes:
@@ -44,7 +44,7 @@ class Shape:
     equal: bool = True
 
 
-def shape_of(motion: Motion, positions: Callable[[Array], Array] | None = None) -> Shape:
+def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = None) -> MovingPoints:
     """The shape of a system: bodies by their names, pendulums by their energy, else a point or a chain.
 
     Args:
@@ -61,16 +61,18 @@ def shape_of(motion: Motion, positions: Callable[[Array], Array] | None = None) 
         columns = np.array([body.columns for body in found])
         names = tuple(body.name for body in found if body.name)
         labels = tuple("xyz"[: columns.shape[1]])
-        return Shape(points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(found))), names=names)
+        return MovingPoints(
+            points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(found))), names=names
+        )
     if (sign := _hanging(motion)) is not None:
         return _pendulum(_lengths(motion), sign)
     if m == 1:
         labels = (coordinates[0], motion.stepper.interface.momenta[0])
-        return Shape(points=lambda q, p: np.stack([q, p], axis=2), labels=labels, trails=(0,), equal=False)
+        return MovingPoints(points=lambda q, p: np.stack([q, p], axis=2), labels=labels, trails=(0,), equal=False)
     if m == 2:
-        return Shape(points=lambda q, p: q[:, np.newaxis], labels=tuple(coordinates), trails=(0,))
+        return MovingPoints(points=lambda q, p: q[:, np.newaxis], labels=tuple(coordinates), trails=(0,))
     places = np.arange(1.0, m + 1)
-    return Shape(
+    return MovingPoints(
         points=lambda q, p: np.stack([np.broadcast_to(places, q.shape), q], axis=2),
         labels=("number of the coordinate", "q"),
         joined=True,
@@ -78,18 +80,18 @@ def shape_of(motion: Motion, positions: Callable[[Array], Array] | None = None) 
     )
 
 
-def _given(motion: Motion, positions: Callable[[Array], Array]) -> Shape:
+def _given(motion: DrawnMotion, positions: Callable[[Array], Array]) -> MovingPoints:
     tried = np.shape(positions(motion.q[:1]))
     if len(tried) != 3 or tried[0] != 1 or tried[2] not in (2, 3):
         raise StateError(f"positions(q) must have shape (n, k, 2) or (n, k, 3); for n = 1 it has {tried}")
-    return Shape(
+    return MovingPoints(
         points=lambda q, p: np.asarray(positions(q), dtype=float),
         labels=tuple("xyz"[: tried[2]]),
         trails=tuple(range(tried[1])),
     )
 
 
-def _pendulum(lengths: Array, sign: float) -> Shape:
+def _pendulum(lengths: Array, sign: float) -> MovingPoints:
     """Rods of these lengths, each hung (sign 1) or put (-1) on the end of the one before, the first on the origin."""
 
     def points(q: Array, p: Array) -> Array:
@@ -97,10 +99,10 @@ def _pendulum(lengths: Array, sign: float) -> Shape:
         ends = np.cumsum(rods, axis=1)
         return np.concatenate([np.zeros_like(ends[:, :1]), ends], axis=1)
 
-    return Shape(points=points, labels=("x", "y"), joined=True, trails=(len(lengths),))
+    return MovingPoints(points=points, labels=("x", "y"), joined=True, trails=(len(lengths),))
 
 
-def _hanging(motion: Motion) -> float | None:
+def _hanging(motion: DrawnMotion) -> float | None:
     """1 if the coordinates are the angles of pendulums that hang at 0, -1 if these stand there, ``None`` if neither.
 
     They are if the energy at rest is that of weights, sum a_i (1 - cos q_i) with all a_i of one sign, and if each is
@@ -126,7 +128,7 @@ def _hanging(motion: Motion) -> float | None:
     return float(np.sign(a[0])) if close and one_sign and together else None
 
 
-def _energies(motion: Motion, q: Array, p: Array) -> Array:
+def _energies(motion: DrawnMotion, q: Array, p: Array) -> Array:
     return np.asarray(motion.stepper.energy(q, p, motion.t[0], motion.parameters), dtype=float)
 
 
@@ -138,7 +140,7 @@ def _numbers(names: Sequence[str]) -> tuple[int, ...] | None:
     return tuple(int(match[2]) for match in found if match)
 
 
-def _lengths(motion: Motion) -> Array:
+def _lengths(motion: DrawnMotion) -> Array:
     """(m,) lengths of rods, by the names of parameters; 1 where there is none."""
     interface, m = motion.stepper.interface, motion.q.shape[1]
     values = dict(zip(interface.parameters, motion.parameters, strict=True))

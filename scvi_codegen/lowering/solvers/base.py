@@ -22,11 +22,11 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Shape
 
-__all__ = ["Problem", "Solver"]
+__all__ = ["Solver", "StepProblem"]
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class StepProblem:
     """A system, and the shape of its stage equations."""
 
     system: MechanicalSystem
@@ -41,4 +41,4 @@ class Problem:
         return lagrangian_twin(self.system)
 
 
-Solver: TypeAlias = Callable[[Problem], Sweep | None]
+Solver: TypeAlias = Callable[[StepProblem], Sweep | None]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.sweeps import Splitting, Sweep
-from scvi_codegen.lowering.solvers.base import Problem, Solver
+from scvi_codegen.lowering.solvers.base import Solver, StepProblem
 from scvi_codegen.lowering.solvers.collocation import position_sweep, printed_sweep
 from scvi_codegen.lowering.solvers.coupled import coupled_sweep
 from scvi_codegen.lowering.solvers.hamiltonian import hamiltonian_sweep
@@ -38,7 +38,7 @@ FIXED_POINTS: tuple[Solver, ...] = (
 
 def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
     """The fixed-point iteration of the stage equations of a system, or ``None`` where there is none."""
-    problem = Problem(system, stages.shape)
+    problem = StepProblem(system, stages.shape)
     return next((sweep for solver in FIXED_POINTS if (sweep := solver(problem)) is not None), None)
 
 

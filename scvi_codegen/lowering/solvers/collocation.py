@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import CollocationSweep, PrintedEnds
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.base import Problem
+from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector
 from scvi_codegen.mechanics.forms import forms_of
@@ -27,7 +27,7 @@ from scvi_codegen.tables.tableau import Tableau
 __all__ = ["position_sweep", "printed_sweep"]
 
 
-def position_sweep(problem: Problem) -> CollocationSweep | None:
+def position_sweep(problem: StepProblem) -> CollocationSweep | None:
     """The fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, Accelerations):
@@ -46,7 +46,7 @@ def position_sweep(problem: Problem) -> CollocationSweep | None:
     )
 
 
-def printed_sweep(problem: Problem) -> CollocationSweep | None:
+def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
     """The fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, PrintedCurve):

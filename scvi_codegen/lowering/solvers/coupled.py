@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import CoupledSweep
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.base import Problem
+from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
@@ -26,7 +26,7 @@ __all__ = ["coupled_sweep", "over", "weighted_tables"]
 FRACTION_BITS = 51
 
 
-def coupled_sweep(problem: Problem) -> CoupledSweep | None:
+def coupled_sweep(problem: StepProblem) -> CoupledSweep | None:
     """The fixed-point iteration of a Lagrangian; ``None`` with too many points."""
     system, tables = problem.lagrangian, velocity_tables(problem.shape)
     return _sweep(system, tables) if system and tables else None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import HamiltonianSweep
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.base import Problem
+from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
@@ -19,7 +19,7 @@ from scvi_codegen.mechanics.forms import forms_of
 __all__ = ["hamiltonian_sweep"]
 
 
-def hamiltonian_sweep(problem: Problem) -> HamiltonianSweep | None:
+def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
     """The fixed-point iteration of a Hamiltonian; ``None`` with too many points, or other points than velocities."""
     system = problem.system
     tables = velocity_tables(problem.shape) if system.auxiliaries else None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import SeparableSweep
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.base import Problem
+from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.padding import (
     MOST_LANES,
     guess_tables,
@@ -32,7 +32,7 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["separable_sweep"]
 
 
-def separable_sweep(problem: Problem) -> SeparableSweep | None:
+def separable_sweep(problem: StepProblem) -> SeparableSweep | None:
     """The fixed-point iteration of a separable system; ``None`` of others, and with too many points.
 
     Position form and phase-space form are the same there.

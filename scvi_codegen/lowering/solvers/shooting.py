@@ -13,7 +13,7 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import ShootingSweep
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.base import Problem
+from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import accelerations, forms_of, multipliers
@@ -27,7 +27,7 @@ LARGEST_DIMENSION = 8
 """Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
 
 
-def shooting_sweep(problem: Problem) -> ShootingSweep | None:
+def shooting_sweep(problem: StepProblem) -> ShootingSweep | None:
     """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, ShotCurve):
