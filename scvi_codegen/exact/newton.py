@@ -21,7 +21,7 @@ Array: TypeAlias = NDArray[Any]
 Floats: TypeAlias = NDArray[np.float64]
 Solve: TypeAlias = Callable[[Array], Array]
 
-MOST_ITERATIONS = 30
+MOST_ITERATIONS = 60
 STALE = 1e-3
 """A Jacobian is computed anew where an iteration with the old one gains less than this factor."""
 LEAST_FRACTION = 1e-4
