@@ -24,8 +24,8 @@ extern "C" {
 enum {
   KEPLER_SVI_4_OK = 0,
   KEPLER_SVI_4_NOT_CONVERGED = 1, /* max_iterations reached */
-  KEPLER_SVI_4_SINGULAR = 2,      /* the Newton matrix has no inverse */
-  KEPLER_SVI_4_NOT_FINITE = 3     /* an infinity or a NaN turned up */
+  KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix has no inverse */
+  KEPLER_SVI_4_NOT_FINITE = 3 /* an infinity or a NaN turned up */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of

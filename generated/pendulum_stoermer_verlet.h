@@ -25,8 +25,8 @@ extern "C" {
 enum {
   PENDULUM_STOERMER_VERLET_OK = 0,
   PENDULUM_STOERMER_VERLET_NOT_CONVERGED = 1, /* max_iterations reached */
-  PENDULUM_STOERMER_VERLET_SINGULAR = 2,      /* the Newton matrix has no inverse */
-  PENDULUM_STOERMER_VERLET_NOT_FINITE = 3     /* an infinity or a NaN turned up */
+  PENDULUM_STOERMER_VERLET_SINGULAR = 2, /* the Newton matrix has no inverse */
+  PENDULUM_STOERMER_VERLET_NOT_FINITE = 3 /* an infinity or a NaN turned up */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of

@@ -25,8 +25,8 @@ extern "C" {
 enum {
   TWO_POINT_PENDULUM_OK = 0,
   TWO_POINT_PENDULUM_NOT_CONVERGED = 1, /* max_iterations reached */
-  TWO_POINT_PENDULUM_SINGULAR = 2,      /* the Newton matrix has no inverse */
-  TWO_POINT_PENDULUM_NOT_FINITE = 3     /* an infinity or a NaN turned up */
+  TWO_POINT_PENDULUM_SINGULAR = 2, /* the Newton matrix has no inverse */
+  TWO_POINT_PENDULUM_NOT_FINITE = 3 /* an infinity or a NaN turned up */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of

@@ -1,5 +1,5 @@
-/* Runs of many trajectories with compensated sums. Before it: many_trajectories.h, time.h, and prepare_sweep and sweep of a
- * solver, which give the increments of a step. */
+/* Runs of many trajectories with compensated sums. Before it: many_trajectories.h, time.h, and prepare_sweep and sweep
+ * of a solver, which give the increments of a step. */
 
 void NAME(start)(block_memory *block, double t, double h)
 {

@@ -1,7 +1,7 @@
 /* The search for zero crossings, by nothing of an integrator but its public functions. Before it: numbers.h, the kernel
  * event_functions, EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES, EVENT_NODES: where on a part of a step functions are
- * evaluated, as fractions of it, EVENT_COEFFICIENTS: from values there to coefficients of x^k, with x from -1 to 1 on the
- * part, and EVENT_DOUBTS: what part of the last two of these is in doubt. */
+ * evaluated, as fractions of it, EVENT_COEFFICIENTS: from values there to coefficients of x^k, with x from -1 to 1 on
+ * the part, and EVENT_DOUBTS: what part of the last two of these is in doubt. */
 enum {
   EVENT_SPLITS = 6, /* a step is split into parts at most so many times over */
   EVENT_TRIALS = 200, /* at most so many states are tried for one crossing: bisection takes 52 */
@@ -112,8 +112,8 @@ static int polynomial_crossings(const real *c, int degree, real *x)
   return count;
 }
 
-/* The polynomial through values at the nodes; how far it is in doubt (its last two Chebyshev coefficients), and how far it
- * moves away from its value in the middle. */
+/* The polynomial through values at the nodes; how far it is in doubt (its last two Chebyshev coefficients), and how far
+ * it moves away from its value in the middle. */
 static void interpolate(const real *g, real *c, real *doubt, real *range)
 {
   *range = 0.0;
@@ -131,8 +131,8 @@ static real nearer_middle(real a, real b)
   return fabs(a) < fabs(b) ? a : b;
 }
 
-/* Where the sign of the polynomial c, or whether it crosses zero but once, is in doubt (of such places that nearest to the
- * middle), or 2; its extrema, ascending. */
+/* Where the sign of the polynomial c, or whether it crosses zero but once, is in doubt (of such places that nearest to
+ * the middle), or 2; its extrema, ascending. */
 static real doubtful_place(const real *c, real doubt, real *extrema, int *count)
 {
   real derivative[EVENT_DEGREE], zeros[EVENT_DEGREE], place = 2.0;
@@ -149,8 +149,8 @@ static real doubtful_place(const real *c, real doubt, real *extrema, int *count)
   return place;
 }
 
-/* Narrows a change of sign down to neighbouring fractions; high is the later end. After a secant the end that it moved is
- * followed by states beyond it, twice as far each time, until one lies on the other side. */
+/* Narrows a change of sign down to neighbouring fractions; high is the later end. After a secant the end that it moved
+ * is followed by states beyond it, twice as far each time, until one lies on the other side. */
 static int enclose_crossing(const event_step *step, int e, event_sample low, event_sample *high)
 {
   const real least = 2.0 * DBL_EPSILON;
@@ -310,8 +310,8 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   memset(report, 0, sizeof *report);
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
-    const event_step step = {t[start], t[k], h[start], q + start * M, p + start * M, parameters, options, watch, found, room,
-        filled, report, workspace};
+    const event_step step = {t[start], t[k], h[start], q + start * M, p + start * M, parameters, options, watch, found,
+        room, filled, report, workspace};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;

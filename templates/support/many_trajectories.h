@@ -59,11 +59,13 @@ static inline int needs_sweep(const progress *now)
 static inline void take_change(progress *now, lanes change, const solver_options *options, int k, solver_report *report)
 {
   const lane_view after = {change}, before = {now->last};
+  const solver_options wanted = *options; /* where nothing that is written can be meant */
+  double *active = report->active;
   int pending = 0;
   for (int j = 0; j < LANES; j++) {
-    const int status = sweep_status(after.lane[j], before.lane[j], options, k);
-    report->active[j] = status < 0 ? 0.0 : report->active[j];
-    pending += (report->active[j] > 0.0) & (status == 0);
+    const int status = sweep_status(after.lane[j], before.lane[j], &wanted, k);
+    active[j] = status < 0 ? 0.0 : active[j];
+    pending += (active[j] > 0.0) & (status == 0);
   }
   now->pending = pending > 0;
   now->first = k == 0 ? change : now->first;

@@ -1,5 +1,5 @@
-/* One step, and runs of many with compensated sums. Before it: step.h, time.h, and prepare and solve of a solver, which give
- * the increments of a step. */
+/* One step, and runs of many with compensated sums. Before it: step.h, time.h, and prepare and solve of a solver, which
+ * give the increments of a step. */
 
 solver_options NAME(default_options)(void)
 {

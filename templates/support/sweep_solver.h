@@ -8,8 +8,9 @@ static void prepare(const step_data *step, solver_data *data)
 
 /* The increments where the curve continued from former steps leads nowhere: by sweeps from the straight line, else as
  * fall_back can. */
-static int solve_again(int status, const step_data *step, const solver_data *data, double *memory, long long *guess,
-    double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
+static __attribute__((noinline)) int solve_again(int status, const step_data *step, const solver_data *data,
+    double *memory, long long *guess, double *dq, double *dp, const solver_options *options, solver_report *report,
+    double *workspace)
 {
   long long steps = 0;
   if (*guess > 0)

@@ -1,0 +1,51 @@
+"""Support headers are laid out as ``.clang-format`` says; generated sources are short, amalgamated or not the same."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+from scvi_codegen import SVI, compile_stepper, problem
+from scvi_codegen.files.templates import template_folder
+from scvi_codegen.rendering.source import Source
+
+FOLDER = Path(__file__).parents[2] / "generated"
+STYLE = Path(__file__).parents[2] / ".clang-format"
+SUPPORT = sorted((template_folder() / "support").glob("*.h"))
+CLANG_FORMAT = Path(sysconfig.get_path("scripts")) / "clang-format"
+
+
+def check_style(text: str) -> None:
+    assert [line for line in text.splitlines() if len(line) > 120] == []
+    assert "\n\n\n" not in text
+    command = [str(CLANG_FORMAT), f"--style=file:{STYLE}", "--assume-filename=integrator.c"]
+    formatted = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
+    assert formatted == text
+
+
+@pytest.mark.parametrize("path", SUPPORT, ids=lambda path: path.name)
+def test_support_headers(path):
+    check_style(path.read_text())
+
+
+@pytest.mark.parametrize(("name", "most"), [("two_point_pendulum.c", 250), ("kepler_svi_4.c", 400)])
+def test_a_method_is_read_on_a_few_pages(name, most):
+    assert len((FOLDER / name).read_text().splitlines()) < most
+
+
+def test_amalgamated_text_computes_the_same_bits():
+    system = problem("double-pendulum").system
+    stepper = compile_stepper(system, SVI(3))
+    whole = stepper.source.amalgamated()
+    assert re.findall(r'#include "support', whole.code) == []
+    assert whole.support == ()
+    other = type(stepper)(whole, stepper.interface)
+    q, p = [1.0, 0.5], [0.3, -0.2]
+    ours, theirs = (each.integrate(q, p, h=0.05, steps=50) for each in (stepper, other))
+    assert (ours.q == theirs.q).all()
+    assert (ours.p == theirs.p).all()
+    assert isinstance(whole, Source)
