@@ -1,4 +1,8 @@
-"""Families of points in loops: what is gathered, which kernel is evaluated, where its results are scattered."""
+"""Families of points in loops: what is gathered, which kernel is evaluated, where its results are scattered.
+
+Unknowns and rows stand at *sites*: the m coordinates, then the components of what has another size (multipliers). A
+loop is over so many ``sites`` from the ``first`` on.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,11 @@ __all__ = ["Family", "GatherLoop", "ScatterLoop", "SlopeBlock"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatherLoop:
-    """m arguments: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][i]``."""
+    """Arguments of a kernel: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][first + i]``."""
 
     name: str
+    first: int
+    sites: int
     offset: int
     from_state: bool
     power: int
@@ -25,9 +31,11 @@ class GatherLoop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScatterLoop:
-    """m results: ``rows[r][i] += weight_n h^power table[n][r] value[offset + i]``; the last column belongs to p1."""
+    """Results: ``rows[r][first + i] += weight_n h^power table[n][r] value[offset + i]``; p1 has the last column."""
 
     name: str
+    first: int
+    sites: int
     offset: int
     power: int
     table: tuple[tuple[float, ...], ...]
@@ -35,7 +43,7 @@ class ScatterLoop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeBlock:
-    """Non-zero slopes of one scatter against one gather: ``slope[first + e]`` is d value[i_e] / d u[j_e]."""
+    """Non-zero slopes of a scatter by a gather: ``slope[first + e]`` is d value[i_e] / d u[j_e], i and j sites."""
 
     scatter: int
     gather: int

@@ -46,9 +46,10 @@ class Program:
         title: one line, the system and the method.
         notes: lines for the header's comment: order, symmetry, symplecticity.
         coordinate_names, parameter_names, parameter_defaults: for people and for Python.
-        blocks: number of unknown blocks B; the unknowns are B m numbers.
+        sites: the coordinates, then the components of unknowns of other sizes.
+        blocks: number of unknowns B at each site.
         families: points and kernels.
-        places: (m,) the place of each coordinate in matrices, chosen so that those that meet are near each other.
+        places: (sites,) the place of each site in matrices, chosen so that those that meet are near each other.
         bandwidth: how many places they are apart at most.
         momentum_rows: (B,) coefficient of p0 in each row.
         end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
@@ -73,6 +74,7 @@ class Program:
     coordinate_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
     parameter_defaults: tuple[float, ...]
+    sites: int
     blocks: int
     families: tuple[Family, ...]
     places: tuple[int, ...]
@@ -100,8 +102,8 @@ class Program:
 
     @property
     def unknowns(self) -> int:
-        """B m."""
-        return self.blocks * self.dimension
+        """B numbers a site."""
+        return self.blocks * self.sites
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -114,7 +116,7 @@ class Program:
     @property
     def action(self) -> bool:
         """Whether there is a discrete Lagrangian."""
-        return self.newton and any(family.action for family in self.families)
+        return self.newton and self.sites == self.dimension and any(family.action for family in self.families)
 
     @property
     def memory(self) -> int:
@@ -134,16 +136,16 @@ class Program:
         """Numbers that say where the factors were made: time, q0 with what rounding cut off, unknowns."""
         return 1 + 2 * self.dimension + self.unknowns if self.remembers_factors else 0
 
-    def matrix_size(self, blocks: int) -> int:
-        """Numbers of a matrix with ``blocks`` unknowns a coordinate: its band with room for fill-in, or all of it."""
-        rows, reach = self.dimension * blocks, (self.bandwidth + 1) * blocks - 1
+    def matrix_size(self, sites: int, blocks: int) -> int:
+        """Numbers of a matrix with ``blocks`` unknowns a site: its band with room for fill-in, or all of it."""
+        rows, reach = sites * blocks, (self.bandwidth + 1) * blocks - 1
         return rows * min(rows, 3 * reach + 1)
 
     def __str__(self) -> str:
         """Readable text of the whole program."""
         head = [
             f"program {self.prefix}: {self.title}",
-            f"  {self.blocks} blocks of {self.dimension} unknowns, bandwidth {self.bandwidth}",
+            f"  {self.blocks} blocks of {self.sites} unknowns, bandwidth {self.bandwidth}",
         ]
         for family in self.families:
             head.append(f"  family {family.name}: {family.points} points")

@@ -9,6 +9,7 @@ from scvi_codegen.ir.families import Family, GatherLoop, ScatterLoop, SlopeBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.sites import Sites
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -22,9 +23,9 @@ def _is_regular(system: MechanicalSystem) -> bool:
     return not isinstance(system, HamiltonianSystem) or system.is_regular
 
 
-def lowered_family(system: MechanicalSystem, family: PointFamily) -> Family:
+def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) -> Family:
     """A family of points in loops: its kernel with slopes, and rounded tables."""
-    slopes, blocks = _slope_blocks(family)
+    slopes, blocks = _slope_blocks(family, sites)
     names = tuple(argument_name(system, gather) for gather in family.gathers)
     u = f"u = ({', '.join(names)})"
     return Family(
@@ -32,8 +33,8 @@ def lowered_family(system: MechanicalSystem, family: PointFamily) -> Family:
         arguments=names,
         abscissae=lower_vector(family.abscissae),
         weights=lower_vector(family.weights),
-        gathers=tuple(_gather_loop(family, g) for g in range(len(family.gathers))),
-        scatters=tuple(_scatter_loop(family, s) for s in range(len(family.scatters))),
+        gathers=tuple(_gather_loop(family, g, sites) for g in range(len(family.gathers))),
+        scatters=tuple(_scatter_loop(family, s, sites) for s in range(len(family.scatters))),
         value=system_kernel(
             system,
             f"{family.name}_value",
@@ -57,6 +58,8 @@ def lowered_family(system: MechanicalSystem, family: PointFamily) -> Family:
 
 def _results(family: PointFamily, names: tuple[str, ...]) -> str:
     """What the kernel of a family gives, in words."""
+    if family.computes:
+        return family.computes
     if family.name == "node":
         return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
     if family.scalar_power:
@@ -88,10 +91,11 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
         system.auxiliaries: "p",
         auxiliary_multipliers(system): "nu",
     }
-    return names[gather.arguments]
+    own = gather.arguments[0].name.rpartition("_")[0] if gather.arguments else ""
+    return names.get(gather.arguments, own)
 
 
-def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:
+def _slope_blocks(family: PointFamily, sites: Sites) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:
     """Non-zero slopes, grouped by scatter and gather."""
     entries = _slopes(family)
     slopes: list[sympy.Expr] = []
@@ -103,7 +107,9 @@ def _slope_blocks(family: PointFamily) -> tuple[tuple[sympy.Expr, ...], tuple[Sl
             rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
             found = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
             if found:
-                blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=tuple(found)))
+                row, column = sites.first[len(scatter.results)], sites.first[len(gather.arguments)]
+                pairs = tuple((row + i, column + j) for i, j in found)
+                blocks.append(SlopeBlock(scatter=s, gather=g, first=len(slopes), entries=pairs))
                 slopes.extend(entries[top + i, left + j] for i, j in found)
     return tuple(slopes), tuple(blocks)
 
@@ -116,22 +122,28 @@ def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
     return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
 
 
-def _gather_loop(family: PointFamily, index: int) -> GatherLoop:
+def _gather_loop(family: PointFamily, index: int, sites: Sites) -> GatherLoop:
     gather = family.gathers[index]
+    size = len(gather.arguments)
     return GatherLoop(
         name=f"{family.name}_gather_{index}",
+        first=sites.first[size],
+        sites=size,
         offset=sum(len(other.arguments) for other in family.gathers[:index]),
         from_state=bool(gather.table.entries[0][0]),
         power=gather.power + 1,
-        table=lower_matrix(tuple(line[1:] for line in gather.table.entries)),
+        table=lower_matrix(gather.table.columns([b + 1 for b in sites.columns[size]]).entries),
     )
 
 
-def _scatter_loop(family: PointFamily, index: int) -> ScatterLoop:
+def _scatter_loop(family: PointFamily, index: int, sites: Sites) -> ScatterLoop:
     scatter = family.scatters[index]
+    size = len(scatter.results)
     return ScatterLoop(
         name=f"{family.name}_scatter_{index}",
+        first=sites.first[size],
+        sites=size,
         offset=sum(len(other.results) for other in family.scatters[:index]),
         power=scatter.power,
-        table=lower_matrix(scatter.table.entries),
+        table=lower_matrix(scatter.table.columns([*sites.rows[size], -1]).entries),
     )

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 
 import sympy
 
-from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import MomentumMap, Program
@@ -27,6 +26,7 @@ from scvi_codegen.ir.sweeps import Splitting, Sweep
 from scvi_codegen.lowering.families import lowered_family
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
+from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -59,13 +59,12 @@ def lower(
         (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`). newton: whether Newton's iteration is emitted;
         with it the discrete Legendre transforms. symmetries: whose momentum maps are emitted.
     """
-    m = system.dimension
-    if {*stages.block_sizes(m), *stages.row_sizes(m)} != {m}:
-        raise MethodError(f"{method.name} has blocks of other sizes than {m}: they are not compiled yet")
+    m, sites = system.dimension, sites_of(stages, system.dimension)
+    blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
     mass = forms_of(system).legendre_slopes
-    families = tuple(lowered_family(system, family) for family in stages.families)
+    families = tuple(lowered_family(system, family, sites) for family in stages.families)
     met = [*mass, *_meetings(families if newton else ())]
-    order = places(met, system.dimension)
+    order = (*places([pair for pair in met if max(pair) < m], m), *range(m, sites.count))
     return Program(
         prefix=prefix,
         title=_comment(f"{system.name}: {method.title}"),
@@ -73,16 +72,17 @@ def lower(
         coordinate_names=tuple(q.name for q in system.coordinates),
         parameter_names=tuple(parameter.name for parameter in system.parameters),
         parameter_defaults=system.defaults,
-        blocks=len(stages.blocks),
+        sites=sites.count,
+        blocks=len(blocks),
         families=families,
         places=order,
         bandwidth=bandwidth(met, order),
-        momentum_rows=lower_vector(tuple(row.momentum for row in stages.rows)),
-        end_position=lower_vector(stages.end_position.entries[0][1:]),
-        straight=tuple(int(block.straight[1]) for block in stages.blocks),
-        momentum_blocks=tuple(block.momentum for block in stages.blocks),
-        moving_blocks=tuple(int(block.moves) for block in stages.blocks),
-        extrapolation=lower_matrix(_required_extrapolation(stages)),
+        momentum_rows=lower_vector(tuple(row.momentum for row in rows)),
+        end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[m]]).entries[0]),
+        straight=tuple(int(block.straight[1]) for block in blocks),
+        momentum_blocks=tuple(block.momentum for block in blocks),
+        moving_blocks=tuple(int(block.moves) for block in blocks),
+        extrapolation=lower_matrix(_required_extrapolation(stages, sites.columns[m])),
         legendre=_legendre_kernel(system),
         mass_entries=tuple(mass),
         energy=_energy_kernel(system),
@@ -154,7 +154,8 @@ def _notes(method: Method) -> tuple[str, ...]:
     )
 
 
-def _required_extrapolation(stages: StageSystem) -> Matrix:
+def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:
+    """That of the blocks at the coordinates; others are guessed to stay as they were."""
     if stages.extrapolation is None or any(block.power != 1 for block in stages.blocks):
         raise TypeError("only stage systems with velocities as unknowns can be lowered")
-    return stages.extrapolation
+    return tuple(tuple(stages.extrapolation[i][j] for j in columns) for i in columns)

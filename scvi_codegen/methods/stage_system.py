@@ -163,7 +163,8 @@ class PointFamily:
     """Points c_n in [0, 1] with weights, evaluated by one kernel.
 
     Where the kernel is the gradient of a ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
-    function, and of the discrete Lagrangian if ``in_action``.
+    function, and of the discrete Lagrangian if ``in_action``. ``computes`` says what the kernel gives, where its name
+    does not.
     """
 
     name: str
@@ -175,6 +176,7 @@ class PointFamily:
     scalar: sympy.Expr | None = None
     scalar_power: int = 0
     in_action: bool = False
+    computes: str = ""
 
     @property
     def arguments(self) -> tuple[sympy.Symbol, ...]:

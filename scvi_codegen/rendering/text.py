@@ -173,14 +173,14 @@ def workspace_size(program: Program) -> int:
     """Doubles of workspace: scratch, memory, and for Newton unknowns, point, update, pivots, rows and Jacobian."""
     if not program.newton:
         return scratch_size(program) + program.memory
-    rows = program.unknowns + program.dimension
-    jacobian = program.matrix_size(program.blocks + (1 if program.action else 0))
+    rows = program.unknowns + program.sites
+    jacobian = program.matrix_size(program.sites, program.blocks + (1 if program.action else 0))
     return scratch_size(program) + program.memory + program.unknowns + program.point + 3 * rows + jacobian
 
 
 def scratch_size(program: Program) -> int:
     """Doubles for the kernels of one family, or for the mass matrix with its slopes."""
-    mass = program.matrix_size(1) + len(program.mass_entries)
+    mass = program.matrix_size(program.dimension, 1) + len(program.mass_entries)
     return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
 
 

@@ -6,18 +6,20 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import sympy
+from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
 import scvi_codegen
-from scvi_codegen.compiler import program_of
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.exact.step import DerivedStep
+from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import SVI
@@ -172,8 +174,7 @@ class Constrained(Method):
     def _reactions(self, system: MechanicalSystem, nodes: Nodes) -> PointFamily:
         """(lambda . g)_q at the nodes 0 .. s - 1, in the rows of their positions."""
         s, rule = self.degree, gauss_lobatto(self.degree + 1)
-        multipliers = sympy.symbols(f"lambda_:{len(self.constraints)}", real=True)
-        product = sympy.Add(*(x * g for x, g in zip(multipliers, self.constraints, strict=True)))
+        product, multipliers = self._product()
         here = Table.joined(Table.identity(s), Table.constant(s, 1 + s))
         return PointFamily(
             name="reaction",
@@ -186,6 +187,11 @@ class Constrained(Method):
             ),
             scatters=(Scatter(results=tuple(product.diff(q) for q in system.coordinates), table=here, power=1),),
         )
+
+    def _product(self) -> tuple[sympy.Expr, tuple[sympy.Symbol, ...]]:
+        """Multipliers times constraints, and the multipliers."""
+        multipliers = sympy.symbols(f"lambda_:{len(self.constraints)}", real=True)
+        return sympy.Add(*(x * g for x, g in zip(multipliers, self.constraints, strict=True))), multipliers
 
     def _surface(self, system: MechanicalSystem, nodes: Nodes) -> PointFamily:
         """g at the nodes 1 .. s, which must vanish."""
@@ -241,7 +247,102 @@ def test_without_a_constraint_nothing_is_left_but_the_svi() -> None:
     assert max(abs(a - b) for a, b in zip(free(*state).q, own(*state).q, strict=True)) < 1e-40
 
 
-def test_other_sizes_are_refused_where_they_cannot_be_compiled() -> None:
+@dataclass(frozen=True, slots=True)
+class ConstrainedIncrements(Constrained):
+    """The same with velocities as unknowns, as it is compiled."""
+
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
+        s, k = self.degree, len(self.constraints)
+        own = SVI(s, f"gauss-lobatto:{s + 1}").stage_system(system)
+        (action,) = own.families
+        place, none = action.gathers[0].table, Table.constant(s + 1, s)
+        rows = [_widened(scatter.table, none) for scatter in action.scatters]
+        product, multipliers = self._product()
+        first, last = range(s), range(1, s + 1)
+        reaction = PointFamily(
+            name="reaction",
+            computes="(lambda . g)_q",
+            abscissae=action.abscissae[:s],
+            weights=action.weights[:s],
+            weight_names=action.weight_names[:s],
+            gathers=(
+                Gather(arguments=system.coordinates, table=_lines(Table.joined(place, none), first), power=0),
+                Gather(
+                    arguments=multipliers, table=Table.joined(Table.constant(s, 1 + s), Table.identity(s)), power=-1
+                ),
+            ),
+            scatters=(
+                Scatter(
+                    results=tuple(product.diff(q) for q in system.coordinates), table=_lines(rows[0], first), power=1
+                ),
+            ),
+        )
+        surface = PointFamily(
+            name="surface",
+            computes="g",
+            abscissae=action.abscissae[1:],
+            weights=(mp.one,) * s,
+            weight_names=("",) * s,
+            gathers=(Gather(arguments=system.coordinates, table=_lines(Table.joined(place, none), last), power=0),),
+            scatters=(
+                Scatter(
+                    results=self.constraints,
+                    table=Table.joined(Table.constant(s, s), Table.identity(s), Table.constant(s, 1)),
+                    power=-1,
+                ),
+            ),
+        )
+        free = replace(
+            action,
+            in_action=False,
+            gathers=tuple(replace(each, table=Table.joined(each.table, none)) for each in action.gathers),
+            scatters=tuple(replace(each, table=table) for each, table in zip(action.scatters, rows, strict=True)),
+        )
+        still, zero = (mp.zero, mp.zero), (mp.zero,) * s
+        return replace(
+            own,
+            blocks=(
+                *own.blocks,
+                *(Block(name=f"m_{n}", power=1, straight=still, moves=False, size=k) for n in range(s)),
+            ),
+            rows=(*own.rows, *(Row(number="g", kind="stage", momentum=mp.zero, size=k) for _ in range(s))),
+            families=(free, reaction, surface),
+            end_position=Table.joined(own.end_position, Table.constant(1, s)),
+            extrapolation=(*((*line, *zero) for line in own.extrapolation or ()), *((*zero, *zero) for _ in zero)),
+            shape=None,
+        )
+
+    paper_form = stage_system
+
+
+def _lines(table: Table, numbers: range) -> Table:
+    """Some rows of a table."""
+    part = slice(numbers.start, numbers.stop)
+    return Table(entries=table.entries[part], names=table.names[part])
+
+
+def _widened(table: Table, columns: Table) -> Table:
+    """A scatter table with columns before the last one, that of p1."""
+    last = len(table.entries[0]) - 1
+    return Table.joined(table.columns(range(last)), columns, table.columns([last]))
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_blocks_of_another_size_are_compiled(degree: int) -> None:
     system, surface = rod()
-    with pytest.raises(MethodError, match="blocks of other sizes than 2"):
-        program_of(system, Constrained(1, (surface,)))
+    method = ConstrainedIncrements(degree, (surface,))
+    stepper = compile_stepper(system, method, solver="newton", flags=QUICK_FLAGS)
+    start = [np.sin(0.7), -np.cos(0.7)], [0.4 * np.cos(0.7), 0.4 * np.sin(0.7)]
+    run = stepper.integrate(*start, h=1 / 16, steps=16)
+    exact = DerivedStep(system, method.stage_system(system))(*start, 1 / 16)
+    np.testing.assert_allclose([*run.q[1], *run.p[1]], np.array([*exact.q, *exact.p], dtype=float), rtol=0, atol=1e-14)
+    assert np.abs((run.q**2).sum(axis=1) - 1).max() < 1e-14
+    assert np.abs(run.q[-1] - pendulum(0.7, 0.4, 1.0)).max() < 0.02 / 16 ** (2 * degree)
+    assert run.iterations[1:].max() <= 6
+
+
+def test_two_sizes_need_blocks_and_rows_of_each() -> None:
+    system, surface = rod()
+    stages = ConstrainedIncrements(2, (surface,)).stage_system(system)
+    with pytest.raises(MethodError, match="2 blocks and 1 rows of 1"):
+        sites_of(replace(stages, rows=stages.rows[:-1]), 2)

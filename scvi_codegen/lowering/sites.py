@@ -1,0 +1,48 @@
+"""Where unknowns and equations stand: at the coordinates, or at sites of their own where they have another size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.methods.stage_system import StageSystem
+
+__all__ = ["Sites", "sites_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sites:
+    """Groups of blocks of one size, each at as many sites: first those of m components, at the coordinates.
+
+    Attributes:
+        first: of each size the first site.
+        columns: of each size the numbers of its blocks, B of them.
+        rows: of each size the numbers of its rows, B of them.
+        count: all sites.
+    """
+
+    first: dict[int, int]
+    columns: dict[int, tuple[int, ...]]
+    rows: dict[int, tuple[int, ...]]
+    count: int
+
+
+def sites_of(stages: StageSystem, dimension: int) -> Sites:
+    """The sites of stage equations.
+
+    Raises:
+        MethodError: unless there are as many blocks, and as many rows, of every size.
+    """
+    blocks, rows = stages.block_sizes(dimension), stages.row_sizes(dimension)[:-1]
+    sizes = [dimension, *sorted({*blocks, *rows} - {dimension})]
+    columns, lines = ({size: _places(size, each) for size in sizes} for each in (blocks, rows))
+    if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
+        counts = ", ".join(f"{len(columns[size])} blocks and {len(lines[size])} rows of {size}" for size in sizes)
+        raise MethodError(f"stage equations are compiled with as many blocks as rows of every size, not {counts}")
+    first = {size: sum(sizes[:k]) for k, size in enumerate(sizes)}
+    return Sites(first, columns, lines, sum(sizes))
+
+
+def _places(size: int, sizes: Sequence[int]) -> tuple[int, ...]:
+    return tuple(place for place, each in enumerate(sizes) if each == size)
