@@ -12,7 +12,8 @@
 
 enum {
   M = 2, /* coordinates */
-  B = 5, /* blocks of M unknowns */
+  SITES = 2, /* coordinates, then the components of other unknowns */
+  B = 5, /* unknowns a site */
   N = 10, /* unknowns */
   POINTS = 5, /* most points of a family, or blocks */
   POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
@@ -82,7 +83,7 @@ static const int NODE_SLOPE_3[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
 static const int NODE_SLOPE_4[2][2] = {{0, 0}, {1, 1}};
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
-static const int PLACE[M] = {0, 1};
+static const int PLACE[SITES] = {0, 1};
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
 INVERSE_ROOT(1, inverse)
@@ -237,17 +238,17 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
 {
   const double h = step->h;
   double *u = step->scratch, *value = u + 8, *slope = value + 8;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 4, 1);
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, 2, u + 0, 4, 1);
   offset(step, 2, u + 0, 4);
-  gather(QUADRATURE_GATHER_1[0], 2, 1, z, u + 2, 4, 1);
+  gather(QUADRATURE_GATHER_1[0], 2, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
       quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, slope + n * 6);
     else
       quadrature_value(u + n * 4, step->t, step->parameters, value + n * 4);
   }
-  scatter(QUADRATURE_SCATTER_0[0], 2, QUADRATURE_WEIGHT, h, value + 0, 4, rows, size);
-  scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 2, 4, rows, size);
+  scatter(QUADRATURE_SCATTER_0[0], 2, QUADRATURE_WEIGHT, h, value + 0, 4, 2, rows, size);
+  scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 2, 4, 2, rows, size);
   if (!jacobian)
     return;
   scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0, 4,
@@ -262,21 +263,21 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
 {
   const double h = step->h;
   double *u = step->scratch, *value = u + 16, *slope = value + 16;
-  gather(NODE_GATHER_0[0], 2, h, z, u + 0, 8, 1);
+  gather(NODE_GATHER_0[0], 2, h, z, 2, u + 0, 8, 1);
   offset(step, 2, u + 0, 8);
-  gather(NODE_GATHER_1[0], 2, 1, z, u + 2, 8, 1);
-  gather(NODE_GATHER_2[0], 2, 1 / (h), z, u + 4, 8, 1);
-  gather(NODE_GATHER_3[0], 2, 1, z, u + 6, 8, 1);
+  gather(NODE_GATHER_1[0], 2, 1, z, 2, u + 2, 8, 1);
+  gather(NODE_GATHER_2[0], 2, 1 / (h), z, 2, u + 4, 8, 1);
+  gather(NODE_GATHER_3[0], 2, 1, z, 2, u + 6, 8, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
       node_slope(u + n * 8, step->t, step->parameters, value + n * 8, slope + n * 16);
     else
       node_value(u + n * 8, step->t, step->parameters, value + n * 8);
   }
-  scatter(NODE_SCATTER_0[0], 2, NODE_WEIGHT, h * h, value + 0, 8, rows, size);
-  scatter(NODE_SCATTER_1[0], 2, NODE_WEIGHT, h, value + 2, 8, rows, size);
-  scatter(NODE_SCATTER_2[0], 2, NODE_WEIGHT, 1, value + 4, 8, rows, size);
-  scatter(NODE_SCATTER_3[0], 2, NODE_WEIGHT, h, value + 6, 8, rows, size);
+  scatter(NODE_SCATTER_0[0], 2, NODE_WEIGHT, h * h, value + 0, 8, 2, rows, size);
+  scatter(NODE_SCATTER_1[0], 2, NODE_WEIGHT, h, value + 2, 8, 2, rows, size);
+  scatter(NODE_SCATTER_2[0], 2, NODE_WEIGHT, 1, value + 4, 8, 2, rows, size);
+  scatter(NODE_SCATTER_3[0], 2, NODE_WEIGHT, h, value + 6, 8, 2, rows, size);
   if (!jacobian)
     return;
   scatter_slopes(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_SLOPE_0, 4, slope + 0, 16,
@@ -403,9 +404,9 @@ static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 4, 1);
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, 2, u + 0, 4, 1);
   offset(step, 2, u + 0, 4);
-  gather(QUADRATURE_GATHER_1[0], 2, 1, z, u + 2, 4, 1);
+  gather(QUADRATURE_GATHER_1[0], 2, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 2; n++) {
     double value[1];
     lagrangian(u + n * 4, step->t, step->parameters, value);

@@ -12,7 +12,8 @@
 
 enum {
   M = 2, /* coordinates */
-  B = 4, /* blocks of M unknowns */
+  SITES = 2, /* coordinates, then the components of other unknowns */
+  B = 4, /* unknowns a site */
   N = 8, /* unknowns */
   POINTS = 4, /* most points of a family, or blocks */
   POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
@@ -69,7 +70,7 @@ static const int QUADRATURE_SLOPE_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
 static const int QUADRATURE_SLOPE_1[2][2] = {{0, 0}, {1, 1}};
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
-static const int PLACE[M] = {0, 1};
+static const int PLACE[SITES] = {0, 1};
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
 INVERSE_ROOT(1, inverse)
@@ -149,17 +150,17 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
 {
   const double h = step->h;
   double *u = step->scratch, *value = u + 16, *slope = value + 16;
-  gather(QUADRATURE_GATHER_0[0], 4, h, z, u + 0, 4, 1);
+  gather(QUADRATURE_GATHER_0[0], 4, h, z, 2, u + 0, 4, 1);
   offset(step, 4, u + 0, 4);
-  gather(QUADRATURE_GATHER_1[0], 4, 1, z, u + 2, 4, 1);
+  gather(QUADRATURE_GATHER_1[0], 4, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 4; n++) {
     if (jacobian)
       quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, slope + n * 6);
     else
       quadrature_value(u + n * 4, step->t, step->parameters, value + n * 4);
   }
-  scatter(QUADRATURE_SCATTER_0[0], 4, QUADRATURE_WEIGHT, h, value + 0, 4, rows, size);
-  scatter(QUADRATURE_SCATTER_1[0], 4, QUADRATURE_WEIGHT, 1, value + 2, 4, rows, size);
+  scatter(QUADRATURE_SCATTER_0[0], 4, QUADRATURE_WEIGHT, h, value + 0, 4, 2, rows, size);
+  scatter(QUADRATURE_SCATTER_1[0], 4, QUADRATURE_WEIGHT, 1, value + 2, 4, 2, rows, size);
   if (!jacobian)
     return;
   scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 4, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0, 4,
@@ -268,9 +269,9 @@ static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0;
-  gather(QUADRATURE_GATHER_0[0], 4, h, z, u + 0, 4, 1);
+  gather(QUADRATURE_GATHER_0[0], 4, h, z, 2, u + 0, 4, 1);
   offset(step, 4, u + 0, 4);
-  gather(QUADRATURE_GATHER_1[0], 4, 1, z, u + 2, 4, 1);
+  gather(QUADRATURE_GATHER_1[0], 4, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 4; n++) {
     double value[1];
     lagrangian(u + n * 4, step->t, step->parameters, value);

@@ -12,7 +12,8 @@
 
 enum {
   M = 1, /* coordinates */
-  B = 1, /* blocks of M unknowns */
+  SITES = 1, /* coordinates, then the components of other unknowns */
+  B = 1, /* unknowns a site */
   N = 1, /* unknowns */
   POINTS = 2, /* most points of a family, or blocks */
   POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
@@ -49,7 +50,7 @@ static const int QUADRATURE_SLOPE_0[1][2] = {{0, 0}};
 static const int QUADRATURE_SLOPE_1[1][2] = {{0, 0}};
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
-static const int PLACE[M] = {0};
+static const int PLACE[SITES] = {0};
 static const int MASS_ENTRY[1][2] = {{0, 0}};
 
 /* L_q and L_v at u = (q, v). Operations: 6 *, 1 neg, 1 sin. */
@@ -103,17 +104,17 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
 {
   const double h = step->h;
   double *u = step->scratch, *value = u + 4, *slope = value + 4;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 2, 1);
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, 1, u + 0, 2, 1);
   offset(step, 2, u + 0, 2);
-  gather(QUADRATURE_GATHER_1[0], 2, 1, z, u + 1, 2, 1);
+  gather(QUADRATURE_GATHER_1[0], 2, 1, z, 1, u + 1, 2, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
       quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, slope + n * 2);
     else
       quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
   }
-  scatter(QUADRATURE_SCATTER_0[0], 2, QUADRATURE_WEIGHT, h, value + 0, 2, rows, size);
-  scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 1, 2, rows, size);
+  scatter(QUADRATURE_SCATTER_0[0], 2, QUADRATURE_WEIGHT, h, value + 0, 2, 1, rows, size);
+  scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 1, 2, 1, rows, size);
   if (!jacobian)
     return;
   scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0, 1,
@@ -198,9 +199,9 @@ static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, u + 0, 2, 1);
+  gather(QUADRATURE_GATHER_0[0], 2, h, z, 1, u + 0, 2, 1);
   offset(step, 2, u + 0, 2);
-  gather(QUADRATURE_GATHER_1[0], 2, 1, z, u + 1, 2, 1);
+  gather(QUADRATURE_GATHER_1[0], 2, 1, z, 1, u + 1, 2, 1);
   for (int n = 0; n < 2; n++) {
     double value[1];
     lagrangian(u + n * 2, step->t, step->parameters, value);

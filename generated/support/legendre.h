@@ -6,7 +6,7 @@
 /* y at u = (q, x), and dy/dx in the first numbers of scratch. */
 static void transform_and_slopes(real t, const real *u, const real *parameters, real *y, real *scratch)
 {
-  const band shape = band_of(1);
+  const band shape = band_of(M, 1);
   real *mass = scratch, *slope = scratch + band_size(&shape);
   legendre(u, t, parameters, y, slope);
   memset(mass, 0, sizeof(real) * band_size(&shape));
@@ -39,7 +39,7 @@ static int transform(real t, const real *q, const real *x, const real *parameter
  * */
 static int invert_from(real t, real *u, const real *y, const real *parameters, real *mass)
 {
-  const band shape = band_of(1);
+  const band shape = band_of(M, 1);
   real value[M], update[M], pivot[M], misfit;
   transform_and_slopes(t, u, parameters, value, mass);
   misfit = largest_misfit(value, y);

@@ -43,15 +43,16 @@ static newton_data newton_in(real *workspace)
   data.z = workspace;
   data.point = data.z + N;
   data.rows = data.point + POINT;
-  data.update = data.rows + N + M;
-  data.pivot = data.update + N + M;
-  data.factors = data.pivot + N + M;
+  data.update = data.rows + N + SITES;
+  data.pivot = data.update + N + SITES;
+  data.factors = data.pivot + N + SITES;
   return data;
 }
 
-/* The stages of a motion on a straight line with velocity v and momentum p0. */
+/* The stages of a motion on a straight line with velocity v and momentum p0; other unknowns are 0. */
 static void place_on_line(const real *v, const real *p0, real *z)
 {
+  memset(z + M * B, 0, sizeof(real) * (N - M * B));
   for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++)
       z[i * B + b] = STRAIGHT[b] * v[i] + MOMENTA[b] * p0[i];
@@ -61,12 +62,12 @@ static void place_on_line(const real *v, const real *p0, real *z)
 static void apply_update(const newton_data *data, const band *shape, real h, real *p0, const real *size_p,
     const real *size_q, movement *moved)
 {
-  const int blocks = shape->rows / M;
-  real change[M];
-  for (int i = 0; i < M; i++)
+  const int blocks = shape->rows / SITES;
+  real change[SITES];
+  for (int i = 0; i < SITES; i++)
     memcpy(data->update + PLACE[i] * blocks, data->rows + i * (B + 1), sizeof(real) * (size_t)blocks);
   back_substitute(data->factors, shape, data->pivot, data->update);
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < SITES; i++) {
     const real *update = data->update + PLACE[i] * blocks;
     change[i] = 0;
     for (int b = 0; b < B; b++) {
@@ -133,8 +134,8 @@ static int linearise(const step_data *step, const newton_data *data, const band 
 static int newton(const step_data *step, const newton_data *data, const real *q1, real *p0, real *increment, int *keep,
     const solver_options *options, solver_report *report)
 {
-  const band shape = band_of(q1 ? B + 1 : B);
-  real size_q[M], size_p[M], change[M], last = (real)INFINITY;
+  const band shape = band_of(SITES, q1 ? B + 1 : B);
+  real size_q[M], size_p[SITES], change[M], last = (real)INFINITY;
   movement moved = no_movement();
   int trials = 0;
   memset(increment, 0, sizeof(real) * M);
@@ -146,7 +147,7 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
     }
     if (q1)
       add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + M) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
+    if (!all_finite(data->rows, N + SITES) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
       return NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);

@@ -5,7 +5,7 @@ static int fall_back(int status, const step_data *step, double *dq, double *dp, 
   const newton_data newtons = newton_in(workspace);
   int keep;
   status = newton_from_line(step, &newtons, dp, &keep, options, report);
-  gather(END_POSITION, 1, step->h, newtons.z, dq, 0, 1);
+  gather(END_POSITION, 1, step->h, newtons.z, M, dq, 0, 1);
   memset(dq + M, 0, sizeof(double) * M);
   memset(dp + M, 0, sizeof(double) * M);
   return status;

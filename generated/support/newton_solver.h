@@ -13,8 +13,8 @@ static void prepare(const step_data *step, solver_data *data)
 /* The factors at a remembered point, made again, the same to the last bit; 0 if that fails. */
 static int remake_factors(const step_data *step, const real *point, const newton_data *data)
 {
-  const band shape = band_of(B);
-  real size_p[M], size_q[M];
+  const band shape = band_of(SITES, B);
+  real size_p[SITES], size_q[M];
   step_data then = *step;
   then.t = point[0];
   then.q0 = point + 1;
@@ -36,14 +36,15 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   if (POINT && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, &data) : 1;
   if (*guess) {
-    gather(EXTRAPOLATION[0], B, 1, memory, data.z, 1, B);
+    gather(EXTRAPOLATION[0], B, 1, memory, M, data.z, 1, B);
+    memcpy(data.z + M * B, memory + M * B, sizeof(real) * (N - M * B));
     status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)
     status = newton_from_line(step, &data, dp, &keep, options, report);
   if (status != OK)
     return status;
-  gather(END_POSITION, 1, step->h, data.z, dq, 0, 1);
+  gather(END_POSITION, 1, step->h, data.z, M, dq, 0, 1);
   memcpy(memory, data.z, sizeof(real) * N);
   memcpy(memory + N, data.point, sizeof(real) * POINT);
   *guess = POINT && keep ? 2 : 1;

@@ -1,11 +1,12 @@
 /* Sums between blocks of unknowns z and points, the same for every method. Before it: real, M, B, POINTS, PLACE,
- * band.h, step.h. Unknown b of coordinate i is z[i B + b]; row r of coordinate i is rows[i (B + 1) + r], the last one
- * for p1. */
+ * band.h, step.h. Unknown b of site i is z[i B + b]; row r of site i is rows[i (B + 1) + r], the last one for p1. The
+ * first M sites are the coordinates. */
 
-/* scale sum_b table[b][n] z_b for every coordinate i and point n, into u[n * across + i * along]. */
-static inline void gather(const real *table, int points, real scale, const real *z, real *u, int across, int along)
+/* scale sum_b table[b][n] z_b for so many sites i from z on and every point n, into u[n * across + i * along]. */
+static inline void gather(const real *table, int points, real scale, const real *z, int sites, real *u, int across,
+    int along)
 {
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < sites; i++) {
     real sum[POINTS] = {0};
     for (int b = 0; b < B; b++)
       for (int n = 0; n < points; n++)
@@ -23,12 +24,12 @@ static inline void offset(const step_data *step, int points, real *u, int across
       u[n * across + i] = step->q0[i] + (step->carry_q[i] + u[n * across + i]);
 }
 
-/* rows_r += sum_n weight[n] scale table[n][r] value_n for every coordinate; the last row is p1, whose terms are also
- * summed without sign into size. */
+/* rows_r += sum_n weight[n] scale table[n][r] value_n for so many sites; the last row is p1, whose terms are also summed
+ * without sign into size. */
 static inline void scatter(const real *table, int points, const real *weight, real scale, const real *value, int across,
-    real *rows, real *size)
+    int sites, real *rows, real *size)
 {
-  for (int i = 0; i < M; i++) {
+  for (int i = 0; i < sites; i++) {
     real sum[B + 1], end = size[i];
     memcpy(sum, rows + i * (B + 1), sizeof sum);
     for (int n = 0; n < points; n++) {
@@ -43,11 +44,11 @@ static inline void scatter(const real *table, int points, const real *weight, re
 }
 
 /* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns
- * (j, b), for every slope and its pair of coordinates i, j. */
+ * (j, b), for every slope and its pair of sites i, j. */
 static inline void scatter_slopes(const real *row, const real *column, int points, const real *weight, real scale,
     const int (*pair)[2], int count, const real *slope, int across, real *jacobian, const band *shape)
 {
-  const int blocks = shape->rows / M;
+  const int blocks = shape->rows / SITES;
   for (int e = 0; e < count; e++) {
     real *corner = jacobian + shape->first + PLACE[pair[e][1]] * blocks * shape->stride + PLACE[pair[e][0]] * blocks;
     for (int b = 0; b < B; b++) {
@@ -77,6 +78,8 @@ static inline void begin_rows(const step_data *step, const real *z, real *rows, 
     for (int b = 0; b < B; b++)
       size_q[i] += MATH(fabs)(step->h * END_POSITION[b] * z[i * B + b]);
   }
+  memset(rows + M * (B + 1), 0, sizeof(real) * (SITES - M) * (B + 1));
+  memset(size_p + M, 0, sizeof(real) * (SITES - M));
   if (jacobian)
     memset(jacobian, 0, sizeof(real) * band_size(shape));
 }
