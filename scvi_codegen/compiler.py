@@ -126,12 +126,14 @@ def generate_source(
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
     embedded: Embedded | None = None,
+    amalgamate: bool = False,
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`.
 
     Args:
         embedded: the precision, ``"double"`` or ``"single"``, of text for a microcontroller: explicit or Newton's
             iteration alone, which takes half of the stack that lanes take where there are no vector registers.
+        amalgamate: whether support headers stand in the source, not beside it; for a microcontroller they always do.
 
     Raises:
         MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
@@ -142,7 +144,8 @@ def generate_source(
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
     source = render_embedded(program, embedded) if embedded else render(program)
     interface = describe(program, system, method)
-    return (with_events(source, interface, functions) if functions else source), interface
+    found = with_events(source, interface, functions) if functions else source
+    return (found.amalgamated() if amalgamate else found), interface
 
 
 def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
