@@ -217,8 +217,7 @@ def lagrangian_twin(system: MechanicalSystem) -> LagrangianSystem | None:
     """A Lagrangian with the same motion: the system's own, that of a Hamiltonian, or ``None`` where none is found."""
     if isinstance(system, LagrangianSystem):
         return system
-    assert isinstance(system, HamiltonianSystem)
-    return _twin(system)
+    return _twin(system) if isinstance(system, HamiltonianSystem) else None
 
 
 @lru_cache(maxsize=64)

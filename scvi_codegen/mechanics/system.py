@@ -8,6 +8,12 @@ Everything behind the front end sees one thing, a function whose stationary acti
 
 (Hamilton's principle, and Hamilton's principle in phase space: paper, section 1.1). Auxiliaries are further unknowns at
 every point where the function is evaluated, and the action is stationary in them, too.
+
+A new kind of system is a frozen dataclass of :class:`MechanicalSystem` with these two, ``lagrangian`` and
+``auxiliaries``, and with ``formula``, what its user wrote; it checks itself when it is made. Methods and lowering ask
+for nothing else, and for what follows from them only through :func:`~scvi_codegen.mechanics.forms.forms_of`. Solvers
+without a matrix ask whether a Lagrangian with the same motion is known
+(:func:`~scvi_codegen.mechanics.hamiltonian.lagrangian_twin`).
 """
 
 from __future__ import annotations

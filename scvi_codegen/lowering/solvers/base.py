@@ -1,8 +1,9 @@
 """What every solver without a matrix is: a function from a problem to its sweep, or ``None`` where it does not serve.
 
 A solver is a file in this folder with such a function, a line in ``FIXED_POINTS``
-(:mod:`scvi_codegen.lowering.solvers.choice`), a kind of :class:`~scvi_codegen.ir.sweeps.Sweep`, data alone, and the
-template of that kind, which makes C of it. Solvers share nothing but the problem. What they may rely on:
+(:mod:`scvi_codegen.lowering.solvers.choice`), and a kind of :class:`~scvi_codegen.ir.sweeps.Sweep`, data alone, of
+which :mod:`scvi_codegen.rendering.lanes` and the support header of that kind make C. Solvers share nothing but the
+problem. What they may rely on:
 
 * the tables of a shape are numbers of the method in 60 digits; a solver rounds them, so that it decides what their
   rounding does to the map;
