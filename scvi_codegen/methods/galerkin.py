@@ -181,11 +181,6 @@ class SVI(Method):
         """Unknowns V_b at the quadrature points if there are s of them, else at points of the space of curves."""
         rule, curves = self.rule, self.curves
         points = curves.points(self.degree, rule)
-        if self.needs_lagrangian and system.auxiliaries:
-            raise MethodError(
-                f"{rule.name} differentiates L along the curve of positions, which a Hamiltonian does not have: give L "
-                "(lagrangian_of), or use a quadrature without derivatives"
-            )
         return galerkin_system(
             system,
             abscissae=rule.abscissae,

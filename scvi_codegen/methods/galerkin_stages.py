@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.forms import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import unit_sum
@@ -31,7 +32,7 @@ from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
 
-__all__ = ["galerkin_system", "nodal_quadrature_family", "position_block"]
+__all__ = ["action_families", "galerkin_system", "nodal_quadrature_family", "position_block"]
 
 
 def galerkin_system(
@@ -61,25 +62,12 @@ def galerkin_system(
         derivative_weights: rows of (g,) weights of h^k d^k L/dt^k, k = 1, 2, ..
         derivatives: as many (g, s) matrices of the k-th derivatives of the l_nb.
     """
-    points, size = len(abscissae), len(end_position)
+    size = len(end_position)
     beta = unit_sum(end_position)
     place, weights = dyadic(position), unit_sum(weights)
     gathers = _curve_gathers(system, place, (velocity, *derivatives))
-    scalars = (system.lagrangian, *forms_of(system).rates(len(derivatives)))
-    families = [
-        ScalarFamily(
-            name=f"derivative_{k}" if k else "quadrature",
-            abscissae=abscissae,
-            weights=own,
-            weight_names=tuple(f"{'d' * k}w_{n}" for n in range(1, points + 1)),
-            gathers=gathers[: k + 2],
-            scalar=scalar,
-            power=k,
-        )
-        for k, (own, scalar) in enumerate(zip((weights, *derivative_weights), scalars, strict=True))
-    ]
     return stationary_increments(
-        families=families,
+        families=action_families(system, abscissae, (weights, *derivative_weights), gathers),
         blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
         end_position=beta,
         rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=beta[b - 1]) for b in range(1, size + 1)),
@@ -95,6 +83,40 @@ def galerkin_system(
             weights=weights,
             variational=True,
         ),
+    )
+
+
+def action_families(
+    system: MechanicalSystem, abscissae: Vector, weights: Matrix, gathers: tuple[Gather, ...]
+) -> tuple[ScalarFamily, ...]:
+    """sum_k h^(k + 1) sum_n w_kn d^k L/dt^k at the points of a curve, a family for each row of weights (paper, 4.2.3).
+
+    Args:
+        system: the Lagrangian.
+        abscissae: (g,) points in [0, 1].
+        weights: rows of (g,) weights, of L first, then of its derivatives.
+        gathers: position, velocity and as many further derivatives of the curve as L has.
+
+    Raises:
+        MethodError: for derivatives of the L of a Hamiltonian, which depends on momenta, too.
+    """
+    if len(weights) > 1 and system.auxiliaries:
+        raise MethodError(
+            "this quadrature differentiates L along the curve of positions, which a Hamiltonian does not have: give L "
+            "(lagrangian_of), or use a quadrature without derivatives"
+        )
+    scalars = (system.lagrangian, *forms_of(system).rates(len(weights) - 1))
+    return tuple(
+        ScalarFamily(
+            name=f"derivative_{k}" if k else "quadrature",
+            abscissae=abscissae,
+            weights=own,
+            weight_names=tuple(f"{'d' * k}w_{n}" for n in range(1, len(abscissae) + 1)),
+            gathers=gathers[: k + 2],
+            scalar=scalar,
+            power=k,
+        )
+        for k, (own, scalar) in enumerate(zip(weights, scalars, strict=True))
     )
 
 

@@ -47,7 +47,8 @@ class SCVI(Method):
 
     Args:
         degree: degree s of the collocation polynomial, at least 1.
-        quadrature: rule for the action, an object or a name; default: s-point Gauss-Legendre.
+        quadrature: rule for the action, an object or a name; default: s-point Gauss-Legendre. Rules with derivatives,
+            ``"hermite:2"``, sum dL/dt along the curve, too (paper, 4.2.3).
         nodes: collocation nodes of that degree, containing both ends; default Chebyshev-Lobatto (the paper's).
         abscissae: collocation abscissae in [0, 1] in place of nodes, s distinct numbers or the name of a family:
             ``"gauss"``, ``"radau-iia"``, ``"lobatto-iiia"``, ``"chebyshev-gauss"`` or ``"chebyshev-lobatto"``, s points
@@ -58,7 +59,7 @@ class SCVI(Method):
 
     Raises:
         MethodError: on a degree below 1, nodes without the end points or of another degree, abscissae beside nodes or
-            of another number, and for the printed form on abscissae, which needs nodes at both ends.
+            of another number, and for the printed form on abscissae, which needs nodes at both ends, or derivatives.
     """
 
     degree: int
@@ -74,6 +75,8 @@ class SCVI(Method):
         if not isinstance(self.variational, bool):
             raise MethodError(f"variational is True or False, not {self.variational!r}")
         object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
+        if self.rule.derivative_weights and not self.variational:
+            raise MethodError(f"the form printed in the paper sums L alone, {self.rule.name} its derivatives, too")
         if self.abscissae is not None:
             if self.nodes is not None:
                 raise MethodError("give nodes or abscissae, not both: they say where the curve is collocated")
@@ -150,6 +153,11 @@ class SCVI(Method):
         return self.degree > 1 or len(self.rule) > 1
 
     @property
+    def needs_lagrangian(self) -> bool:
+        """With derivatives of L along the curve of positions, which a Hamiltonian does not have."""
+        return bool(self.rule.derivative_weights)
+
+    @property
     def exactness(self) -> Exactness:
         """That of its curves; of the printed form nothing is claimed."""
         return Exactness(curve=self.degree, quadrature=self.rule.order) if self.symplectic else Exactness()
@@ -177,9 +185,10 @@ class SCVI(Method):
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """(34a)-(34e), with the multiplier terms unless the degree is 1 (where they vanish) or as printed.
 
-        On abscissae, which the paper does not write out: the compiled equations, unknowns v0, h a_i and h^-2 lambda_i.
+        On abscissae and of quadratures with derivatives, which the paper does not write out: the compiled equations,
+        unknowns v0, h a_i and h^-2 lambda_i.
         """
-        if self.abscissae is not None:
+        if self.abscissae is not None or self.rule.derivative_weights:
             return self.stage_system(system)
         if self.variational and self.degree > 1:
             return shooting_nodal(system, self.node_set, self.rule)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from scvi_codegen.mechanics.forms import forms_of, multipliers
+from collections.abc import Sequence
+
+from scvi_codegen.mechanics.forms import curve_rates, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import (
     acceleration_extrapolation,
@@ -11,7 +13,7 @@ from scvi_codegen.methods.acceleration_stages import (
     residual_family,
 )
 from scvi_codegen.methods.collocation import nodal_blocks, nodal_gathers
-from scvi_codegen.methods.galerkin_stages import nodal_quadrature_family
+from scvi_codegen.methods.galerkin_stages import action_families, nodal_quadrature_family
 from scvi_codegen.methods.method import lagrangian_scatters, unit_sum
 from scvi_codegen.methods.shapes import PrintedCurve, ShotCurve
 from scvi_codegen.methods.stage_system import (
@@ -28,7 +30,6 @@ from scvi_codegen.methods.stage_system import (
     stationary_nodal,
 )
 from scvi_codegen.tables.basis import (
-    cardinal_integrals,
     cardinal_slopes,
     cardinal_values,
     matrix_product,
@@ -36,31 +37,33 @@ from scvi_codegen.tables.basis import (
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
 __all__ = ["printed_increments", "printed_nodal", "shooting_increments", "shooting_nodal"]
 
 
 def shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, _nodes: Nodes) -> StageSystem:
-    """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i)."""
+    """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i).
+
+    A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve.
+    """
     size = len(tableau.b)
-    position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
+    position_rows, velocities, end_row = _curve(tableau, rule)
     blocks = (
         *acceleration_unknowns(size),
         *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
     )
-    action = ScalarFamily(
-        name="quadrature",
-        abscissae=rule.abscissae,
-        weights=unit_sum(rule.unit_weights),
-        weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
-        gathers=_curve_gathers(system, dyadic(position_rows), velocity_rows, other_blocks=size),
-        scalar=system.lagrangian,
+    action = action_families(
+        system,
+        rule.abscissae,
+        (unit_sum(rule.unit_weights), *rule.unit_derivative_weights),
+        _curve_gathers(system, dyadic(position_rows), velocities, other_blocks=size),
     )
     beta = dyadic([end_row])[0]
     extrapolated = acceleration_extrapolation(tableau)
     return stationary_increments(
-        families=(action, _multiplier_family(system, tableau)),
+        families=(*action, _multiplier_family(system, tableau)),
         blocks=blocks,
         end_position=(*beta, *(mp.zero,) * size),
         rows=(
@@ -71,7 +74,7 @@ def shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadra
             *((*line, *(mp.zero,) * size) for line in extrapolated),
             *((*(mp.zero,) * (size + 1), *(mp.mpf(int(i == j)) for j in range(size))) for i in range(size)),
         ),
-        shape=ShotCurve(tableau, rule),
+        shape=None if rule.derivative_weights else ShotCurve(tableau, rule),
     )
 
 
@@ -101,29 +104,39 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFami
     )
 
 
-def _curve(tableau: Tableau, at: Vector) -> tuple[Matrix, Matrix, Vector]:
-    """The polynomial through V_i = v0 + sum a_ij z_j at abscissae ``at``: rows for q / h and v, the row of q1 / h."""
+def _curve(tableau: Tableau, rule: Quadrature) -> tuple[Matrix, tuple[Matrix, ...], Vector]:
+    """The polynomial through V_i = v0 + sum a_ij z_j at the points of ``rule``.
+
+    Rows for q / h; for v and h^k d^k v/dt^k, as many as the rule has derivatives; the row of q1 / h.
+    """
+    curves, at = Polynomials(), rule.abscissae
     moved = tuple((mp.one, *line) for line in tableau.A)
-    position = matrix_product(cardinal_integrals(tableau.c, at, 0), moved)
-    velocity = matrix_product(cardinal_values(tableau.c, at), moved)
-    return position, velocity, matrix_product((tableau.b,), moved)[0]
+    velocities = tuple(
+        matrix_product(curves.velocities(tableau.c, at, k), moved) for k in range(len(rule.derivative_weights) + 1)
+    )
+    position = matrix_product(curves.positions(tableau.c, at), moved)
+    return position, velocities, matrix_product((tableau.b,), moved)[0]
 
 
 def _curve_gathers(
-    system: MechanicalSystem, position: Matrix, velocity: Matrix, *, other_blocks: int = 0
-) -> tuple[Gather, Gather]:
+    system: MechanicalSystem, position: Matrix, velocities: Sequence[Matrix], *, other_blocks: int = 0
+) -> tuple[Gather, ...]:
     points = len(position)
     padding = Table.constant(points, other_blocks)
+    rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
     return (
         Gather(
             arguments=system.coordinates,
             table=Table.joined(Table.constant(points, 1, 1), Table.named("r", position, column=0), padding),
             power=0,
         ),
-        Gather(
-            arguments=system.velocities,
-            table=Table.joined(Table.constant(points, 1), Table.named("u", velocity, column=0), padding),
-            power=-1,
+        *(
+            Gather(
+                arguments=arguments,
+                table=Table.joined(Table.constant(points, 1), Table.named(f"{'d' * k}u", table, column=0), padding),
+                power=-1 - k,
+            )
+            for k, (arguments, table) in enumerate(zip(rates, velocities, strict=True))
         ),
     )
 
@@ -131,7 +144,7 @@ def _curve_gathers(
 def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
     """(34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
     size, points = len(tableau.b), len(rule)
-    position_rows, velocity_rows, end_row = _curve(tableau, rule.abscissae)
+    position_rows, velocities, end_row = _curve(tableau, rule)
     abscissae = nodes.abscissae
     values = cardinal_values(abscissae, rule.abscissae)
     slopes = cardinal_slopes(abscissae, rule.abscissae)
@@ -147,7 +160,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
             abscissae=rule.abscissae,
             weights=rule.unit_weights,
             weight_names=tuple(f"w_{n}" for n in range(1, points + 1)),
-            gathers=_curve_gathers(system, position_rows, velocity_rows),
+            gathers=_curve_gathers(system, position_rows, velocities),
             scatters=(),
         ),
         system,
