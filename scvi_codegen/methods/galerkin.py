@@ -179,6 +179,9 @@ class SVI(Method):
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns V_b at the quadrature points if there are s of them, else at points of the space of curves."""
+        return self._equations(system, rounded=True)
+
+    def _equations(self, system: MechanicalSystem, *, rounded: bool) -> StageSystem:
         rule, curves = self.rule, self.curves
         points = curves.points(self.degree, rule)
         return galerkin_system(
@@ -192,15 +195,16 @@ class SVI(Method):
             blocks=points,
             derivative_weights=rule.unit_derivative_weights,
             derivatives=[curves.velocities(points, rule.abscissae, k + 1) for k in range(len(rule.derivative_weights))],
+            rounded=rounded,
         )
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c).
 
-        Of curves other than polynomials, and of quadratures with derivatives, the compiled equations.
+        Of curves other than polynomials, and of quadratures with derivatives, the compiled equations, all digits kept.
         """
         if not isinstance(self.curves, Polynomials) or self.rule.derivative_weights:
-            return self.stage_system(system)
+            return self._equations(system, rounded=False)
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
         return stationary_nodal(

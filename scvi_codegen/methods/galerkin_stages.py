@@ -47,6 +47,7 @@ def galerkin_system(
     blocks: Vector = (),
     derivative_weights: Matrix = (),
     derivatives: Sequence[Matrix] = (),
+    rounded: bool = True,
 ) -> StageSystem:
     """Stationarity of h sum_n w_n L(q0 + h sum_b a_nb V_b, sum_b l_nb V_b, t_n) at fixed q1 = q0 + h sum_b beta_b V_b.
 
@@ -61,25 +62,26 @@ def galerkin_system(
         blocks: (s,) where the velocities are; left out, the points.
         derivative_weights: rows of (g,) weights of h^k d^k L/dt^k, k = 1, 2, ..
         derivatives: as many (g, s) matrices of the k-th derivatives of the l_nb.
+        rounded: whether tables are those of doubles, or have all their digits.
     """
     size = len(end_position)
-    beta = unit_sum(end_position)
-    place, weights = dyadic(position), unit_sum(weights)
-    gathers = _curve_gathers(system, place, (velocity, *derivatives))
+    if rounded:
+        end_position, position, weights = unit_sum(end_position), dyadic(position), unit_sum(weights)
+    gathers = _curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(
         families=action_families(system, abscissae, (weights, *derivative_weights), gathers),
         blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
-        end_position=beta,
-        rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=beta[b - 1]) for b in range(1, size + 1)),
+        end_position=end_position,
+        rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=end_position[b - 1]) for b in range(1, size + 1)),
         extrapolation=extrapolation,
         shape=None
         if derivatives
         else Velocities(
             abscissae=abscissae,
             blocks=blocks or abscissae,
-            position=place,
+            position=position,
             velocity=velocity,
-            end=beta,
+            end=end_position,
             weights=weights,
             variational=True,
         ),

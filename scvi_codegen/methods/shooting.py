@@ -175,21 +175,29 @@ class SCVI(Method):
         named = isinstance(self.abscissae, str)
         return common | {"abscissae": self.abscissae if named else [float(c) for c in self.abscissae]}
 
+    @property
+    def _line(self) -> SVI:
+        """What degree 1 is."""
+        return SVI(1, self.rule, self.node_set)
+
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI of degree 1 with the same quadrature."""
         if self.degree == 1:
-            return SVI(1, self.rule, self.node_set).stage_system(system)
-        build = shooting_increments if self.variational else printed_increments
-        return build(system, self.tableau, self.rule, self.node_set)
+            return self._line.stage_system(system)
+        if self.variational:
+            return shooting_increments(system, self.tableau, self.rule)
+        return printed_increments(system, self.tableau, self.rule, self.node_set)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """(34a)-(34e), with the multiplier terms unless the degree is 1 (where they vanish) or as printed.
 
         On abscissae and of quadratures with derivatives, which the paper does not write out: the compiled equations,
-        unknowns v0, h a_i and h^-2 lambda_i.
+        unknowns v0, h a_i and h^-2 lambda_i, all digits kept.
         """
         if self.abscissae is not None or self.rule.derivative_weights:
-            return self.stage_system(system)
+            if self.degree == 1:
+                return self._line.paper_form(system)
+            return shooting_increments(system, self.tableau, self.rule, rounded=False)
         if self.variational and self.degree > 1:
             return shooting_nodal(system, self.node_set, self.rule)
         return printed_nodal(system, self.node_set, self.rule)

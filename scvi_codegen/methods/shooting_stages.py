@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from scvi_codegen.mechanics.forms import curve_rates, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -43,13 +44,19 @@ from scvi_codegen.tables.tableau import Tableau
 __all__ = ["printed_increments", "printed_nodal", "shooting_increments", "shooting_nodal"]
 
 
-def shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, _nodes: Nodes) -> StageSystem:
+def shooting_increments(
+    system: MechanicalSystem, tableau: Tableau, rule: Quadrature, *, rounded: bool = True
+) -> StageSystem:
     """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i).
 
-    A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve.
+    A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve. Not
+    ``rounded``, all tables have all their digits.
     """
     size = len(tableau.b)
-    position_rows, velocities, end_row = _curve(tableau, rule)
+    position, velocities, beta = _curve(tableau, rule)
+    weights = rule.unit_weights
+    if rounded:
+        position, weights, beta = dyadic(position), unit_sum(weights), dyadic([beta])[0]
     blocks = (
         *acceleration_unknowns(size),
         *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
@@ -57,13 +64,12 @@ def shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadra
     action = action_families(
         system,
         rule.abscissae,
-        (unit_sum(rule.unit_weights), *rule.unit_derivative_weights),
-        _curve_gathers(system, dyadic(position_rows), velocities, other_blocks=size),
+        (weights, *rule.unit_derivative_weights),
+        _curve_gathers(system, position, velocities, other_blocks=size),
     )
-    beta = dyadic([end_row])[0]
     extrapolated = acceleration_extrapolation(tableau)
     return stationary_increments(
-        families=(*action, _multiplier_family(system, tableau)),
+        families=(*action, _multiplier_family(system, tableau, rounded=rounded)),
         blocks=blocks,
         end_position=(*beta, *(mp.zero,) * size),
         rows=(
@@ -78,15 +84,13 @@ def shooting_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadra
     )
 
 
-def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFamily:
+def _multiplier_family(system: MechanicalSystem, tableau: Tableau, *, rounded: bool) -> ScalarFamily:
     """The collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
     size = len(tableau.b)
     position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
-    rounded = Gather(
-        arguments=position.arguments,
-        table=Table(entries=dyadic(position.table.entries), names=position.table.names),
-        power=0,
-    )
+    if rounded:
+        table = Table(entries=dyadic(position.table.entries), names=position.table.names)
+        position = replace(position, table=table)
     own = Gather(
         arguments=multipliers(system),
         table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
@@ -97,7 +101,7 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau) -> ScalarFami
         abscissae=tableau.c,
         weights=(mp.one,) * size,
         weight_names=("",) * size,
-        gathers=(rounded, velocity, acceleration, own),
+        gathers=(position, velocity, acceleration, own),
         scalar=forms_of(system).multiplied_residual,
         power=1,
         in_action=False,

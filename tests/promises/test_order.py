@@ -21,6 +21,10 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
+from scvi_codegen.models.problems import problem
+from scvi_codegen.verification.certificate import Outcome
+from scvi_codegen.verification.convergence import convergence_checks
+from scvi_codegen.verification.subject import State, Subject
 
 PLATEAU = 1e-11
 """Errors below are left out; round-off and the reference contribute up to 1e-13."""
@@ -57,7 +61,19 @@ def measured_order(compiled, sample, name, method):
     return -np.polyfit(np.log(COUNTS[used]), np.log(errors[used]), 1)[0]
 
 
+DERIVATIVES = ("hermite:2", "hermite:3")
+"""Quadratures with derivatives of L."""
+PLACES = (None, "gauss", "lobatto-iiia")
+
+SPECIAL = (
+    *(SVI(s, rule) for s in (1, 2, 3) for rule in DERIVATIVES),
+    *(SCVI(s, rule, abscissae=at) for s in (2, 3) for rule in DERIVATIVES for at in PLACES),
+    SCVI(1, "hermite:2"),
+    *(SVI(s, space="splines:2") for s in (2, 3, 4)),
+    SVI(2, "gauss-lobatto:3", space="splines:0.3"),
+)
 METHODS = (
+    *SPECIAL[1::4],
     *(SVI(s, f"gauss-legendre:{g}") for s in (1, 2, 3, 4, 5) for g in (s, s + 1)),
     *(SVI(s, f"gauss-lobatto:{g}") for s in (2, 4) for g in (s, s + 1)),
     SVI(1, "gauss-lobatto:2"),
@@ -91,12 +107,30 @@ METHODS = (
     ExplicitEuler(),
     ExplicitEuler(form="position"),
 )
-LOW = tuple(method for method in METHODS if method.order <= 6)
+LOW = tuple(method for method in METHODS if method.order <= 6 and method not in SPECIAL)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 def test_global_error_on_kepler_shrinks_with_the_order_claimed(compiled, sample, method):
     assert measured_order(compiled, sample, "kepler", method) == pytest.approx(method.order, abs=0.15)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", SPECIAL, ids=lambda method: method.name)
+def test_every_method_has_its_order_with_quadratures_of_derivatives_and_other_curves(compiled, sample, method):
+    assert measured_order(compiled, sample, "kepler", method) == pytest.approx(method.order, abs=0.15)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "method", [*METHODS, *(one for one in SPECIAL if one not in METHODS)], ids=lambda method: method.name
+)
+def test_the_certificate_measures_that_order_below_rounding(compiled, sample, method):
+    state, stepper = State(*sample("kepler").state, 0.3, 0.05), compiled("kepler", method)
+    subject = Subject(problem("kepler").system, method, stepper, None, state)
+    (order,) = (check for check in convergence_checks(subject) if check.name == "order")
+    assert order.outcome is Outcome.KEPT, order
+    assert method.order - 0.25 < order.measured < method.order + 0.3
 
 
 @pytest.mark.parametrize("method", LOW[::5], ids=lambda method: method.name)
