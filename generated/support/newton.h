@@ -1,9 +1,9 @@
 /* Newton's iteration on the stage equations. Before it: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT,
  * MOMENTA and MOVES, and evaluate, which gives the equations and their Jacobian. */
 
-#define STOPPED_SHRINKING ((real)0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
-#define KEEP_CHANGE ((real)1e-2) /* factors are kept while updates are below this part of the state */
-#define KEEP_RATE ((real)0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
+#define STOPPED_SHRINKING REAL(0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
+#define KEEP_CHANGE REAL(1e-2) /* factors are kept while updates are below this part of the state */
+#define KEEP_RATE REAL(0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
 
 /* How far the last update moved the stages and the end momentum: the largest ratio to its own size, the ratio of the
  * largest to the largest size, and the largest itself. */
@@ -147,7 +147,8 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
     }
     if (q1)
       add_boundary(step, data, q1, !*keep, &shape);
-    if (!all_finite(data->rows, N + SITES) || !all_finite(increment, M) || !all_finite(size_p, M) || !all_finite(size_q, M))
+    if (!all_finite(data->rows, N + SITES) || !all_finite(increment, M) || !all_finite(size_p, M) ||
+        !all_finite(size_q, M))
       return NOT_FINITE;
     if (k > 0) {
       measure(&moved, change, size_p);

@@ -24,8 +24,8 @@ static inline void offset(const step_data *step, int points, real *u, int across
       u[n * across + i] = step->q0[i] + (step->carry_q[i] + u[n * across + i]);
 }
 
-/* rows_r += sum_n weight[n] scale table[n][r] value_n for so many sites; the last row is p1, whose terms are also summed
- * without sign into size. */
+/* rows_r += sum_n weight[n] scale table[n][r] value_n for so many sites; the last row is p1, whose terms are also
+ * summed without sign into size. */
 static inline void scatter(const real *table, int points, const real *weight, real scale, const real *value, int across,
     int sites, real *rows, real *size)
 {
