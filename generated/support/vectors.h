@@ -1,6 +1,5 @@
 /* Vectors of LANES numbers, which GCC and Clang map to whatever the processor has. Before it: LANES, a power of two. */
 #pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
-#pragma GCC diagnostic ignored "-Wunused-function" /* a sweep takes what it needs of what follows */
 #if defined(__AVX512F__) && LANES >= 8 && !defined(__clang__)
 #pragma GCC target("prefer-vector-width=512") /* loops over lanes become whole vectors, not halves */
 #endif

@@ -1,5 +1,9 @@
 /* Comparisons and checks of numbers. Before it: real. */
 
+#ifdef __clang__
+#pragma clang diagnostic ignored "-Wunused-function" /* a method takes what it needs of what is inline here */
+#endif
+
 /* fmax without its care for NaN, and without a call. */
 static inline real larger(real a, real b)
 {
