@@ -30,6 +30,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
+from scvi_codegen.lowering.solvers.ladder import control_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -37,6 +38,7 @@ from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.waiting import waiting_for
+from scvi_codegen.rendering.control import with_control
 from scvi_codegen.rendering.events import with_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
@@ -103,14 +105,27 @@ def compile_stepper(
         text = remembered_text((*key, "ensemble"), lambda: _text_of(render_ensemble(program())))
         return Source.from_json(text) if text else None
 
-    source, interface = json.loads(remembered_text((*key, "integrator"), texts))
+    @cache
+    def controlled() -> Source | None:
+        text = remembered_text((*key, "controlled"), lambda: _text_of(_controlled(source, program())))
+        return Source.from_json(text) if text else None
+
+    texts_of = json.loads(remembered_text((*key, "integrator"), texts))
+    source, interface = Source.from_json(texts_of[0]), Interface.from_json(texts_of[1])
     return Stepper(
-        Source.from_json(source),
-        Interface.from_json(interface),
+        source,
+        interface,
         ensemble=ensemble,
+        controlled=controlled,
         flags=flags,
         events=as_events(events),
     )
+
+
+def _controlled(source: Source, program: Program) -> Source | None:
+    """The text with steps that choose their length, where there is a fixed-point iteration whose error is known."""
+    sweep = program.sweep
+    return with_control(source, program, control_of(sweep, program.order)) if sweep else None
 
 
 def _text_of(source: Source | None) -> str:

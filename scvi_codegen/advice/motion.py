@@ -107,7 +107,7 @@ def solve_motion(
             h = advice.h
     steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
     h = (end - start) / steps
-    asked = None if t_eval is None else times_of_run(t_eval, start, h, steps)
+    asked = None if t_eval is None else times_of_run(t_eval, start, end)
     status, message, failure = REACHED, "The end of the span was reached.", None
     try:
         trajectory = stepper.integrate(

@@ -66,6 +66,9 @@ class Program:
         sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
+        order: of the method; where none is claimed, the number of its points.
+        stage_highest: (B,) what gives the highest Legendre coefficient of the velocities of the stages; empty where the
+            unknowns are others.
     """
 
     prefix: str
@@ -94,6 +97,8 @@ class Program:
     sweep: Sweep | None
     splitting: Splitting | None
     newton: bool
+    order: int
+    stage_highest: tuple[float, ...]
 
     @property
     def dimension(self) -> int:
@@ -104,6 +109,18 @@ class Program:
     def unknowns(self) -> int:
         """B numbers a site."""
         return self.blocks * self.sites
+
+    @property
+    def stage_error_power(self) -> int:
+        """Of h in the square of the displacement by that coefficient over that by all but the mean."""
+        return 2 * (self.blocks - 1)
+
+    @property
+    def error_power(self) -> int:
+        """Of h in what a run keeps of the error of its curves; 0 where there is none."""
+        if self.sweep:
+            return self.sweep.error_power
+        return self.stage_error_power if self.stage_highest else 0
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

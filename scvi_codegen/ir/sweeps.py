@@ -51,8 +51,16 @@ class SplitMatrix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuessTables:
-    """(lanes, lanes) tables that continue what was kept at the points: ``last_alone``, or ``last`` and ``before``."""
+    """(lanes, lanes) tables that continue what was kept at the points: ``last_alone``, or ``last`` and ``before``.
 
+    Attributes:
+        abscissae: where the kept values stand on a step, without padding.
+        degree, highest: (lanes,) what gives the highest Legendre coefficient of the curve through them.
+    """
+
+    abscissae: tuple[float, ...]
+    degree: int
+    highest: tuple[float, ...]
     last_alone: LaneTable
     last: LaneTable
     before: LaneTable
@@ -101,6 +109,11 @@ class SeparableSweep:
         """Those with lanes."""
         return (self.force,)
 
+    @property
+    def error_power(self) -> int:
+        """Of h in the square of the displacement by the highest coefficient over that by all."""
+        return 2 * self.guess.degree + 2
+
     def memory(self, dimension: int) -> int:
         """The forces at the points in the last two steps."""
         return 2 * dimension * self.lanes
@@ -141,6 +154,11 @@ class PointSweep:
     def kernels(self) -> tuple[Kernel, ...]:
         """Those with lanes."""
         return (self.kernel, self.force)
+
+    @property
+    def error_power(self) -> int:
+        """Of h in the square of the displacement by the highest coefficient over that by all but the mean."""
+        return 2 * self.guess.degree
 
     @property
     def uses_time(self) -> bool:
@@ -266,6 +284,11 @@ class CurveSweep:
     def guess(self) -> GuessTables:
         """That of the accelerations."""
         return self.nodes.guess
+
+    @property
+    def error_power(self) -> int:
+        """Of h in the square of the displacement by the highest coefficient over that by all."""
+        return 2 * self.guess.degree + 2
 
     @property
     def diagonal(self) -> bool:

@@ -32,6 +32,7 @@ from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.tables.basis import legendre_functional
 from scvi_codegen.tables.precision import Matrix
 
 __all__ = ["lower"]
@@ -95,7 +96,15 @@ def lower(
         sweep=sweep,
         splitting=splitting,
         newton=newton,
+        order=method.order or len(stages.blocks),
+        stage_highest=_stage_highest(stages) if newton and splitting is None else (),
     )
+
+
+def _stage_highest(stages: StageSystem) -> tuple[float, ...]:
+    """Where the unknowns are two or more velocities along the curve."""
+    points = stages.block_abscissae
+    return lower_vector(legendre_functional(points, len(points) - 1)) if len(points) > 1 else ()
 
 
 def _legendre_kernel(system: MechanicalSystem) -> Kernel:

@@ -12,12 +12,13 @@ from scvi_codegen.rendering.target import MAX_ITERATIONS, TOLERANCE
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 
-STATUS = {1: "not converged", 2: "singular", 3: "not finite"}
+STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished"}
 
 
 ADVICE = {
     "not converged": "try a smaller step, or more iterations",
     "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
+    "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
 

@@ -24,8 +24,8 @@ from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, c
 __all__ = ["Integrator"]
 
 
-def no_ensemble() -> None:
-    """Of a method without a text for many trajectories."""
+def no_text() -> None:
+    """Of a method without a text for many trajectories, or for steps that choose their length."""
 
 
 class Integrator:
@@ -46,11 +46,13 @@ class Integrator:
         source: Source,
         interface: Interface,
         *,
-        ensemble: Callable[[], Source | None] = no_ensemble,
+        ensemble: Callable[[], Source | None] = no_text,
+        controlled: Callable[[], Source | None] = no_text,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
     ) -> None:
-        self.interface, self._ensemble, self.flags, self.events = interface, ensemble, flags, events
+        self.interface, self.flags, self.events = interface, flags, events
+        self._ensemble, self._controlled = ensemble, controlled
         self._plain = source
         self.source = _watching(source, interface, events) if events else source
         self.binding = Binding(building.load(self.source, flags=flags), interface.prefix, interface.workspace)
@@ -156,7 +158,33 @@ class Integrator:
         wanted = as_events(events)
         if wanted == self.events:
             return self
-        return type(self)(self._plain, self.interface, ensemble=self._ensemble, flags=self.flags, events=wanted)
+        return type(self)(
+            self._plain,
+            self.interface,
+            ensemble=self._ensemble,
+            controlled=self._controlled,
+            flags=self.flags,
+            events=wanted,
+        )
+
+    def controlled(self) -> Self:
+        """The same integrator with steps that choose their length; MethodError where it has none."""
+        source = self._controlled()
+        if source is None:
+            raise MethodError(
+                f"{self.interface.method} has no steps that choose their length for this system: they need a "
+                "fixed-point iteration (solver 'auto' or 'fixed-point'); give h and steps"
+            )
+        if source == self._plain:
+            return self
+        return type(self)(
+            source,
+            self.interface,
+            ensemble=self._ensemble,
+            controlled=self._controlled,
+            flags=self.flags,
+            events=self.events,
+        )
 
     def momentum(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
         """(m,) momenta p = dL/dv at (q, v, t), the Legendre transform."""

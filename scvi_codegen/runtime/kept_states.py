@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["KeptStates"]
@@ -32,6 +33,7 @@ class KeptStates:
     parameters: Array
     stepper: Integrator = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
+    goal: Goal | None = field(default=None, repr=False)
 
     @property
     def forward(self) -> float:

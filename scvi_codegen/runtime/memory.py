@@ -10,10 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["Memory"]
+
+
+UNHEARD_STEPS = 10**5
+"""Between looks at the keyboard."""
 
 
 class Memory:
@@ -21,10 +26,19 @@ class Memory:
 
     Attributes:
         stepper: the compiled integrator.
+        goal: where steps that choose their length lead, ``None`` for steps of h.
     """
 
-    def __init__(self, stepper: Integrator, memory: Any, parameters: Array, options: SolverOptions | None) -> None:
+    def __init__(
+        self,
+        stepper: Integrator,
+        memory: Any,
+        parameters: Array,
+        options: SolverOptions | None,
+        goal: Goal | None = None,
+    ) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
+        self.goal = goal
 
     @classmethod
     def started(
@@ -33,19 +47,24 @@ class Memory:
         q: ArrayLike,
         p: ArrayLike,
         *,
-        h: float,
+        h: float | Goal,
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Self:
-        """At (q, p) and t, before the first step of h."""
+        """At (q, p) and t, before the first step: of h, or one that chooses its length on the way to a goal."""
         interface, binding = stepper.interface, stepper.binding
         q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
         memory = binding.new("run *")
         binding.function("start")(
-            memory, checked_number(t, "the time t"), checked_step(h), binding.pointer(q0), binding.pointer(p0)
+            memory,
+            checked_number(t, "the time t"),
+            0.0 if isinstance(h, Goal) else checked_step(h),
+            binding.pointer(q0),
+            binding.pointer(p0),
         )
-        return cls(stepper, memory, checked_parameters(interface, parameters), options)
+        goal = h if isinstance(h, Goal) else None
+        return cls(stepper, memory, checked_parameters(interface, parameters), options, goal)
 
     @classmethod
     def restored(
@@ -55,8 +74,9 @@ class Memory:
         *,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
+        goal: Goal | None = None,
     ) -> Self:
-        """Where :meth:`save` gave these bytes; StateError for bytes that no run has."""
+        """Where :meth:`save` gave these bytes; StateError for bytes that no run has, or none of the kind."""
         memory = stepper.binding.new("run *")
         buffer = stepper.binding.buffer(memory)
         if not isinstance(saved, bytes):
@@ -65,11 +85,13 @@ class Memory:
             raise StateError(f"{len(saved)} bytes are not a saved run of this stepper, which has {len(buffer)}")
         buffer[:] = saved
         _check_memory(memory)
-        return cls(stepper, memory, checked_parameters(stepper.interface, parameters), options)
+        if (memory.h == 0.0) != (goal is not None):
+            raise StateError("a saved run whose steps choose their length goes on to a t_end, any other does not")
+        return cls(stepper, memory, checked_parameters(stepper.interface, parameters), options, goal)
 
     @property
     def h(self) -> float:
-        """Step size."""
+        """Step size, 0 where steps choose their length."""
         return float(self._memory.h)
 
     @property
@@ -125,18 +147,31 @@ class Memory:
         if status:
             raise step_failure(status, report, step=self.steps, h=self.h)
 
+    def run_to_goal(self) -> None:
+        """Advance to the goal and keep nothing but the state there."""
+        m = self.stepper.dimension
+        while not self.arrived:
+            last = np.empty(1), np.empty((1, m)), np.empty((1, m)), np.empty(1, dtype=np.int32)
+            status, report = self.advance(UNHEARD_STEPS, self.steps + UNHEARD_STEPS + 1, *last)
+            if status:
+                raise step_failure(status, report, step=self.steps, h=self.h)
+
     def advance(
         self, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
     ) -> tuple[int, Any]:
         """By ``steps`` in one call of C, which fills the arrays with each state whose number ``every`` divides.
 
+        With a goal, by no more steps than lead there; the state there is stored whatever its number, and the report
+        says how many are ``stored``.
+
         Returns:
             The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
         """
-        binding = self.stepper.binding
+        binding, goal = self.stepper.binding, self.goal
         report = binding.new("report *")
-        status = binding.function("advance")(
+        status = binding.function("advance_to" if goal else "advance")(
             self._memory,
+            *((goal.t_end, goal.tolerance) if goal else ()),
             steps,
             every,
             binding.pointer(self._parameters),
@@ -150,6 +185,24 @@ class Memory:
         )
         return status, report
 
+    @property
+    def arrived(self) -> bool:
+        """Whether the run stands at its goal."""
+        return self.goal is not None and self.t == self.goal.t_end
+
+    @property
+    def rejected(self) -> int:
+        """Steps that were tried, and repeated shorter."""
+        return int(getattr(self._memory, "rejected", 0))
+
+    @property
+    def step_error(self) -> tuple[float, float]:
+        """An estimate of the relative error of the worst step, and when that step began; not numbers without one."""
+        if not hasattr(self._memory, "error"):  # of version 0.1
+            return np.nan, np.nan
+        error = float(self.stepper.binding.function("step_error")(self._memory))
+        return (error, float(self._memory.error_t)) if error >= 0.0 else (np.nan, np.nan)
+
 
 def _time(memory: Any) -> float:
     """Of a run; version 0.1, whose text recorded runs may have, carried the start and the number of steps."""
@@ -160,6 +213,6 @@ def _check_memory(memory: Any) -> None:
     """Raise :class:`StateError` for bytes that no run has."""
     numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
     counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
-    sound = np.isfinite(numbers).all() and memory.h != 0.0 and all(0 <= count < 2**53 for count in counts.values())
+    sound = np.isfinite(numbers).all() and all(0 <= count < 2**53 for count in counts.values())
     if not sound or memory.guess > 2:
         raise StateError(f"these bytes are not a saved run: h = {memory.h:g}, {counts}")

@@ -17,7 +17,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.runtime.dense_output import lengths_at, states_at
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.portions import SLICE_SECONDS, record_states, trajectory_of
+from scvi_codegen.runtime.portions import SLICE_SECONDS, record, trajectory_of
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Observation"]
@@ -43,19 +43,20 @@ class Observation:
         self.states: list[tuple[Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations = 0
 
-    def advance(self, steps: int, progress: Callable[[int], None] | None = None) -> Trajectory:
-        """Advance by ``steps``, or to the step in which a terminal event ends the run; that step is not taken.
+    def advance(self, steps: int | None, progress: Callable[[int], None] | None = None) -> Trajectory:
+        """Advance by ``steps`` (to the goal), or to the step in which a terminal event ends the run; that is not taken.
 
         Raises:
             StepFailedError: with what was kept as ``trajectory``; the run stands before the failing step.
             EventError: where an event function is not finite.
         """
-        steps = checked_count(steps, "steps", least=0)
-        self._keep(record_states(self.run, 0), first=True)
+        goal = self.run.goal
+        most_steps = np.inf if steps is None and goal else checked_count(steps, "steps", least=0)
+        self._keep(record(self.run, 0), first=True)
         most = max(1, NUMBERS // self.run.stepper.dimension)
         portion, done = min(FIRST_STEPS, most), 0
-        while done < steps:
-            size, began = min(portion, steps - done), time.perf_counter()
+        while done < most_steps and not self.run.arrived:
+            size, began = int(min(portion, most_steps - done)), time.perf_counter()
             try:
                 self._portion(size)
             except StepFailedError as failure:
@@ -74,14 +75,14 @@ class Observation:
         """A portion of the run, its events and what is kept of it; a step that fails after a terminal event is none."""
         before, failure = self.run.save(), None
         try:
-            part = record_states(self.run, size)
+            part = record(self.run, size)
         except StepFailedError as error:
             part, failure = Trajectory.before(error), error
         if self.search is not None:
             reached = self.search.search(part, first=self.run.steps - len(part) + 1)
             if self.search.ended:
                 self.run.rewind(before)
-                part, failure = self._ended(record_states(self.run, reached)), None
+                part, failure = self._ended(record(self.run, reached)), None
         self._keep(part)
         if failure is not None:
             raise failure
@@ -109,7 +110,7 @@ class Observation:
         number = self.run.steps - (len(part) - 1 - ended) + np.arange(len(part))
         wanted = number % self.every == 0
         wanted[0] = first
-        wanted[-1] |= ended
+        wanted[-1] |= ended or self.run.arrived
         self.states.append((part.t[wanted], part.q[wanted], part.p[wanted], part.lengths[wanted], total[wanted]))
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,20 @@ from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["SLICE_SECONDS", "record_states", "trajectory_of"]
+__all__ = ["SLICE_SECONDS", "record", "record_states", "record_until", "trajectory_of"]
 
 SLICE_SECONDS = 0.1
 """Time between looks at the keyboard (and calls of ``progress``) during an integration."""
+
+
+def record(
+    memory: Memory, steps: int | None, *, every: int = 1, progress: Callable[[int], None] | None = None
+) -> Trajectory:
+    """The states of ``steps``, or of fewer if they lead to the goal of the run; all that do where left out."""
+    if memory.goal is None:
+        return record_states(memory, checked_count(steps, "steps", least=0), every=every, progress=progress)
+    count = None if steps is None else checked_count(steps, "steps", least=0)
+    return record_until(memory, count, every=every, progress=progress)
 
 
 def record_states(
@@ -55,6 +66,62 @@ def record_states(
     return trajectory_of(memory, t, q, p, iterations)
 
 
+def record_until(
+    memory: Memory, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
+) -> Trajectory:
+    """Advance to the goal, or by ``steps``; keep the present state, every so many-th, and the one at the goal.
+
+    Raises:
+        StepFailedError: with the states kept so far as ``trajectory``, where steps shrink to nothing.
+    """
+    every = checked_count(every, "every", least=1)
+    pieces = [_Piece.of(memory)]
+    done, portion = 0, 256 * every
+    while not memory.arrived and (steps is None or done < steps):
+        size, began = portion if steps is None else min(portion, steps - done), time.perf_counter()
+        piece = _Piece.empty(memory, size // every + 2)
+        status, report = memory.advance(size, every, *piece)
+        pieces.append(piece.first(report.stored))
+        done += report.steps
+        if status:
+            raise step_failure(status, report, step=memory.steps, h=memory.h, kept=_joined(memory, pieces, every))
+        if progress is not None:
+            progress(done)
+        elapsed = max(time.perf_counter() - began, 1e-6)
+        portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
+    return _joined(memory, pieces, every)
+
+
+class _Piece(NamedTuple):
+    """States, and iterations since the state before each."""
+
+    t: Array
+    q: Array
+    p: Array
+    iterations: NDArray[np.int32]
+
+    @classmethod
+    def empty(cls, memory: Memory, room: int) -> _Piece:
+        m = memory.stepper.dimension
+        t, q, p = (empty_array((room, *shape)) for shape in ((), (m,), (m,)))
+        return cls(t, q, p, np.zeros(room, dtype=np.int32))
+
+    def first(self, count: int) -> _Piece:
+        return _Piece(self.t[:count], self.q[:count], self.p[:count], self.iterations[:count])
+
+    @classmethod
+    def of(cls, memory: Memory) -> _Piece:
+        """The present state."""
+        return cls(np.array([memory.t]), memory.q[np.newaxis], memory.p[np.newaxis], np.zeros(1, dtype=np.int32))
+
+
+def _joined(memory: Memory, pieces: Sequence[_Piece], every: int) -> Trajectory:
+    """The trajectory of a run to its goal; with each state there, the steps between them have their lengths."""
+    t, q, p, iterations = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
+    lengths = np.append(np.diff(t) if every == 1 else np.full(len(t) - 1, np.nan), np.nan)
+    return trajectory_of(memory, t, q, p, iterations, lengths=lengths)
+
+
 def trajectory_of(
     memory: Memory,
     t: Array,
@@ -66,15 +133,28 @@ def trajectory_of(
     events: tuple[Crossings, ...] = (),
 ) -> Trajectory:
     """These states as states of this integration, each before a step of h if no lengths are given."""
+    step_error, step_error_t = memory.step_error
     return Trajectory(
         t=t,
         q=q,
         p=p,
         iterations=iterations,
         lengths=np.broadcast_to(memory.h, t.shape) if lengths is None else lengths,
-        h=memory.h,
+        h=_length(memory, t),
+        goal=memory.goal,
+        steps=memory.steps,
+        rejected=memory.rejected,
+        step_error=step_error,
+        step_error_t=step_error_t,
         parameters=memory.parameters,
         stepper=memory.stepper,
         options=memory.options,
         events=events,
     )
+
+
+def _length(memory: Memory, t: Array) -> float:
+    """Of steps that are all the same; of others the first, or the sign of all."""
+    if memory.goal is None:
+        return memory.h
+    return float(t[1] - t[0] if len(t) > 1 else memory.goal.t_end - t[0])

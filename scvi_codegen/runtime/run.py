@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
-from scvi_codegen.runtime.portions import record_states
+from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Run"]
@@ -20,10 +21,15 @@ class Run(Memory):
     """An integration under way: :class:`Memory`, and the recording of its states."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_restored, (self.stepper, self.save(), self._parameters, self._options))
+        return (_restored, (self.stepper, self.save(), self._parameters, self._options, self.goal))
 
-    def record(self, steps: int, *, every: int = 1, progress: Callable[[int], None] | None = None) -> Trajectory:
+    def record(
+        self, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
+    ) -> Trajectory:
         """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``every``.
+
+        Where steps choose their length, by no more than lead to the goal, whose state is kept, too; all of them where
+        ``steps`` is left out.
 
         The events of the stepper, if it has any, are recorded; a terminal one ends the run before the step it is in.
 
@@ -33,8 +39,10 @@ class Run(Memory):
         """
         if self.stepper.events:
             return Observation(self, every=every).advance(steps, progress)
-        return record_states(self, steps, every=every, progress=progress)
+        return record(self, steps, every=every, progress=progress)
 
 
-def _restored(stepper: Integrator, saved: bytes, parameters: Array, options: SolverOptions | None) -> Run:
-    return Run.restored(stepper, saved, parameters=parameters, options=options)
+def _restored(
+    stepper: Integrator, saved: bytes, parameters: Array, options: SolverOptions | None, goal: Goal | None
+) -> Run:
+    return Run.restored(stepper, saved, parameters=parameters, options=options, goal=goal)

@@ -14,16 +14,19 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_count
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.ensemble import integrate_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array, Parameters
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Stepper"]
@@ -33,15 +36,18 @@ class Stepper(Integrator):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_rebuild, (self._plain, self.interface, self.ensemble, self.flags, self.events))
+        texts = (self.ensemble, self._controlled())
+        return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events))
 
     def integrate(
         self,
         q: ArrayLike,
         p: ArrayLike,
         *,
-        h: float,
-        steps: int,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
         every: int = 1,
         t: float = 0.0,
         parameters: Parameters = None,
@@ -50,13 +56,15 @@ class Stepper(Integrator):
         t_eval: ArrayLike | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
     ) -> Trajectory:
-        """Run ``steps`` steps and keep every ``every``-th state, the initial one first.
+        """Run ``steps`` steps of h, or to t_end, and keep every ``every``-th state, the initial one first.
 
         Args:
             q, p: (m,) initial positions and momenta.
             h: step size, negative to go back.
             steps: number of steps.
-            every: distance between kept states.
+            t_end: instead of both: where to go, by steps that choose their length. The last ends there exactly.
+            tolerance: relative error of the end of such a step; by default round-off. Many of them add up.
+            every: steps between kept states; the one at t_end is kept, too.
             t: initial time.
             parameters, options: as in :meth:`step`.
             progress: called now and then with the number of steps done.
@@ -67,7 +75,7 @@ class Stepper(Integrator):
                 several. They are compiled with the integrator, once. By default those of :func:`compile_stepper`.
 
         Returns:
-            A :class:`Trajectory` of steps // every + 1 states, fewer if an event ended it.
+            A :class:`Trajectory`: steps // every + 1 states, fewer if an event ended it.
 
         Raises:
             StateError: on wrong shapes, names or numbers.
@@ -75,12 +83,16 @@ class Stepper(Integrator):
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
         stepper = self if events is None else self.with_events(events)
-        run = stepper.start(q, p, h=h, t=t, parameters=parameters, options=options)
+        run = stepper.start(q, p, h=h, t=t, t_end=t_end, tolerance=tolerance, parameters=parameters, options=options)
+        if run.goal is None and steps is None:
+            raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
+        if run.goal is not None and steps is not None:
+            raise StateError(f"steps that choose their length go to t_end={t_end}: leave out steps={steps}")
         if t_eval is None:
             return run.record(steps, every=every, progress=progress)
         if every != 1:
             raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
-        return Observation(run, times=times_of_run(t_eval, t, h, steps)).advance(steps, progress)
+        return Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress)
 
     def integrate_ensemble(
         self,
@@ -130,20 +142,53 @@ class Stepper(Integrator):
         q: ArrayLike,
         p: ArrayLike,
         *,
-        h: float,
+        h: float | None = None,
         t: float = 0.0,
+        t_end: float | None = None,
+        tolerance: float | None = None,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """A run from (q, p) at t with step h, to be advanced at will."""
+        """A run from (q, p) at t, to be advanced at will: by steps of h, or of their own lengths to t_end."""
+        if t_end is not None and h is None:
+            goal = Goal.checked(t_end, tolerance)
+            return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
+        if t_end is not None or h is None:
+            raise StateError(
+                "the step h, for steps of one length, or t_end, for steps that choose theirs: give one of them"
+            )
+        if tolerance is not None:
+            raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
         return Run.started(self, q, p, h=h, t=t, parameters=parameters, options=options)
 
-    def restore(self, saved: bytes, *, parameters: Parameters = None, options: SolverOptions | None = None) -> Run:
-        """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have."""
-        return Run.restored(self, saved, parameters=parameters, options=options)
+    def restore(
+        self,
+        saved: bytes,
+        *,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+    ) -> Run:
+        """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have; give its goal again."""
+        if t_end is None:
+            return Run.restored(self, saved, parameters=parameters, options=options)
+        goal = Goal.checked(t_end, tolerance)
+        return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+
+
+def _end_of(run: Run, steps: int | None) -> float:
+    return run.goal.t_end if run.goal else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
 
 
 def _rebuild(
-    source: Source, interface: Interface, ensemble: Source | None, flags: tuple[str, ...], events: tuple[Event, ...]
+    source: Source,
+    interface: Interface,
+    texts: tuple[Source | None, Source | None],
+    flags: tuple[str, ...],
+    events: tuple[Event, ...],
 ) -> Stepper:
-    return Stepper(source, interface, ensemble=lambda: ensemble, flags=flags, events=events)
+    ensemble, controlled = texts
+    return Stepper(
+        source, interface, ensemble=lambda: ensemble, controlled=lambda: controlled, flags=flags, events=events
+    )

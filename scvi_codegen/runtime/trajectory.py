@@ -50,10 +50,18 @@ class Trajectory(KeptStates):
         stepper: the compiled integrator.
         options: convergence of the stage equations, ``None`` for the defaults.
         events: the zero crossings found, parallel to ``stepper.events``.
+        goal: where steps that choose their length led, and their tolerance; ``h`` is then the first of them.
+        steps, rejected: taken since the start of the run; tried, and repeated shorter.
+        step_error, step_error_t: an estimate of the relative error of the worst step of the run, and when it began; not
+            numbers for methods without a curve to tell them from.
     """
 
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
+    steps: int = 0
+    rejected: int = 0
+    step_error: float = np.nan
+    step_error_t: float = np.nan
 
     @classmethod
     def before(cls, failure: StepFailedError) -> Self:

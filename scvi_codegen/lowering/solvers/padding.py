@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.ir.sweeps import GuessTables, LaneTable, SplitMatrix, SplitVector
-from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
+from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 __all__ = ["MOST_LANES", "guess_tables", "lane_count", "pad_matrix", "pad_split", "pad_split_matrix", "pad_vector"]
@@ -50,11 +50,15 @@ def pad_split(entries: Vector, lanes: int, *, repeat: bool = False) -> SplitVect
     return SplitVector(high, lower_vector(_difference(long, high)))
 
 
-def guess_tables(abscissae: Vector, lanes: int, through: Matrix | None = None) -> GuessTables:
+def guess_tables(
+    abscissae: Vector, lanes: int, *, through: Matrix | None = None, degree: int | None = None
+) -> GuessTables:
     """From the values at the points in the last step, or in the last two, to those in the next.
 
-    ``through``: a matrix to apply to the guess.
+    ``through``: a matrix to apply to the guess; ``degree``: of the highest coefficient that the method resolves, left
+    out as many as the points determine.
     """
+    highest = len(abscissae) - 1 if degree is None else degree
     alone = extrapolation(abscissae, 1, min(len(abscissae) - 1, DEGREE_OF_ONE))
     places = len({*abscissae, *(x - 1 for x in abscissae)})  # one fewer if both ends of a step are points
     through_most = max(2 * len(abscissae) - 2, INTERPOLATED)
@@ -62,7 +66,14 @@ def guess_tables(abscissae: Vector, lanes: int, through: Matrix | None = None) -
     if through is not None:
         tables = tuple(matrix_product(through, table) for table in tables)
     last_alone, last, before = (pad_matrix(table, lanes) for table in tables)
-    return GuessTables(last_alone=last_alone, last=last, before=before)
+    return GuessTables(
+        abscissae=lower_vector(abscissae),
+        degree=highest,
+        highest=pad_vector(legendre_functional(abscissae, highest), lanes),
+        last_alone=last_alone,
+        last=last,
+        before=before,
+    )
 
 
 def _wide(entries: Matrix, lanes: int) -> Matrix:

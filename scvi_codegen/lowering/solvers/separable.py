@@ -53,7 +53,8 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> SeparableSweep |
         return None
     product = matrix_product(tables.position, tables.momentum)
     drift = tuple(mp.fsum(line) for line in tables.position)
-    guess = guess_tables(tables.abscissae, lanes, through=product)
+    highest = min(len(tables.abscissae), len(tables.blocks)) - 1
+    guess = guess_tables(tables.abscissae, lanes, through=product, degree=highest)
     forms = forms_of(system)
     return SeparableSweep(
         points=len(tables.abscissae),

@@ -1,0 +1,99 @@
+"""Tables for steps that choose their own length on a ladder, h = 2^(k/4).
+
+What the points kept of the last step, or of the last two, is continued into the next by least-squares polynomials
+(:mod:`scvi_codegen.lowering.solvers.padding`); on a ladder there are few ratios of lengths, so each has its table. They
+are guesses: doubles serve, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004, section 2.2), in sums
+that round the same everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.sweeps import CurveSweep, LaneTable, SeparableSweep, Sweep
+from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
+
+__all__ = ["control_of"]
+
+RUNGS, REACH = 4, 2
+"""Rungs an octave, and how many of them a step may be from the one before for its guess to be continued."""
+MARGIN = 0.5
+"""Of the error allowed, what a longer step may be expected to use."""
+
+
+def control_of(sweep: Sweep, order: int) -> Control:
+    """The ladder of a fixed-point iteration whose method has this order."""
+    points, ratios = sweep.guess.abscissae, [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
+    alone = _tables(sweep, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
+    pairs = []
+    for ratio in ratios:
+        sources = (*points, *((x - 1.0) / ratio for x in points))
+        most = min(len(set(sources)) - 1, max(2 * len(points) - 2, INTERPOLATED), DEGREE_OF_TWO)
+        pairs.append(_tables(sweep, ratios, sources, most, (1.0, ratio)))
+    return Control(
+        mantissas=tuple(2.0 ** (k / RUNGS) for k in range(RUNGS)),
+        reach=REACH,
+        alone=tuple(table for (table,) in alone),
+        last=tuple(tuple(last for last, _ in line) for line in pairs),
+        before=tuple(tuple(before for _, before in line) for line in pairs),
+        growth=2.0 ** (sweep.error_power / RUNGS),
+        power=sweep.error_power / (order + 2),
+        margin=MARGIN,
+    )
+
+
+def _tables(
+    sweep: Sweep, ratios: Sequence[float], sources: Sequence[float], degree: int, ages: Sequence[float]
+) -> list[list[LaneTable]]:
+    """For each ratio of the next step to the last a table for each step that the sources are of.
+
+    ``ages``: the ratio of the last step to each of these, by which h a, where that is kept, is longer.
+    """
+    points, through = sweep.guess.abscissae, sweep.product.high if isinstance(sweep, SeparableSweep) else ()
+    count = len(points)
+    rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree)
+    tables = []
+    for k, ratio in enumerate(ratios):
+        scales = [ratio * age if isinstance(sweep, CurveSweep) else 1.0 for age in ages]
+        part = rows[k * count : (k + 1) * count]
+        tables.append(
+            [
+                _padded([[scale * x for x in row[n * count : (n + 1) * count]] for row in part], through, sweep.lanes)
+                for n, scale in enumerate(scales)
+            ]
+        )
+    return tables
+
+
+def least_squares(sources: Sequence[float], targets: Sequence[float], degree: int) -> list[list[float]]:
+    """From values at the sources to those of the least-squares polynomial at the targets."""
+    count, everywhere = len(sources), [*sources, *targets]
+    rows = [[0.0] * count for _ in targets]
+    before, here, norm_before = [0.0] * len(everywhere), [1.0] * len(everywhere), math.inf
+    for _ in range(degree + 1):
+        norm = math.fsum(value * value for value in here[:count])
+        for row, there in zip(rows, here[count:], strict=True):
+            row[:] = [entry + there * value / norm for entry, value in zip(row, here[:count], strict=True)]
+        centre = math.fsum(x * value * value for x, value in zip(sources, here, strict=False)) / norm
+        ratio = norm / norm_before
+        here, before = (
+            [(x - centre) * value - ratio * last for x, value, last in zip(everywhere, here, before, strict=True)],
+            here,
+        )
+        norm_before = norm
+    return rows
+
+
+def _padded(rows: list[list[float]], through: LaneTable, lanes: int) -> LaneTable:
+    """A square table, through another if there is one, with whole vectors as columns; rows beyond repeat the last."""
+    count = len(rows)
+    if through:
+        columns = list(zip(*rows, strict=True))
+        rows = [
+            [math.fsum(a * x for a, x in zip(line, column, strict=False)) for column in columns]
+            for line in through[:count]
+        ]
+    wide = [(*row, *(0.0,) * (lanes - count)) for row in rows]
+    return (*wide, *(wide[-1],) * (lanes - count))
