@@ -38,7 +38,6 @@ from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.waiting import waiting_for
-from scvi_codegen.rendering.control import with_control
 from scvi_codegen.rendering.events import with_events
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
@@ -107,7 +106,7 @@ def compile_stepper(
 
     @cache
     def controlled() -> Source | None:
-        text = remembered_text((*key, "controlled"), lambda: _text_of(_controlled(source, program())))
+        text = remembered_text((*key, "controlled"), lambda: _text_of(_controlled(program())))
         return Source.from_json(text) if text else None
 
     texts_of = json.loads(remembered_text((*key, "integrator"), texts))
@@ -122,10 +121,9 @@ def compile_stepper(
     )
 
 
-def _controlled(source: Source, program: Program) -> Source | None:
-    """The text with steps that choose their length, where there is a fixed-point iteration whose error is known."""
-    sweep = program.sweep
-    return with_control(source, program, control_of(sweep, program.order)) if sweep else None
+def _controlled(program: Program) -> Source | None:
+    """The text with steps that choose their length, where there is a fixed-point iteration."""
+    return render(program, control_of(program.sweep)) if program.sweep else None
 
 
 def _text_of(source: Source | None) -> str:

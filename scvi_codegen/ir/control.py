@@ -19,8 +19,6 @@ class Control:
         alone: by the change into the next step, -reach .. reach: from the last step to the next.
         last, before: by the changes into the last step and into the next: from these two steps.
         growth: of the error of a curve from rung to rung.
-        power: where the relative error of a step's end is e, that of its curve is e^power.
-        margin: part of what is allowed that is used when steps are made longer.
     """
 
     mantissas: tuple[float, ...]
@@ -29,5 +27,3 @@ class Control:
     last: tuple[tuple[LaneTable, ...], ...]
     before: tuple[tuple[LaneTable, ...], ...]
     growth: float
-    power: float
-    margin: float

@@ -31,6 +31,7 @@ from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import legendre_functional
 from scvi_codegen.tables.precision import Matrix
@@ -103,8 +104,10 @@ def lower(
 
 def _stage_highest(stages: StageSystem) -> tuple[float, ...]:
     """Where the unknowns are two or more velocities along the curve."""
-    points = stages.block_abscissae
-    return lower_vector(legendre_functional(points, len(points) - 1)) if len(points) > 1 else ()
+    shape = stages.shape
+    if not isinstance(shape, Velocities) or not 1 < len(shape.blocks) == len(set(shape.blocks)):
+        return ()
+    return lower_vector(legendre_functional(shape.blocks, len(shape.blocks) - 1))
 
 
 def _legendre_kernel(system: MechanicalSystem) -> Kernel:

@@ -7,6 +7,7 @@ notation it is the polynomial through the positions Q^v at the nodes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 
 from scvi_codegen.errors import MethodError
@@ -65,8 +66,18 @@ def galerkin_system(
         rounded: whether tables are those of doubles, or have all their digits.
     """
     size = len(end_position)
+    shape = exact = Velocities(
+        abscissae=abscissae,
+        blocks=blocks or abscissae,
+        position=position,
+        velocity=velocity,
+        end=tuple(end_position),
+        weights=tuple(weights),
+        variational=True,
+    )
     if rounded:
         end_position, position, weights = unit_sum(end_position), dyadic(position), unit_sum(weights)
+        shape = replace(exact, position=position, end=end_position, weights=weights, unrounded=exact)
     gathers = _curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(
         families=action_families(system, abscissae, (weights, *derivative_weights), gathers),
@@ -74,17 +85,7 @@ def galerkin_system(
         end_position=end_position,
         rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=end_position[b - 1]) for b in range(1, size + 1)),
         extrapolation=extrapolation,
-        shape=None
-        if derivatives
-        else Velocities(
-            abscissae=abscissae,
-            blocks=blocks or abscissae,
-            position=position,
-            velocity=velocity,
-            end=end_position,
-            weights=weights,
-            variational=True,
-        ),
+        shape=None if derivatives else shape,
     )
 
 

@@ -30,6 +30,7 @@ class Velocities(Shape):
         abscissae: (g,) of the points; blocks: (s,) of the velocities.
         position, velocity: (g, s); end: (s,); weights: (g,).
         variational: which of the two it is.
+        unrounded: the same, where these numbers are doubles that belong together.
     """
 
     abscissae: Vector
@@ -39,6 +40,7 @@ class Velocities(Shape):
     end: Vector
     weights: Vector
     variational: bool
+    unrounded: Velocities | None = None
 
 
 @dataclass(frozen=True, slots=True)

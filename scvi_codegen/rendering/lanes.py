@@ -78,6 +78,7 @@ class SweepText:
         kernels: with lanes.
         mass: the constant masses, if there are such.
         support: headers from the tables on.
+        error_defines, highest: macro and value, and the table, that the error of a curve is found with.
     """
 
     lanes: int
@@ -88,6 +89,8 @@ class SweepText:
     kernels: tuple[Kernel, ...]
     mass: Kernel | None
     support: tuple[str, ...]
+    error_defines: Mapping[str, str]
+    highest: str
 
     @property
     def inverse_roots(self) -> bool:
@@ -127,7 +130,21 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamilt
         kernels=sweep.kernels,
         mass=mass,
         support=(*meaning.before, "contraction", meaning.memory, *_support(sweep), *solver),
+        error_defines=_kept(sweep),
+        highest=_vector("HIGHEST", sweep.guess.highest),
     )
+
+
+def _kept(sweep: Sweep) -> dict[str, str]:
+    """What is kept of a step. Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations."""
+    velocities, degree = isinstance(sweep, PointSweep), sweep.guess.degree
+    forces = isinstance(sweep, SeparableSweep)
+    return {
+        "KEPT": str(len(sweep.guess.abscissae)),
+        "KEPT_VELOCITIES": str(int(velocities)),
+        "KEPT_UNIT(i)": "(data->square * data->inverse_mass[i])" if forces else "(step->h)",
+        "RESOLVED": f"{4 * degree - 2 if velocities else 1}.0",
+    }
 
 
 def _function(name: str) -> str:

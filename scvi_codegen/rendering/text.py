@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, TypeAlias, get_args
 
+from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.parts import parts
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
+from scvi_codegen.rendering.control import ladder_tables
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
@@ -90,9 +92,10 @@ class EventSearch:
     doubts: tuple[float, float]
 
 
-def render(program: Program) -> Source:
-    """Header and source of a program; equal programs give equal bytes."""
-    return _render(program.prefix, _context(program, DOUBLE))
+def render(program: Program, control: Control | None = None) -> Source:
+    """Header and source of a program; with control, steps that choose their length. Equal programs give equal bytes."""
+    ladder = tuple(ladder_tables(control, program.sweep.lanes)) if control and program.sweep else ()
+    return _render(program.prefix, _context(program, DOUBLE) | {"control": control, "ladder": ladder})
 
 
 def render_embedded(program: Program, precision: Embedded) -> Source:
@@ -199,6 +202,7 @@ def _context(program: Program, target: Target) -> dict[str, object]:
         "most_iterations": "INT_MAX",
         "embedded": False,
         "written_out": False,
+        "control": None,
         **_lane_context(program),
     }
 

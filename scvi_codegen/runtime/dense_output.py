@@ -15,15 +15,17 @@ A state takes 0.65 microseconds there, four times as long as a step of the run, 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import step_failure
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.times import times_after
 
 __all__ = ["checked_times", "grid_tolerance", "lengths_at", "states_at", "times_of_run"]
 
@@ -40,13 +42,33 @@ def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
         StepFailedError: if a step of a part of h fails.
     """
     times = _within(times, states.t[0], states.t[-1])
-    _check_on_grid(states)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
+    if states.goal is not None and np.isnan(states.lengths[:-1]).any():
+        return _run_to_each(states, left, times, states.goal)
+    _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
     whole = _whole_steps(times - t, np.nan_to_num(states.lengths[left], nan=np.inf))
     between = np.flatnonzero(whole)
     _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
     _take_parts(states, t, times - t, q, p)
+    return q, p
+
+
+def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal: Goal) -> tuple[Array, Array]:
+    """By steps that choose their length, from the state kept before each time."""
+    q, p = states.q[left], states.p[left]
+    for k in np.flatnonzero(times != states.t[left]):
+        memory = Memory.started(
+            states.stepper,
+            q[k],
+            p[k],
+            h=replace(goal, t_end=float(times[k])),
+            t=states.t[left[k]],
+            parameters=states.parameters,
+            options=states.options,
+        )
+        memory.run_to_goal()
+        q[k], p[k] = memory.q, memory.p
     return q, p
 
 
@@ -110,14 +132,14 @@ def checked_times(t: ArrayLike, name: str) -> Array:
     return times
 
 
-def times_of_run(t_eval: ArrayLike, t: float, h: float, steps: int) -> Array:
-    """(n,) times within a run of ``steps`` steps, sorted as it goes."""
+def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
+    """(n,) times within a run, sorted as it goes."""
     times = checked_times(t_eval, "t_eval")
     if times.ndim != 1:
         raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
-    if (np.diff(times) * h < 0.0).any():
+    if (np.diff(times) * (t_end - t) < 0.0).any():
         raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
-    return _within(times, t, float(times_after(t, h, steps)[0]))
+    return _within(times, t, t_end)
 
 
 def _within(times: Array, first: float, last: float) -> Array:

@@ -13,8 +13,8 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
-from scvi_codegen.native.arguments import checked_count
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.dense_output import times_of_run

@@ -18,7 +18,7 @@ from operator import mul
 from scvi_codegen.errors import MethodError
 from scvi_codegen.tables.nodes import point_count, to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp, settled
-from scvi_codegen.tables.quadrature import gauss_legendre
+from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
 
 __all__ = [
     "cardinal_integrals",
@@ -157,6 +157,17 @@ def cardinal_integrals(points: Iterable[Number], at: Iterable[Number], start: Nu
             values = [cardinal_row(numbers, weights, origin + half * (1 + x)) for x in rule.points]
             rows.append([half * mp.fdot(rule.weights, column) for column in zip(*values, strict=True)])
     return rounded(rows)
+
+
+def legendre_functional(points: Vector, degree: int) -> Vector:
+    """From values at the points in [0, 1] to the coefficient of P_degree(2x - 1) of the polynomial through them."""
+    rule = gauss_legendre((len(points) + degree) // 2 + 1)
+    values = cardinal_values(points, rule.abscissae)
+    weights = [
+        (2 * degree + 1) * w * legendre_value(degree, 2 * x - 1)
+        for x, w in zip(rule.abscissae, rule.unit_weights, strict=True)
+    ]
+    return tuple(mp.fdot(weights, column) for column in zip(*values, strict=True))
 
 
 def extrapolation(points: Iterable[Number], shift: Number, degree: int | None = None) -> Matrix:

@@ -26,7 +26,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   progress now = before_sweeps();
   int status = OK;
   if (*steps > 0)
-    continue_curve(past, *steps, z);
+    continue_curve(step, past, *steps, z);
   else
     status = start_velocities(step, z);
   if (status != OK)

@@ -40,8 +40,8 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   progress now = before_sweeps();
   int status = OK;
   if (*steps > 0) {
-    continue_curve(past, *steps, z);
-    continue_curve(past + 2 * M * LANES, *steps, force);
+    continue_curve(step, past, *steps, z);
+    continue_curve(step, past + 2 * M * LANES, *steps, force);
   } else {
     status = start_velocities(step, z);
     for (int i = 0; i < M; i++)

@@ -15,8 +15,9 @@ static inline coordinates *kept(history past, coordinates *own)
 }
 
 /* What is kept at the points, continued into this step from the last one or from the last two. */
-static inline void continue_curve(history past, long long steps, lanes (*x)[M])
+static inline void continue_curve(const step_data *step, history past, long long steps, lanes (*x)[M])
 {
+  (void)step;
   for (int i = 0; i < M; i++) {
     lanes next[S];
     for (int n = 0; n < S; n++)

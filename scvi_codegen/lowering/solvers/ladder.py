@@ -19,12 +19,10 @@ __all__ = ["control_of"]
 
 RUNGS, REACH = 4, 2
 """Rungs an octave, and how many of them a step may be from the one before for its guess to be continued."""
-MARGIN = 0.5
-"""Of the error allowed, what a longer step may be expected to use."""
 
 
-def control_of(sweep: Sweep, order: int) -> Control:
-    """The ladder of a fixed-point iteration whose method has this order."""
+def control_of(sweep: Sweep) -> Control:
+    """The ladder of a fixed-point iteration."""
     points, ratios = sweep.guess.abscissae, [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
     alone = _tables(sweep, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
     pairs = []
@@ -39,8 +37,6 @@ def control_of(sweep: Sweep, order: int) -> Control:
         last=tuple(tuple(last for last, _ in line) for line in pairs),
         before=tuple(tuple(before for _, before in line) for line in pairs),
         growth=2.0 ** (sweep.error_power / RUNGS),
-        power=sweep.error_power / (order + 2),
-        margin=MARGIN,
     )
 
 

@@ -25,7 +25,7 @@ from scvi_codegen.lowering.solvers.padding import (
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, tableau_tables, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods.shapes import Accelerations
+from scvi_codegen.methods.shapes import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product
 from scvi_codegen.tables.precision import mp
 
@@ -43,7 +43,7 @@ def separable_sweep(problem: StepProblem) -> SeparableSweep | None:
     if isinstance(shape, Accelerations):
         tables: VelocityTables | None = tableau_tables(shape.tableau.c, shape.tableau.A, shape.tableau.b)
     else:
-        tables = velocity_tables(shape)
+        tables = velocity_tables(shape.unrounded or shape if isinstance(shape, Velocities) else None)
     return _sweep(system, tables) if tables else None
 
 

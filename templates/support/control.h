@@ -1,0 +1,228 @@
+/* Steps that choose their own length. Before it: run.h, and the ladder: MANTISSA, GROWTH, LADDER_ALONE, LADDER_LAST,
+ * LADDER_BEFORE.
+ *
+ * Steps are roots of 2 to the power of a rung, so that a guess continues the curve of former steps by one of few tables:
+ * from the last step, for each change of rung into the next; from the last two, for each pair of changes. */
+enum {
+  OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
+  CHANGES = sizeof LADDER_ALONE / sizeof *LADDER_ALONE,
+  REACH = CHANGES / 2,
+  MOST_UP = 4 * OCTAVE, /* rungs, while the first step is looked for */
+  MOST_DOWN = 2 * OCTAVE /* after a step that failed */
+};
+
+#define USED_PART 0.5 /* of the error allowed, what a longer step may be expected to use */
+#define LITTLE 0.5 /* of the error that lets a step be two rungs longer: less is not measured */
+#define LAST_STEP 1e-6 /* a step that ends so near the end, as a part of it, ends there */
+#define FIRST_STEP DBL_EPSILON /* of the whole span: the first step tried */
+#define VANISHING 1e-22 /* beside the time, which has two doubles: a motion with such steps ends in a singularity */
+#define LEAST_ERROR (0.125 * DBL_EPSILON) /* allowed to a step: many of them stay below rounding */
+#define ITERATION_PART (1.0 / 256) /* of the error allowed to a step: that of its stage equations */
+
+/* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
+ * `few`, two below `fewer`. */
+typedef struct {
+  double most, few, fewer;
+} error_limits;
+
+static error_limits limits_of(double tolerance)
+{
+  const double most = pow(tolerance, 1.0 / ERROR_POWER);
+  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH)};
+  return limits;
+}
+
+static double length_of(long long rung)
+{
+  const long long octave = rung >= 0 ? rung / OCTAVE : -((OCTAVE - 1 - rung) / OCTAVE);
+  return ldexp(MANTISSA[rung - octave * OCTAVE], (int)octave);
+}
+
+/* The longest rung that is not longer than h > 0. */
+static long long rung_below(double h)
+{
+  int exponent;
+  long long rung;
+  frexp(h, &exponent);
+  for (rung = (long long)exponent * OCTAVE; length_of(rung) > h; rung--)
+    ;
+  return rung;
+}
+
+/* By how many rungs the next step is longer. The error is expected to go on growing as it did; where it fell, much of
+ * that may have been luck. */
+static int next_change(double error, double before, const error_limits *limits)
+{
+  const double expected = before > 0.0 && error > before ? error * smaller(error / before, GROWTH * GROWTH)
+                                                         : larger(error, before / (GROWTH * GROWTH));
+  if (expected > limits->most)
+    return expected > limits->most * GROWTH ? -2 : -1;
+  return expected < limits->fewer ? 2 : expected < limits->few;
+}
+
+/* The tables that continue the steps before into the next; whether there are any. */
+static inline int choose_tables(const run_memory *run, struct guess_tables *tables)
+{
+  const long long last = run->change_before + REACH, next = run->change + REACH;
+  if (next < 0 || next >= CHANGES || (run->guess == 2 && (last < 0 || last >= CHANGES)))
+    return 0;
+  tables->alone = LADDER_ALONE[next];
+  if (run->guess == 2) {
+    tables->last = LADDER_LAST[last][next];
+    tables->before = LADDER_BEFORE[last][next];
+  }
+  return 1;
+}
+
+/* What the trials of a step share. */
+typedef struct {
+  state now;
+  step_data step;
+  solver_data data;
+  struct guess_tables tables;
+  error_limits limits;
+  double t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low parts */
+  long long guess;
+  int last; /* whether the step ends at t_end */
+} trial;
+
+/* One trial of the step that the run is at: increments, and what their curve leaves unresolved, if more than `least`;
+ * infinity where there is none. */
+HOT void try_step(run_memory *run, trial *now, double least, const solver_options *options, solver_report *report)
+{
+  const double rest = (now->t_end - run->t) - run->t_low, length = length_of(run->rung);
+  int status;
+  now->last = length * (1.0 + LAST_STEP) >= fabs(rest);
+  report->t = now->step.t = run->t;
+  if (now->last || fabs(now->step.h) != length) {
+    now->step.h = now->last ? rest : copysign(length, rest);
+    prepare(&now->step, &now->data);
+  }
+  now->guess = now->last || !choose_tables(run, &now->tables) ? 0 : run->guess;
+  status = sweep(&now->step, &now->data, run->memory, &now->guess, now->dq, now->dp, options, report);
+  if (status == OK && reaches(now->now.q, now->dq) && reaches(now->now.p, now->dp))
+    now->error = curve_error(&now->step, &now->data, run->memory, now->dq, least);
+  else
+    now->error = INFINITY;
+}
+
+/* The first step: from one that is certainly too short by trial to one that is about right. */
+static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  const double span = fabs(now->t_end - run->t);
+  int up = MOST_UP;
+  run->rung = rung_below(run->h != 0.0 ? fabs(run->h) : span * FIRST_STEP);
+  try_step(run, now, 0.0, options, report);
+  while (now->error < now->limits.fewer && !now->last && up > 0) {
+    double error = now->error;
+    for (up = 0; up < MOST_UP && error * GROWTH <= now->limits.most; up++)
+      error *= GROWTH;
+    run->rung += up;
+    try_step(run, now, 0.0, options, report);
+  }
+}
+
+/* Shortens the step after a trial that failed, or whose error was too large; 0 if it is as good as nothing. */
+static int shorten(run_memory *run, const trial *now)
+{
+  double error = now->error;
+  int down = 0;
+  for (; down < MOST_DOWN && !(error <= now->limits.most); down++)
+    error /= GROWTH;
+  run->rung -= down > 1 ? down : 2;
+  run->guess = 0;
+  run->rejected++;
+  return length_of(run->rung) > VANISHING * (fabs(run->t) + DBL_EPSILON * fabs(now->t_end - run->t));
+}
+
+/* The step that the run is at, tried shorter and shorter until its error is allowed; 0 if it vanishes. */
+HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  const double least = LITTLE * now->limits.fewer;
+  if (run->error_before > 0.0)
+    try_step(run, now, least, options, report);
+  else
+    try_first_step(run, now, options, report);
+  while (!(now->error <= now->limits.most * GROWTH)) {
+    if (!shorten(run, now))
+      return 0;
+    try_step(run, now, least, options, report);
+  }
+  now->error = larger(now->error, least);
+  return 1;
+}
+
+/* Chooses the length of the next step. */
+static inline void choose_length(run_memory *run, const trial *now)
+{
+  const int change = next_change(now->error, run->error_before, &now->limits);
+  run->guess = now->guess;
+  run->change_before = run->change;
+  run->change = change;
+  run->rung += change;
+  run->error_before = now->error;
+  for (int k = change; k > 0; k--)
+    run->error_before *= GROWTH;
+  for (int k = change; k < 0; k++)
+    run->error_before /= GROWTH;
+}
+
+/* Makes the step that was found the state. */
+static inline void take_step(run_memory *run, trial *now)
+{
+  add_compensated(now->now.q, now->now.carry_q, now->dq);
+  add_compensated(now->now.p, now->now.carry_p, now->dp);
+  if (now->error > run->error) {
+    run->error = now->error;
+    run->error_t = run->t;
+  }
+  if (now->last) {
+    run->t = now->t_end;
+    run->t_low = 0.0;
+    run->guess = 0;
+  } else {
+    add_to_time(&run->t, &run->t_low, now->step.h);
+    choose_length(run, now);
+  }
+  run->step++;
+}
+
+int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long steps, long long every,
+    const double *parameters, const solver_options *options, double *t, double *q, double *p, int *iterations,
+    solver_report *report, double *workspace)
+{
+  solver_options standard = NAME(default_options)();
+  solver_report unread;
+  trial now = {.limits = limits_of(larger(tolerance, LEAST_ERROR)), .t_end = t_end};
+  const step_data step = {run->t, 0.0, now.now.q, now.now.p, now.now.carry_q, now.now.carry_p, parameters, workspace, 1,
+      &now.tables};
+  standard.tolerance = larger(DBL_EPSILON, ITERATION_PART * tolerance);
+  options = options ? options : &standard;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  memcpy(&now.step, &step, sizeof step);
+  load_state(run, &now.now);
+  if (run->direction * (t_end - run->t) < 0.0)
+    run->guess = 0;
+  run->direction = t_end < run->t ? -1 : 1;
+  while (report->steps < steps && run->t != t_end) {
+    const long long before = report->iterations;
+    if (!find_step(run, &now, options, report)) {
+      save_state(&now.now, run);
+      return STATUS(VANISHED);
+    }
+    take_step(run, &now);
+    run->iterations += report->iterations - before;
+    report->steps++;
+    if (run->step % every == 0 || run->t == t_end) {
+      const long long stored = report->stored++;
+      t[stored] = run->t;
+      memcpy(q + stored * M, now.now.q, sizeof(double) * M);
+      memcpy(p + stored * M, now.now.p, sizeof(double) * M);
+      iterations[stored] = (int)run->iterations;
+      run->iterations = 0;
+    }
+  }
+  save_state(&now.now, run);
+  return OK;
+}
