@@ -106,19 +106,31 @@ HOT void try_step(run_memory *run, trial *now, double least, const solver_option
     now->error = INFINITY;
 }
 
-/* The first step: from one that is certainly too short by trial to one that is about right. */
+/* By how many rungs the first step may be longer at once. */
+static int rungs_up(const trial *now)
+{
+  double error = now->error;
+  int up = 0;
+  if (error < now->limits.fewer)
+    for (; up < MOST_UP && error * GROWTH <= now->limits.most; up++)
+      error *= GROWTH;
+  return up;
+}
+
+/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail: where
+ * some velocities are zero, rounding leaves nothing of what they become. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const double span = fabs(now->t_end - run->t);
-  int up = MOST_UP;
+  int found = 0, up = 1;
   run->rung = rung_below(run->h != 0.0 ? fabs(run->h) : span * FIRST_STEP);
   try_step(run, now, 0.0, options, report);
-  while (now->error < now->limits.fewer && !now->last && up > 0) {
-    double error = now->error;
-    for (up = 0; up < MOST_UP && error * GROWTH <= now->limits.most; up++)
-      error *= GROWTH;
+  while (!now->last && up > 0) {
+    found = found || now->error < INFINITY;
+    up = found ? rungs_up(now) : MOST_UP;
     run->rung += up;
-    try_step(run, now, 0.0, options, report);
+    if (up > 0)
+      try_step(run, now, 0.0, options, report);
   }
 }
 

@@ -1,0 +1,15 @@
+/* The largest error of the steps of a run. Before it: largest_error of a solver, ERROR_POWER. */
+static void observe_error(run_memory *run, const step_data *step, const solver_data *data, const double *dq,
+    double *workspace)
+{
+  const double error = largest_error(run, step, data, dq, workspace);
+  if (error > run->error) {
+    run->error = error;
+    run->error_t = step->t;
+  }
+}
+
+double NAME(step_error)(const run_memory *run)
+{
+  return pow(run->error, ERROR_POWER);
+}

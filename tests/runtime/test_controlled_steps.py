@@ -1,0 +1,249 @@
+"""Steps that choose their own length: accuracy on exact motions, ends, refusals; the error of a step in every run."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+from mpmath import mp
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
+
+SPAN = 60.0
+
+
+@pytest.fixture(scope="module")
+def kepler():
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
+
+
+@pytest.fixture(scope="module")
+def pendulums():
+    return sc.compile_stepper(sc.problem("double-pendulum").system, sc.SVI(8))
+
+
+@pytest.fixture(scope="module")
+def atwood():
+    system = sc.LagrangianSystem.from_text(
+        name="atwood",
+        coordinates=["r", "th"],
+        lagrangian="(M + m)*r_dot**2/2 + m*r**2*th_dot**2/2 - g*r*(M - m*cos(th))",
+        parameters={"M": 1.7, "m": 1.0, "g": 1.0},
+    )
+    return sc.compile_stepper(system, sc.SVI(6))
+
+
+def orbit(e, anomaly=0.3):
+    """(q, p) on an ellipse of semi-axis 1."""
+    p = 1.0 - e * e
+    r = p / (1.0 + e * math.cos(anomaly))
+    return (
+        [r * math.cos(anomaly), r * math.sin(anomaly)],
+        [-math.sin(anomaly) / math.sqrt(p), (e + math.cos(anomaly)) / math.sqrt(p)],
+    )
+
+
+def exact_position(q, p, t):
+    """By Kepler's equation from exactly these doubles, in 40 digits, with Lagrange's coefficients."""
+    with mp.workdps(40):
+        (x, y), (u, v) = map(mp.mpf, q), map(mp.mpf, p)
+        r = mp.hypot(x, y)
+        a = 1 / (2 / r - (u * u + v * v))
+        n, cosine, sine = a ** mp.mpf("-1.5"), 1 - r / a, (x * u + y * v) / mp.sqrt(a)
+
+        def misfit(E):
+            return E - cosine * mp.sin(E) + sine * (1 - mp.cos(E)) - n * t
+
+        E = mp.findroot(misfit, (n * t - 1, n * t + 1), solver="anderson", tol=1e-70)
+        f, g = 1 - a / r * (1 - mp.cos(E)), t - (E - mp.sin(E)) / n
+        return np.array([float(f * x + g * u), float(f * y + g * v)])
+
+
+@pytest.mark.parametrize(("e", "error"), [(0.0, 1e-12), (0.2, 1e-12), (0.5, 1e-12), (0.9, 5e-12), (0.99, 5e-11)])
+def test_an_ellipse_is_followed_to_round_off_without_a_word_about_steps(kepler, e, error):
+    q, p = orbit(e)
+    run = kepler.integrate(q, p, t_end=SPAN)
+    assert run.t[-1] == SPAN
+    assert (np.diff(run.t) > 0.0).all()
+    assert np.abs(run.q[-1] - exact_position(q, p, SPAN)).max() < error
+    energy = run.energy()
+    assert np.abs(energy / energy[0] - 1.0).max() < (1e-12 if e > 0.9 else 3e-14)
+    assert np.abs(run.momentum_errors()).max() < 1e-13
+    assert run.steps == len(run) - 1
+    assert run.rejected <= 0.02 * run.steps
+    assert run.step_error < 1e-15
+    assert run.iterations.sum() < 6 * run.steps
+
+
+def test_steps_follow_the_motion(kepler):
+    run = kepler.integrate(*orbit(0.9), t_end=SPAN)
+    distance = np.hypot(*run.q[:-2].T)
+    near, far = np.diff(run.t)[:-1][distance < 0.2], np.diff(run.t)[:-1][distance > 1.5]
+    assert far.min() > 8.0 * near.max()
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10])
+@pytest.mark.parametrize("degree", [4, 8])
+def test_the_end_of_a_step_is_as_accurate_as_wanted(tolerance, degree):
+    problem, method = sc.problem("henon-heiles"), sc.SVI(degree)
+    stepper, reference = sc.compile_stepper(problem.system, method), sc.compile_stepper(problem.system, sc.SVI(12))
+    run = stepper.integrate([0.3, 0.2], [0.2, 0.3], t_end=30.0, tolerance=tolerance)
+    worst = 0.0
+    for q, p, end, h in zip(run.q[:-1], run.p[:-1], run.q[1:], np.diff(run.t), strict=True):
+        exact = reference.integrate(q, p, h=h / 8, steps=8, every=8).q[-1]
+        worst = max(worst, np.max(np.abs(end - exact) / (np.abs(q) + np.abs(end - q))))
+    assert worst < 3.0 * tolerance
+    assert run.steps < len(stepper.integrate([0.3, 0.2], [0.2, 0.3], t_end=30.0, tolerance=tolerance / 100.0))
+
+
+def test_back_in_time(kepler):
+    q, p = orbit(0.7)
+    there = kepler.integrate(q, p, t_end=-SPAN, t=1.0)
+    assert there.t[-1] == -SPAN
+    assert there.h < 0.0
+    back = kepler.integrate(there.q[-1], there.p[-1], t=-SPAN, t_end=1.0)
+    assert np.abs(back.q[-1] - q).max() < 3e-12
+    mirrored = kepler.integrate(q, [-p[0], -p[1]], t=0.0, t_end=SPAN + 1.0)
+    assert np.array_equal(mirrored.q, there.q)
+
+
+@pytest.mark.parametrize("method", [sc.Gauss(6), sc.SCVI(4), sc.SpectralCollocation(6)])
+def test_every_method_with_sweeps_has_them(method, pendulums):
+    stepper = sc.compile_stepper(sc.problem("double-pendulum").system, method)
+    start = [1.2, 0.4], stepper.momentum([1.2, 0.4], [0.0, 0.5])
+    run, same = stepper.integrate(*start, t_end=5.0), pendulums.integrate(*start, t_end=5.0)
+    assert np.abs(run.q[-1] - same.q[-1]).max() < 3e-12
+    energy = run.energy()
+    assert np.abs(energy / energy[0] - 1.0).max() < 1e-12
+
+
+def test_a_hamiltonian_has_them():
+    system = sc.HamiltonianSystem.from_text(
+        name="relativistic", coordinates=["x"], momenta=["p"], hamiltonian="sqrt(1 + p**2) + x**2/2"
+    )
+    run = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.5], t_end=30.0)
+    assert np.ptp(run.energy()) < 1e-13
+
+
+def test_the_swinging_atwood_machine(atwood):
+    q, v = [1.1, 0.8], [0.0, 0.2]
+    p = atwood.momentum(q, v)
+    run = atwood.integrate(q, p, t_end=100.0)
+    assert run.q[-1] == pytest.approx([0.68422174, -80.58341254], abs=1e-7)  # DOP853 at 1e-13: the same to 8 digits
+    assert np.abs(run.energy() / run.energy()[0] - 1.0).max() < 1e-13
+    assert run.rejected > 0
+
+
+@pytest.mark.parametrize(("h", "wrong"), [(1.0, True), (0.25, True), (0.01, False)])
+def test_a_step_that_converged_and_is_nonsense_is_said(atwood, h, wrong):
+    q, v = [1.1, 0.8], [0.0, 0.2]
+    run = atwood.integrate(q, atwood.momentum(q, v), h=h, steps=round(100.0 / h))
+    assert (run.step_error > 1e-3) == wrong
+    assert 0.0 <= run.step_error_t < 100.0
+
+
+def test_the_error_of_a_step_is_estimated_within_bounds(kepler):
+    q, p = orbit(0.5)
+    for h in (0.05, 0.1, 0.2, 0.4):
+        run = kepler.integrate(q, p, h=h, steps=1)
+        error = np.max(np.abs(run.q[-1] - exact_position(q, p, mp.mpf(h))) / (np.abs(q) + np.abs(run.q[-1] - q)))
+        assert error < 3.0 * run.step_error + 5e-16
+
+
+def test_newtons_iteration_estimates_it_too():
+    system = sc.problem("kepler").system
+    newton, sweeps = (sc.compile_stepper(system, sc.SVI(6), solver=solver) for solver in ("newton", "auto"))
+    q, p = orbit(0.6)
+    found = [stepper.integrate(q, p, h=0.2, steps=40) for stepper in (newton, sweeps)]
+    assert found[0].step_error_t == found[1].step_error_t
+    assert 0.01 < found[0].step_error / found[1].step_error < 100.0
+    assert math.isnan(sc.compile_stepper(system, sc.StoermerVerlet()).integrate(q, p, h=0.1, steps=3).step_error)
+
+
+def test_states_in_between_and_at_given_times(kepler):
+    q, p = orbit(0.6)
+    run = kepler.integrate(q, p, t_end=20.0)
+    times = np.linspace(0.0, 20.0, 13)
+    there, _ = run.at(times)
+    asked = kepler.integrate(q, p, t_end=20.0, t_eval=times)
+    thinned = kepler.integrate(q, p, t_end=20.0, every=7)
+    assert np.array_equal(asked.t, times)
+    assert np.array_equal(asked.q, there)
+    assert thinned.t[-1] == 20.0
+    assert len(thinned) == run.steps // 7 + 2
+    assert np.array_equal(thinned.q[:-1], run.q[::7])
+    assert np.abs(thinned.at(times)[0] - there).max() < 1e-12
+    for t, position in zip(times[1:], there[1:], strict=True):
+        assert np.abs(position - exact_position(q, p, t)).max() < 1e-12
+
+
+def test_events_are_found_and_end_a_run(kepler):
+    q, p = orbit(0.6, 0.0)
+    run = kepler.integrate(q, p, t_end=20.0, events="q2")
+    (crossings,) = run.events
+    assert crossings.t == pytest.approx(np.pi * np.arange(1, 7), abs=1e-12)
+    ended = kepler.integrate(q, p, t_end=20.0, events=sc.Event("q1", direction=1, terminal=True))
+    assert ended.t[-1] < 2.0 * np.pi
+    assert abs(ended.q[-1, 0]) < 1e-13
+
+
+def test_a_run_goes_on_bit_for_bit(kepler):
+    q, p = orbit(0.8)
+    whole = kepler.integrate(q, p, t_end=20.0)
+    run = kepler.start(q, p, t_end=20.0)
+    first = run.record(37)
+    again = kepler.restore(run.save(), t_end=20.0)
+    rest, pickled = again.record(), pickle.loads(pickle.dumps(run)).record()
+    assert first.steps == 37
+    assert np.array_equal(np.concatenate([first.t, rest.t[1:]]), whole.t)
+    assert np.array_equal(rest.q[-1], whole.q[-1])
+    assert np.array_equal(pickled.q, rest.q)
+    with pytest.raises(StateError, match="not a saved run"):
+        kepler.restore(run.save())
+
+
+def test_a_collision_is_refused_where_it_is(kepler):
+    with pytest.raises(StepFailedError, match="collision") as failure:
+        kepler.integrate([1.0, 0.0], [0.0, 0.0], t_end=2.0)
+    assert failure.value.t == pytest.approx(math.pi / math.sqrt(8.0), rel=1e-6)  # the time of free fall
+    assert len(failure.value.trajectory) > 10
+
+
+def test_what_rests_or_moves_freely_needs_few_steps():
+    free = sc.compile_stepper(
+        sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2"), sc.SVI(8)
+    )
+    run = free.integrate([0.0], [2.0], t_end=1000.0)
+    assert run.q[-1] == [2000.0]
+    assert run.steps < 40
+    assert free.integrate([3.0], [0.0], t_end=1000.0).q[-1] == [3.0]
+    assert len(free.integrate([3.0], [1.0], t=5.0, t_end=5.0)) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({}, "step h"),
+        ({"h": 0.1}, "number"),
+        ({"h": 0.1, "steps": 3, "t_end": 1.0}, "t_end"),
+        ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance"),
+        ({"t_end": 1.0, "steps": 3}, "leave out steps"),
+        ({"t_end": math.nan}, "t_end is nan"),
+        ({"t_end": 1.0, "tolerance": 0.0}, "between 0 and 1, not 0"),
+        ({"t_end": 1.0, "tolerance": 2.0}, "between 0 and 1, not 2"),
+        ({"t_end": 1.0, "every": 0}, "every"),
+        ({"t_end": 1.0, "t_eval": [2.0]}, "outside"),
+    ],
+)
+def test_a_wrong_argument_is_named(kepler, arguments, words):
+    with pytest.raises(StateError, match=words):
+        kepler.integrate([1.0, 0.0], [0.0, 1.0], **arguments)
+
+
+def test_methods_without_sweeps_say_so():
+    stepper = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
+    with pytest.raises(MethodError, match="fixed-point"):
+        stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
