@@ -122,8 +122,8 @@ def compile_stepper(
 
 
 def _controlled(program: Program) -> Source | None:
-    """The text with steps that choose their length, where there is a fixed-point iteration."""
-    return render(program, control_of(program.sweep)) if program.sweep else None
+    """The text with steps that choose their length, where there is a fixed-point iteration whose error is known."""
+    return render(program, control_of(program.sweep)) if program.sweep and program.error_power else None
 
 
 def _text_of(source: Source | None) -> str:

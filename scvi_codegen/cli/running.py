@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory import TOLERABLE_ERROR, Trajectory
 
 __all__ = [
     "RunOutcome",
@@ -105,6 +106,7 @@ def summary(model: Model, outcome: RunOutcome) -> str:
         lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory)
+        lines += worst_step(trajectory)
     return "\n".join([*lines, *final_state(run)])
 
 
@@ -123,6 +125,13 @@ def conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
     except StateError as error:
         yield f"energy: {error}"
     yield from momentum_report(trajectory)
+
+
+def worst_step(trajectory: Trajectory) -> Iterator[str]:
+    """How well the worst step was resolved, where the method has a curve that tells it."""
+    if math.isfinite(trajectory.step_error):
+        said = f"worst step: relative error about {trajectory.step_error:.1e}, from t = {trajectory.step_error_t:g}"
+        yield f"{said}; too long: take a shorter step" if trajectory.step_error > TOLERABLE_ERROR else said
 
 
 def final_state(run: Run) -> Iterator[str]:
@@ -146,4 +155,7 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
         p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
         iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
         lengths=np.concatenate([first.lengths, *(piece.lengths[1:] for piece in rest)]),
+        steps=pieces[-1].steps,
+        step_error=pieces[-1].step_error,
+        step_error_t=pieces[-1].step_error_t,
     )

@@ -173,7 +173,7 @@ class Integrator:
         if source is None:
             raise MethodError(
                 f"{self.interface.method} has no steps that choose their length for this system: they need a "
-                "fixed-point iteration (solver 'auto' or 'fixed-point'); give h and steps"
+                "fixed-point iteration (solver 'auto' or 'fixed-point') of two points or more; give h and steps"
             )
         if source == self._plain:
             return self

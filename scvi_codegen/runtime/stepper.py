@@ -88,10 +88,10 @@ class Stepper(Integrator):
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if run.goal is not None and steps is not None:
             raise StateError(f"steps that choose their length go to t_end={t_end}: leave out steps={steps}")
+        if t_eval is not None and every != 1:
+            raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
         if t_eval is None:
             return run.record(steps, every=every, progress=progress)
-        if every != 1:
-            raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
         return Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress)
 
     def integrate_ensemble(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,10 @@ if TYPE_CHECKING:
     from scvi_codegen.pictures.animation import Film
     from scvi_codegen.pictures.plots import Plots
 
-__all__ = ["Trajectory", "relative_changes"]
+__all__ = ["TOLERABLE_ERROR", "Trajectory", "relative_changes"]
+
+TOLERABLE_ERROR = 1e-3
+"""Of a step: one that is wrong by more is too long for its motion."""
 
 MOST_DRAWN, MOST_CURVES = 400, 6
 """States, and coordinates, that a notebook draws."""
@@ -144,13 +148,20 @@ class Trajectory(KeptStates):
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
         names = zip(self.stepper.parameters, self.parameters, strict=True)
         facts = (
-            ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, h = {self.h:g}")),
+            ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
             ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
             ("coordinates", listed(self.stepper.coordinates)),
             ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
             ("iterations", plain(f"{self.iterations.sum()}")),
+            *([("step error", plain(self._worst()))] if math.isfinite(self.step_error) else []),
         )
         return card(self.stepper.title, facts, grid(rows))
+
+    def _steps(self) -> str:
+        return f"{self.steps} steps of their own lengths, {self.rejected} rejected" if self.goal else f"h = {self.h:g}"
+
+    def _worst(self) -> str:
+        return f"about {self.step_error:.1e} relative in the step from t = {self.step_error_t:g}, the worst"
 
     def _energies(self, every: int) -> Array | None:
         """Of each so many states, ``None`` where a state has no energy."""

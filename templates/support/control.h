@@ -76,7 +76,7 @@ static inline int choose_tables(const run_memory *run, struct guess_tables *tabl
 
 /* What the trials of a step share. */
 typedef struct {
-  state now;
+  state at;
   step_data step;
   solver_data data;
   struct guess_tables tables;
@@ -90,17 +90,17 @@ typedef struct {
  * infinity where there is none. */
 HOT void try_step(run_memory *run, trial *now, double least, const solver_options *options, solver_report *report)
 {
-  const double rest = (now->t_end - run->t) - run->t_low, length = length_of(run->rung);
+  const double rest = (now->t_end - now->at.t) - now->at.t_low, length = length_of(run->rung);
   int status;
   now->last = length * (1.0 + LAST_STEP) >= fabs(rest);
-  report->t = now->step.t = run->t;
+  report->t = now->step.t = now->at.t;
   if (now->last || fabs(now->step.h) != length) {
     now->step.h = now->last ? rest : copysign(length, rest);
     prepare(&now->step, &now->data);
   }
   now->guess = now->last || !choose_tables(run, &now->tables) ? 0 : run->guess;
   status = sweep(&now->step, &now->data, run->memory, &now->guess, now->dq, now->dp, options, report);
-  if (status == OK && reaches(now->now.q, now->dq) && reaches(now->now.p, now->dp))
+  if (status == OK && reaches(now->at.q, now->dq) && reaches(now->at.p, now->dp))
     now->error = curve_error(&now->step, &now->data, run->memory, now->dq, least);
   else
     now->error = INFINITY;
@@ -121,7 +121,7 @@ static int rungs_up(const trial *now)
  * some velocities are zero, rounding leaves nothing of what they become. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const double span = fabs(now->t_end - run->t);
+  const double span = fabs(now->t_end - now->at.t);
   int found = 0, up = 1;
   run->rung = rung_below(run->h != 0.0 ? fabs(run->h) : span * FIRST_STEP);
   try_step(run, now, 0.0, options, report);
@@ -144,7 +144,7 @@ static int shorten(run_memory *run, const trial *now)
   run->rung -= down > 1 ? down : 2;
   run->guess = 0;
   run->rejected++;
-  return length_of(run->rung) > VANISHING * (fabs(run->t) + DBL_EPSILON * fabs(now->t_end - run->t));
+  return length_of(run->rung) > VANISHING * (fabs(now->at.t) + DBL_EPSILON * fabs(now->t_end - now->at.t));
 }
 
 /* The step that the run is at, tried shorter and shorter until its error is allowed; 0 if it vanishes. */
@@ -182,18 +182,18 @@ static inline void choose_length(run_memory *run, const trial *now)
 /* Makes the step that was found the state. */
 static inline void take_step(run_memory *run, trial *now)
 {
-  add_compensated(now->now.q, now->now.carry_q, now->dq);
-  add_compensated(now->now.p, now->now.carry_p, now->dp);
+  add_compensated(now->at.q, now->at.carry_q, now->dq);
+  add_compensated(now->at.p, now->at.carry_p, now->dp);
   if (now->error > run->error) {
     run->error = now->error;
-    run->error_t = run->t;
+    run->error_t = now->at.t;
   }
   if (now->last) {
-    run->t = now->t_end;
-    run->t_low = 0.0;
+    now->at.t = now->t_end;
+    now->at.t_low = 0.0;
     run->guess = 0;
   } else {
-    add_to_time(&run->t, &run->t_low, now->step.h);
+    add_to_time(&now->at.t, &now->at.t_low, now->step.h);
     choose_length(run, now);
   }
   run->step++;
@@ -206,35 +206,35 @@ int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long 
   solver_options standard = NAME(default_options)();
   solver_report unread;
   trial now = {.limits = limits_of(larger(tolerance, LEAST_ERROR)), .t_end = t_end};
-  const step_data step = {run->t, 0.0, now.now.q, now.now.p, now.now.carry_q, now.now.carry_p, parameters, workspace, 1,
+  const step_data step = {run->t, 0.0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
       &now.tables};
   standard.tolerance = larger(DBL_EPSILON, ITERATION_PART * tolerance);
   options = options ? options : &standard;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   memcpy(&now.step, &step, sizeof step);
-  load_state(run, &now.now);
+  load_state(run, &now.at);
   if (run->direction * (t_end - run->t) < 0.0)
     run->guess = 0;
   run->direction = t_end < run->t ? -1 : 1;
-  while (report->steps < steps && run->t != t_end) {
+  while (report->steps < steps && now.at.t != t_end) {
     const long long before = report->iterations;
     if (!find_step(run, &now, options, report)) {
-      save_state(&now.now, run);
+      save_state(&now.at, run);
       return STATUS(VANISHED);
     }
     take_step(run, &now);
     run->iterations += report->iterations - before;
     report->steps++;
-    if (run->step % every == 0 || run->t == t_end) {
+    if (run->step % every == 0 || now.at.t == t_end) {
       const long long stored = report->stored++;
-      t[stored] = run->t;
-      memcpy(q + stored * M, now.now.q, sizeof(double) * M);
-      memcpy(p + stored * M, now.now.p, sizeof(double) * M);
+      t[stored] = now.at.t;
+      memcpy(q + stored * M, now.at.q, sizeof(double) * M);
+      memcpy(p + stored * M, now.at.p, sizeof(double) * M);
       iterations[stored] = (int)run->iterations;
       run->iterations = 0;
     }
   }
-  save_state(&now.now, run);
+  save_state(&now.at, run);
   return OK;
 }
