@@ -105,7 +105,7 @@ def lower(
 def _stage_highest(stages: StageSystem) -> tuple[float, ...]:
     """Where the unknowns are two or more velocities along the curve."""
     shape = stages.shape
-    if not isinstance(shape, Velocities) or not 1 < len(shape.blocks) == len(set(shape.blocks)):
+    if not isinstance(shape, Velocities) or not 1 < len(shape.blocks) == len(set(shape.blocks)) == len(stages.blocks):
         return ()
     return lower_vector(legendre_functional(shape.blocks, len(shape.blocks) - 1))
 

@@ -214,7 +214,7 @@ int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long 
   memset(report, 0, sizeof *report);
   memcpy(&now.step, &step, sizeof step);
   load_state(run, &now.at);
-  if (run->direction * (t_end - run->t) < 0.0)
+  if ((double)run->direction * (t_end - run->t) < 0.0)
     run->guess = 0;
   run->direction = t_end < run->t ? -1 : 1;
   while (report->steps < steps && now.at.t != t_end) {
