@@ -1,0 +1,77 @@
+"""Tables of steps that choose their length, and the digits of the coefficients they stand on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.compiler import program_of
+from scvi_codegen.lowering.solvers.ladder import control_of
+from scvi_codegen.tables.basis import legendre_functional
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
+
+KEPLER = sc.problem("kepler").system
+
+
+@pytest.mark.parametrize("method", [sc.SVI(3), sc.SVI(8), sc.Gauss(5), sc.SVI(4, sc.gauss_lobatto(5))])
+def test_coefficients_have_106_bits(method):
+    sweep = program_of(KEPLER, method).sweep
+    c, b, q = (
+        [mp.mpf(high) + mp.mpf(low) for high, low in zip(split.high, split.low, strict=True)][: sweep.points]
+        for split in (sweep.drift, sweep.end_momentum, sweep.end_position)
+    )
+    product = [
+        [mp.mpf(high) + mp.mpf(low) for high, low in zip(*lines, strict=True)]
+        for lines in zip(sweep.product.high, sweep.product.low, strict=True)
+    ][: sweep.points]
+    for k in range(method.degree if isinstance(method, sc.SVI) else 5):
+        powers = [x**k for x in c]
+        assert abs(mp.fdot(b, powers) - mp.mpf(1) / (k + 1)) < 1e-31
+        assert abs(mp.fdot(q, powers) - mp.mpf(1) / (k + 1) / (k + 2)) < 1e-31
+    for line, x in zip(product, c, strict=True):
+        assert abs(mp.fsum(line) - x * x / 2) < 1e-31
+
+
+@pytest.mark.parametrize("system", [KEPLER, sc.problem("double-pendulum").system])
+@pytest.mark.parametrize("degree", [2, 8])
+def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree):
+    sweep = program_of(system, sc.SVI(degree)).sweep
+    control, same = control_of(sweep), control_of(sweep).reach
+    for found, wanted in (
+        (control.alone[same], sweep.guess.last_alone),
+        (control.last[same][same], sweep.guess.last),
+        (control.before[same][same], sweep.guess.before),
+    ):
+        assert np.allclose(found, wanted, rtol=0.0, atol=1e-13 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("method", [sc.SVI(6), sc.SpectralCollocation(6)])
+def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
+    system = sc.problem("double-pendulum").system
+    sweep = program_of(system, method).sweep
+    control, points = control_of(sweep), np.array(sweep.guess.abscissae)
+    accelerations = sweep.kind == "collocation"  # z = h a is kept
+
+    def curve(t):
+        return 1.0 + t - 2.0 * t**3 + t**5
+
+    for into_last in range(-2, 3):
+        for into_next in range(-2, 3):
+            h_before, h_last, h_next = 1.0, 2.0 ** (into_last / 4), 2.0 ** ((into_last + into_next) / 4)
+            scales = (h_before, h_last, h_next) if accelerations else (1.0, 1.0, 1.0)
+            before, last = scales[0] * curve(points - 1.0), scales[1] * curve(h_last * points)
+            wanted = scales[2] * curve(h_last + h_next * points)
+            tables = [np.array(each[into_last + 2][into_next + 2]) for each in (control.last, control.before)]
+            padded = [np.pad(values, (0, sweep.lanes - len(points))) for values in (last, before)]
+            found = sum(table @ values for table, values in zip(tables, padded, strict=True))
+            assert np.allclose(found[: len(points)], wanted, rtol=1e-8, atol=1e-8)
+
+
+def test_the_highest_coefficient_of_a_curve():
+    points = gauss_legendre(5).abscissae
+    functional = legendre_functional(points, 4)
+    values = [3 * legendre_value(4, 2 * x - 1) - legendre_value(3, 2 * x - 1) + 1 for x in points]
+    assert abs(mp.fdot(functional, values) - 3) < 1e-50
+    assert abs(mp.fsum(functional)) < 1e-50
