@@ -25,12 +25,12 @@ static inline coordinates *kept(history past, coordinates *own)
 struct guess_tables {
   const lanes *alone, *last, *before;
 };
-static const struct guess_tables OF_ONE_LENGTH = {LAST_ALONE, LAST, BEFORE};
 
 /* What is kept at the points, continued into this step from the last one or from the last two. */
 static inline void continue_curve(const step_data *step, const double *past, long long steps, lanes (*x)[M])
 {
-  const struct guess_tables *tables = step->tables ? step->tables : &OF_ONE_LENGTH;
+  const struct guess_tables of_one_length = {LAST_ALONE, LAST, BEFORE};
+  const struct guess_tables *tables = step->tables ? step->tables : &of_one_length;
   lanes before[1][M];
   lanes_load(past, x[0]);
   lanes_load(past + M * LANES, before[0]);
