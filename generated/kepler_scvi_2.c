@@ -385,6 +385,18 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #include "support/shooting_sweep.h"
 #include "support/newton_fallback.h"
 #include "support/sweep_solver.h"
+
+/* How the error of a curve is found, and the power of it that the relative error of the end of its step goes with. */
+#define KEPT 2
+#define KEPT_VELOCITIES 0
+#define KEPT_UNIT(i) (step->h)
+#define RESOLVED 1.0
+#define ERROR_POWER 1.5
+static const lanes HIGHEST = {-1.0, 1.0};
+
+#include "support/curve_error.h"
+#include "support/sweep_error.h"
+#include "support/observed_error.h"
 #else
 static const double EXTRAPOLATION[5][5] = {
     {1.0, 0.0, 0.0, 0.0, 0.0},
@@ -394,6 +406,7 @@ static const double EXTRAPOLATION[5][5] = {
     {0.0, 0.0, 0.0, 0.0, 1.0}};
 
 #include "support/newton_solver.h"
+#include "support/no_error.h"
 #endif
 
 #include "support/time.h"

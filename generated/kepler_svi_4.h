@@ -25,7 +25,8 @@ enum {
   KEPLER_SVI_4_OK = 0,
   KEPLER_SVI_4_NOT_CONVERGED = 1, /* max_iterations reached */
   KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix has no inverse */
-  KEPLER_SVI_4_NOT_FINITE = 3 /* an infinity or a NaN turned up */
+  KEPLER_SVI_4_NOT_FINITE = 3, /* an infinity or a NaN turned up */
+  KEPLER_SVI_4_VANISHED = 4 /* steps that choose their length became as good as nothing */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of
@@ -43,6 +44,7 @@ typedef struct {
   long long iterations; /* of the solver, over all steps */
   double change;        /* the last update, measured as above */
   double t;             /* start of the last step tried */
+  long long stored;     /* states, where steps choose their length */
 } kepler_svi_4_report;
 
 /* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
@@ -55,6 +57,7 @@ typedef struct {
   double memory[16];
   long long guess;      /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
+  double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
 } kepler_svi_4_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */
@@ -89,6 +92,9 @@ void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double 
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations,
     kepler_svi_4_report *report, double *workspace);
+/* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
+ * each step is resolved. Negative where the method has no curve that tells it. */
+double kepler_svi_4_step_error(const kepler_svi_4_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */
 int kepler_svi_4_discrete_legendre(double t, double h, const double *q0, const double *q1, const double *parameters,

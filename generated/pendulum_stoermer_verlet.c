@@ -155,6 +155,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 
 #include "support/splitting.h"
 
+#include "support/no_error.h"
 #include "support/time.h"
 #include "support/run.h"
 

@@ -26,7 +26,8 @@ enum {
   PENDULUM_STOERMER_VERLET_OK = 0,
   PENDULUM_STOERMER_VERLET_NOT_CONVERGED = 1, /* max_iterations reached */
   PENDULUM_STOERMER_VERLET_SINGULAR = 2, /* the Newton matrix has no inverse */
-  PENDULUM_STOERMER_VERLET_NOT_FINITE = 3 /* an infinity or a NaN turned up */
+  PENDULUM_STOERMER_VERLET_NOT_FINITE = 3, /* an infinity or a NaN turned up */
+  PENDULUM_STOERMER_VERLET_VANISHED = 4 /* steps that choose their length became as good as nothing */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of
@@ -44,6 +45,7 @@ typedef struct {
   long long iterations; /* of the solver, over all steps */
   double change;        /* the last update, measured as above */
   double t;             /* start of the last step tried */
+  long long stored;     /* states, where steps choose their length */
 } pendulum_stoermer_verlet_report;
 
 /* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
@@ -56,6 +58,7 @@ typedef struct {
   double memory[1];
   long long guess;      /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
+  double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
 } pendulum_stoermer_verlet_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */
@@ -83,6 +86,9 @@ void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t,
 int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long long steps, long long every, const double *parameters,
     const pendulum_stoermer_verlet_options *options, double *t, double *q, double *p, int *iterations,
     pendulum_stoermer_verlet_report *report, double *workspace);
+/* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
+ * each step is resolved. Negative where the method has no curve that tells it. */
+double pendulum_stoermer_verlet_step_error(const pendulum_stoermer_verlet_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */
 int pendulum_stoermer_verlet_discrete_legendre(double t, double h, const double *q0, const double *q1, const double *parameters,

@@ -32,7 +32,7 @@ static int first_curve(const step_data *step, const double *past, long long step
     memcpy(curve->v0, past + 2 * M * LANES, sizeof curve->v0);
     for (int i = 0; i < M; i++)
       curve->v0[i] = end_velocity(curve, i);
-    continue_curve(past, steps, curve->z);
+    continue_curve(step, past, steps, curve->z);
     return nearby_velocity(step, curve->v0);
   }
   for (int i = 0; i < M; i++)

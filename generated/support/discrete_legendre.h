@@ -9,7 +9,7 @@ int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, cons
   solver_report unread;
   const newton_data data = newton_in(workspace + SCRATCH);
   real v[M], start_p[M], increment[M];
-  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace, 1};
+  const step_data step = {t, h, q0, start_p, carry_q, carry_q, parameters, workspace, 1, NULL};
   int keep = 0, status;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);

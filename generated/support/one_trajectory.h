@@ -21,14 +21,22 @@ static inline coordinates *kept(history past, coordinates *own)
   return own;
 }
 
+/* Tables that continue what is kept at the points: from the last step, or from the last and the one before. */
+struct guess_tables {
+  const lanes *alone, *last, *before;
+};
+
 /* What is kept at the points, continued into this step from the last one or from the last two. */
-static inline void continue_curve(const double *past, long long steps, lanes (*x)[M])
+static inline void continue_curve(const step_data *step, const double *past, long long steps, lanes (*x)[M])
 {
+  const struct guess_tables of_one_length = {LAST_ALONE, LAST, BEFORE};
+  const struct guess_tables *tables = step->tables ? step->tables : &of_one_length;
   lanes before[1][M];
   lanes_load(past, x[0]);
   lanes_load(past + M * LANES, before[0]);
   for (int i = 0; i < M; i++)
-    x[0][i] = steps == 1 ? apply(LAST_ALONE, 0, x, i) : apply(LAST, 0, x, i) + apply(BEFORE, 0, before, i);
+    x[0][i] = steps == 1 ? apply(tables->alone, 0, x, i)
+                         : apply(tables->last, 0, x, i) + apply(tables->before, 0, before, i);
 }
 
 static inline void remember_curve(lanes (*x)[M], history past)

@@ -1,5 +1,5 @@
-/* One step, and runs of many with compensated sums. Before it: step.h, time.h, and prepare and solve of a solver, which
- * give the increments of a step. */
+/* One step, and runs of many with compensated sums. Before it: step.h, time.h, prepare and solve of a solver, which give
+ * the increments of a step, and observe_error. */
 
 solver_options NAME(default_options)(void)
 {
@@ -21,7 +21,7 @@ int NAME(step)(real t, real h, const real *q0, const real *p0, const real *param
 {
   const solver_options standard = NAME(default_options)();
   const real nothing[M] = {0};
-  const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace, 1};
+  const step_data step = {t, h, q0, p0, nothing, nothing, parameters, workspace, 1, NULL};
   solver_report unread;
   solver_data data;
   real *memory = workspace + SCRATCH, dq[2 * M] = {0}, dp[2 * M] = {0}; /* increments, then their low parts */
@@ -94,7 +94,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
 {
   const solver_options standard = NAME(default_options)();
   state now;
-  step_data step = {run->t, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1};
+  step_data step = {run->t, run->h, now.q, now.p, now.carry_q, now.carry_p, parameters, workspace, 1, NULL};
   solver_report unread;
   solver_data data;
   long long stored = 0;
@@ -116,6 +116,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
       save_state(&now, run);
       return status;
     }
+    observe_error(run, &step, &data, dq, workspace + SCRATCH);
     add_compensated(now.q, now.carry_q, dq);
     add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;

@@ -55,7 +55,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
       X[n][i] = base[n][i] = step->q0[i] + DRIFT[n] * drift[i];
   }
   if (*steps > 0) {
-    continue_curve(past, *steps, F);
+    continue_curve(step, past, *steps, F);
     for (int i = 0; i < M; i++)
       for (int n = 0; n < GROUPS; n++)
         X[n][i] += (data->square * data->inverse_mass[i]) * F[n][i];

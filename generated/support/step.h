@@ -7,4 +7,5 @@ typedef struct {
   const real *q0, *p0, *carry_q, *carry_p, *parameters;
   real *scratch; /* SCRATCH numbers */
   int first; /* whether the workspace holds nothing of the step before */
+  const struct guess_tables *tables; /* that continue the curve of former steps; NULL: those of steps of one length */
 } step_data;
