@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,21 +68,25 @@ def solve_motion(
     method: Method | None = None,
     h: float | None = None,
     tolerance: float = 1e-9,
+    rtol: float | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
     events: EventLike | Sequence[EventLike] | None = None,
     parameters: Mapping[str, float] | Sequence[float] | None = None,
     options: SolverOptions | None = None,
 ) -> Motion:
-    """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, for a run backward) with steps of one length.
+    """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, for a run backward).
+
+    By steps of one length, or with ``rtol`` by steps that choose their length.
 
     Args:
-        system: what moves; or its compiled stepper, which takes the place of ``method`` and needs ``h``.
+        system: what moves; or its compiled stepper, which takes the place of ``method`` and needs ``h`` or ``rtol``.
         t_span: two times.
         y0: (2 m,) initial positions, then momenta (:meth:`Stepper.momentum` gives them from velocities).
         method: by default ``SVI(8)``.
         h: longest step, taken a little shorter so that whole steps fill the span; by default :func:`advise` chooses it.
         tolerance: the error |q - q_exact| / |q| at the end that it then aims at.
+        rtol: the relative error of the end of each step, whose length is then its own; leave out ``h``.
         t_eval: (n,) times at which states are wanted; by default the ends of the steps.
         dense_output: whether ``sol`` is wanted, for which all steps are kept.
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
@@ -94,27 +98,24 @@ def solve_motion(
     start, end = _span(t_span)
     q, p = _halves(y0)
     if isinstance(system, Stepper):
-        if method is not None or h is None:
-            raise StateError("a compiled stepper has its method, and its step h must be given")
+        if method is not None or (h is None and rtol is None):
+            raise StateError("a compiled stepper has its method, and its step h, or rtol, must be given")
         stepper = system
     else:
         method = method or SVI(8)
         stepper = compile_stepper(system, method)
-        if h is None:
+        if h is None and rtol is None:
             advice = advise(
                 system, method, q, p, end - start, tolerance, t=start, parameters=parameters, options=options
             )
             h = advice.h
-    steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
-    h = (end - start) / steps
     asked = None if t_eval is None else times_of_run(t_eval, start, end)
     status, message, failure = REACHED, "The end of the span was reached.", None
     try:
         trajectory = stepper.integrate(
             q,
             p,
-            h=h,
-            steps=steps,
+            **_steps(start, end, h, rtol),
             t=start,
             parameters=parameters,
             options=options,
@@ -127,6 +128,15 @@ def solve_motion(
     if ended_by is not None and failure is None:
         status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
+
+
+def _steps(start: float, end: float, h: float | None, rtol: float | None) -> dict[str, Any]:
+    """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
+    if rtol is not None:
+        return {"h": h, "t_end": end, "tolerance": rtol}
+    assert h is not None
+    steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
+    return {"h": (end - start) / steps, "steps": steps}
 
 
 def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, status: int, message: str) -> Motion:
