@@ -53,6 +53,7 @@ class Integrator:
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
         self._ensemble, self._controlled = ensemble, controlled
+        self._with_control: Self | None = None
         self._plain = source
         self.source = _watching(source, interface, events) if events else source
         self.binding = Binding(building.load(self.source, flags=flags), interface.prefix, interface.workspace)
@@ -168,7 +169,12 @@ class Integrator:
         )
 
     def controlled(self) -> Self:
-        """The same integrator with steps that choose their length; MethodError where it has none."""
+        """The same integrator with steps that choose their length, loaded once; MethodError where it has none."""
+        if self._with_control is None:
+            self._with_control = self._loaded_with_control()
+        return self._with_control
+
+    def _loaded_with_control(self) -> Self:
         source = self._controlled()
         if source is None:
             raise MethodError(

@@ -16,7 +16,7 @@ enum {
 #define LAST_STEP 1e-6 /* a step that ends so near the end, as a part of it, ends there */
 #define FIRST_STEP DBL_EPSILON /* of the whole span: the first step tried */
 #define VANISHING 1e-22 /* beside the time, which has two doubles: a motion with such steps ends in a singularity */
-#define LEAST_ERROR (0.125 * DBL_EPSILON) /* allowed to a step: many of them stay below rounding */
+#define LEAST_ERROR (0.03125 * DBL_EPSILON) /* allowed to a step: a million of them add up to what rounding leaves */
 #define ITERATION_PART (1.0 / 256) /* of the error allowed to a step: that of its stage equations */
 
 /* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
