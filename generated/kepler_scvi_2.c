@@ -1,4 +1,5 @@
-/* Kepler problem: Spectral-collocation variational integrator, degree 2, chebyshev-lobatto nodes, gauss-legendre:2; see kepler_scvi_2.h. */
+/* Kepler problem: Spectral-collocation variational integrator, degree 2, chebyshev-lobatto nodes, gauss-legendre:2; see
+ * kepler_scvi_2.h. */
 #include "kepler_scvi_2.h"
 
 #include <float.h>

@@ -40,11 +40,11 @@ typedef struct {
 
 /* What a call did. */
 typedef struct {
-  long long steps;      /* completed */
+  long long steps; /* completed */
   long long iterations; /* of the solver, over all steps */
-  double change;        /* the last update, measured as above */
-  double t;             /* start of the last step tried */
-  long long stored;     /* states, where steps choose their length */
+  double change; /* the last update, measured as above */
+  double t; /* start of the last step tried */
+  long long stored; /* states, where steps choose their length */
 } kepler_scvi_2_report;
 
 /* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
@@ -55,7 +55,7 @@ typedef struct {
   double q[2], p[2];
   double carry_q[2], carry_p[2];
   double memory[14];
-  long long guess;      /* what memory holds of the steps before, 0 if nothing */
+  long long guess; /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
   double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
 } kepler_scvi_2_run;

@@ -40,11 +40,11 @@ typedef struct {
 
 /* What a call did. */
 typedef struct {
-  long long steps;      /* completed */
+  long long steps; /* completed */
   long long iterations; /* of the solver, over all steps */
-  double change;        /* the last update, measured as above */
-  double t;             /* start of the last step tried */
-  long long stored;     /* states, where steps choose their length */
+  double change; /* the last update, measured as above */
+  double t; /* start of the last step tried */
+  long long stored; /* states, where steps choose their length */
 } kepler_svi_4_report;
 
 /* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
@@ -55,7 +55,7 @@ typedef struct {
   double q[2], p[2];
   double carry_q[2], carry_p[2];
   double memory[16];
-  long long guess;      /* what memory holds of the steps before, 0 if nothing */
+  long long guess; /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
   double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
 } kepler_svi_4_run;
@@ -90,8 +90,8 @@ int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, co
  * */
 void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p);
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
-    const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations,
-    kepler_svi_4_report *report, double *workspace);
+    const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,
+    double *workspace);
 /* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
  * each step is resolved. Negative where the method has no curve that tells it. */
 double kepler_svi_4_step_error(const kepler_svi_4_run *run);

@@ -41,11 +41,11 @@ typedef struct {
 
 /* What a call did. */
 typedef struct {
-  long long steps;      /* completed */
+  long long steps; /* completed */
   long long iterations; /* of the solver, over all steps */
-  double change;        /* the last update, measured as above */
-  double t;             /* start of the last step tried */
-  long long stored;     /* states, where steps choose their length */
+  double change; /* the last update, measured as above */
+  double t; /* start of the last step tried */
+  long long stored; /* states, where steps choose their length */
 } pendulum_stoermer_verlet_report;
 
 /* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
@@ -56,7 +56,7 @@ typedef struct {
   double q[1], p[1];
   double carry_q[1], carry_p[1];
   double memory[1];
-  long long guess;      /* what memory holds of the steps before, 0 if nothing */
+  long long guess; /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
   double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
 } pendulum_stoermer_verlet_run;
@@ -69,31 +69,33 @@ int pendulum_stoermer_verlet_momentum(double t, const double *q, const double *v
     double *workspace);
 int pendulum_stoermer_verlet_velocity(double t, const double *q, const double *p, const double *parameters, double *v,
     double *workspace);
-int pendulum_stoermer_verlet_energy(double t, const double *q, const double *p, const double *parameters, double *energy,
-    double *workspace);
-/* The same at count states: t (count), q and p (count, m), energy (count). */
-int pendulum_stoermer_verlet_energies(long long count, const double *t, const double *q, const double *p, const double *parameters,
+int pendulum_stoermer_verlet_energy(double t, const double *q, const double *p, const double *parameters,
     double *energy, double *workspace);
+/* The same at count states: t (count), q and p (count, m), energy (count). */
+int pendulum_stoermer_verlet_energies(long long count, const double *t, const double *q, const double *p,
+    const double *parameters, double *energy, double *workspace);
 
 /* One step from (q0, p0) at t to (q1, p1) at t + h; depends on nothing but its arguments. h < 0 goes back. */
 int pendulum_stoermer_verlet_step(double t, double h, const double *q0, const double *p0, const double *parameters,
-    const pendulum_stoermer_verlet_options *options, double *q1, double *p1, pendulum_stoermer_verlet_report *report, double *workspace);
+    const pendulum_stoermer_verlet_options *options, double *q1, double *p1, pendulum_stoermer_verlet_report *report,
+    double *workspace);
 
 /* A run with compensated sums and extrapolated guesses: start it, then advance it as often as wanted. Every `every`
  * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k).
  * */
-void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t, double h, const double *q, const double *p);
-int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long long steps, long long every, const double *parameters,
-    const pendulum_stoermer_verlet_options *options, double *t, double *q, double *p, int *iterations,
-    pendulum_stoermer_verlet_report *report, double *workspace);
+void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t, double h, const double *q,
+    const double *p);
+int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long long steps, long long every,
+    const double *parameters, const pendulum_stoermer_verlet_options *options, double *t, double *q, double *p,
+    int *iterations, pendulum_stoermer_verlet_report *report, double *workspace);
 /* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
  * each step is resolved. Negative where the method has no curve that tells it. */
 double pendulum_stoermer_verlet_step_error(const pendulum_stoermer_verlet_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */
-int pendulum_stoermer_verlet_discrete_legendre(double t, double h, const double *q0, const double *q1, const double *parameters,
-    const pendulum_stoermer_verlet_options *options, double *p0, double *p1, double *action, pendulum_stoermer_verlet_report *report,
-    double *workspace);
+int pendulum_stoermer_verlet_discrete_legendre(double t, double h, const double *q0, const double *q1,
+    const double *parameters, const pendulum_stoermer_verlet_options *options, double *p0, double *p1, double *action,
+    pendulum_stoermer_verlet_report *report, double *workspace);
 
 #ifdef __cplusplus
 }

@@ -1,4 +1,5 @@
-/* planar pendulum: Spectral-collocation variational integrator, degree 1, chebyshev-lobatto nodes, gauss-legendre:2; see two_point_pendulum.h. */
+/* planar pendulum: Spectral-collocation variational integrator, degree 1, chebyshev-lobatto nodes, gauss-legendre:2;
+ * see two_point_pendulum.h. */
 #include "two_point_pendulum.h"
 
 #include <float.h>

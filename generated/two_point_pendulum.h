@@ -41,11 +41,11 @@ typedef struct {
 
 /* What a call did. */
 typedef struct {
-  long long steps;      /* completed */
+  long long steps; /* completed */
   long long iterations; /* of the solver, over all steps */
-  double change;        /* the last update, measured as above */
-  double t;             /* start of the last step tried */
-  long long stored;     /* states, where steps choose their length */
+  double change; /* the last update, measured as above */
+  double t; /* start of the last step tried */
+  long long stored; /* states, where steps choose their length */
 } two_point_pendulum_report;
 
 /* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
@@ -56,7 +56,7 @@ typedef struct {
   double q[1], p[1];
   double carry_q[1], carry_p[1];
   double memory[4];
-  long long guess;      /* what memory holds of the steps before, 0 if nothing */
+  long long guess; /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
   double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
 } two_point_pendulum_run;
@@ -72,12 +72,13 @@ int two_point_pendulum_velocity(double t, const double *q, const double *p, cons
 int two_point_pendulum_energy(double t, const double *q, const double *p, const double *parameters, double *energy,
     double *workspace);
 /* The same at count states: t (count), q and p (count, m), energy (count). */
-int two_point_pendulum_energies(long long count, const double *t, const double *q, const double *p, const double *parameters,
-    double *energy, double *workspace);
+int two_point_pendulum_energies(long long count, const double *t, const double *q, const double *p,
+    const double *parameters, double *energy, double *workspace);
 
 /* One step from (q0, p0) at t to (q1, p1) at t + h; depends on nothing but its arguments. h < 0 goes back. */
 int two_point_pendulum_step(double t, double h, const double *q0, const double *p0, const double *parameters,
-    const two_point_pendulum_options *options, double *q1, double *p1, two_point_pendulum_report *report, double *workspace);
+    const two_point_pendulum_options *options, double *q1, double *p1, two_point_pendulum_report *report,
+    double *workspace);
 
 /* A run with compensated sums and extrapolated guesses: start it, then advance it as often as wanted. Every `every`
  * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k).
@@ -91,9 +92,9 @@ int two_point_pendulum_advance(two_point_pendulum_run *run, long long steps, lon
 double two_point_pendulum_step_error(const two_point_pendulum_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */
-int two_point_pendulum_discrete_legendre(double t, double h, const double *q0, const double *q1, const double *parameters,
-    const two_point_pendulum_options *options, double *p0, double *p1, double *action, two_point_pendulum_report *report,
-    double *workspace);
+int two_point_pendulum_discrete_legendre(double t, double h, const double *q0, const double *q1,
+    const double *parameters, const two_point_pendulum_options *options, double *p0, double *p1, double *action,
+    two_point_pendulum_report *report, double *workspace);
 
 #ifdef __cplusplus
 }

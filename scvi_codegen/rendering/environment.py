@@ -12,7 +12,7 @@ from jinja2.runtime import Context
 from scvi_codegen.files.templates import template_folder
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.rendering.functions import kernel_text, lane_kernel_text, lane_mass_text
-from scvi_codegen.rendering.layout import table, wrapped
+from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototypes
 from scvi_codegen.rendering.printer import print_number
 
 __all__ = ["support_text", "template_environment"]
@@ -90,6 +90,8 @@ FILTERS: dict[str, Callable[..., object]] = {
     "lane_mass_text": _lane_mass_text,
     "transposed": lambda rows: tuple(zip(*rows, strict=True)),
     "wrapped": wrapped,
+    "wrapped_comment": wrapped_comment,
+    "wrapped_prototypes": wrapped_prototypes,
 }
 
 

@@ -6,11 +6,12 @@ import re
 import textwrap
 from collections.abc import Sequence
 
-__all__ = ["WIDTH", "table", "wrapped", "wrapped_comment"]
+__all__ = ["WIDTH", "table", "wrapped", "wrapped_comment", "wrapped_prototypes"]
 
 WIDTH = 120
 CONTINUATION = 4
 OPERATOR = re.compile(r" ([-+*/=]) ")
+PROTOTYPE = re.compile(r"^\w+ \w+\([^;{]*\);$", re.MULTILINE)
 
 
 def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]]) -> str:
@@ -41,6 +42,16 @@ def wrapped(statement: str, indent: int = 2) -> str:
 def wrapped_comment(text: str) -> str:
     """A comment in the first column."""
     return "\n".join(_lines(f"/* {text} */", "", " * "))
+
+
+def wrapped_prototypes(text: str) -> str:
+    """The text with every prototype in it broken between arguments, and only where it is too long."""
+    return PROTOTYPE.sub(lambda found: _wrapped_prototype(" ".join(found[0].split())), text)
+
+
+def _wrapped_prototype(prototype: str) -> str:
+    arguments = prototype.replace(" ", "\0").replace(",\0", ", ")  # no break within an argument
+    return "\n".join(_lines(arguments, "", " " * CONTINUATION)).replace("\0", " ")
 
 
 def _lines(text: str, first: str, following: str) -> list[str]:
