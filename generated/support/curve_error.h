@@ -1,11 +1,11 @@
-/* What the curve of a step leaves unresolved. Before it: a sweep, the table HIGHEST; KEPT, how many numbers are kept of a
- * coordinate, KEPT_VELOCITIES, whether they are velocities, KEPT_UNIT(i), what they move coordinate i by on a step, and
- * RESOLVED, what makes the highest coefficient that of the curve's accelerations. */
+/* What the curve of a step leaves unresolved. Before it: a sweep, the table HIGHEST; KEPT, how many numbers are kept of
+ * a coordinate, KEPT_VELOCITIES, whether they are velocities, KEPT_UNIT(i), what they move coordinate i by on a step,
+ * and RESOLVED, what makes the highest coefficient that of the curve's accelerations. */
 
 #define NEGLIGIBLE 1e-12 /* of displacements relative to the state: rounding leaves no curve of them */
 
-/* Of each coordinate, with everything as a part of its size: the square of what the highest coefficient moves it by, over
- * what the curve bends it by. Returned is the largest of these, or `least` if that is larger. */
+/* Of each coordinate, with everything as a part of its size: the square of what the highest coefficient moves it by,
+ * over what the curve bends it by. Returned is the largest of these, or `least` if that is larger. */
 static double curve_error(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
     double least)
 {
@@ -15,7 +15,8 @@ static double curve_error(const step_data *step, const sweep_data *data, const d
   for (int i = 0; i < M; i++) {
     const double *x = memory + i * LANES;
     const double size = fabs(step->q0[i]) + fabs(dq[i]) + DBL_EPSILON * largest + DBL_MIN, unit = KEPT_UNIT(i) / size;
-    const double ends = KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0]) : fabs(x[0]) + fabs(x[KEPT - 1]);
+    const double ends = KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0])
+                                        : fabs(x[0]) + fabs(x[KEPT - 1]);
     const double bend = fabs(unit) * ends + NEGLIGIBLE;
     lanes all;
     double top;

@@ -1,5 +1,5 @@
-/* One step, and runs of many with compensated sums. Before it: step.h, time.h, prepare and solve of a solver, which give
- * the increments of a step, and observe_error. */
+/* One step, and runs of many with compensated sums. Before it: step.h, time.h, prepare and solve of a solver, which
+ * give the increments of a step, and observe_error. */
 
 solver_options NAME(default_options)(void)
 {

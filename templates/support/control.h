@@ -1,8 +1,8 @@
 /* Steps that choose their own length. Before it: run.h, and the ladder: MANTISSA, GROWTH, LADDER_ALONE, LADDER_LAST,
  * LADDER_BEFORE.
  *
- * Steps are roots of 2 to the power of a rung, so that a guess continues the curve of former steps by one of few tables:
- * from the last step, for each change of rung into the next; from the last two, for each pair of changes. */
+ * Steps are roots of 2 to the power of a rung, so that a guess continues the curve of former steps by one of few
+ * tables: from the last step, for each change of rung into the next; from the last two, for each pair of changes. */
 enum {
   OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
   CHANGES = sizeof LADDER_ALONE / sizeof *LADDER_ALONE,
@@ -117,8 +117,8 @@ static int rungs_up(const trial *now)
   return up;
 }
 
-/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail: where
- * some velocities are zero, rounding leaves nothing of what they become. */
+/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail:
+ * where some velocities are zero, rounding leaves nothing of what they become. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const double span = fabs(now->t_end - now->at.t);
