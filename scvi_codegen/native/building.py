@@ -22,7 +22,8 @@ import sys
 import sysconfig
 import tempfile
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -38,7 +39,7 @@ from scvi_codegen.files.cache import (
     touch,
     trusted_folder,
 )
-from scvi_codegen.native.processes import run_to_end
+from scvi_codegen.native.processes import running
 from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.source import Source
 
@@ -256,35 +257,43 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
-    from cffi import FFI  # only building needs the parser; loading does not
-    from cffi.recompiler import make_c_source  # what FFI.emit_c_code calls, without its message on stdout
-
+    """Parts and binding at the same time, each in a process; then one library of them."""
     for name, text in source.files.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
-    binding = FFI()
-    binding.cdef("".join(each.declarations for each in source.sources))
-    preamble = "".join(f'#include "{each.prefix}.h"\n' for each in source.sources)
-    binding.set_source(folder.name, preamble)
-    make_c_source(binding, folder.name, preamble, str(folder / "binding.c"), verbose=False)
     include = sysconfig.get_paths()["include"]
     python = [] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
     shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
     wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
-    _run([*compiler, *shared, "-O1", "-c", "binding.c", "-o", "binding.o"], folder)
-    parts = [f"{each.prefix}.o" for each in source.sources]
-    objects = ["-shared", *wanted, *python, "binding.o", *parts]
+    parts = [each.prefix for each in source.sources]
+    objects = ["-shared", *wanted, *python, *(f"{name}.o" for name in ("binding", *parts))]
     for define, libraries in _mathematics(flags):
-        for each in source.sources:
-            _run([*compiler, *shared, *flags, *define, *wanted, "-c", f"{each.prefix}.c"], folder)
+        with ExitStack() as ended:
+            for name in parts:
+                command = [*compiler, *shared, *flags, *define, *wanted, "-c", f"{name}.c"]
+                ended.enter_context(_finished(command, folder))
+            if not (folder / "binding.c").exists():
+                _write_binding(source, folder)
+                ended.enter_context(_finished([*compiler, *shared, "-O1", "-c", "binding.c"], folder))
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
         except BuildError:
             if not define:
                 raise
-    for name in ("binding.o", *parts, "binding.c"):
+    for name in ("binding.c", "binding.o", *(f"{name}.o" for name in parts)):
         (folder / name).unlink()
+
+
+def _write_binding(source: Source, folder: Path) -> None:
+    from cffi import FFI  # only building needs the parser; loading does not
+    from cffi.recompiler import make_c_source  # what FFI.emit_c_code calls, without its message on stdout
+
+    binding = FFI()
+    binding.cdef("".join(each.declarations for each in source.sources))
+    preamble = "".join(f'#include "{each.prefix}.h"\n' for each in source.sources)
+    binding.set_source(folder.name, preamble)
+    make_c_source(binding, folder.name, preamble, str(folder / "binding.c"), verbose=False)
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
@@ -298,15 +307,24 @@ def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
 
 
 def _run(command: list[str], folder: Path) -> None:
-    try:
-        result = run_to_end(command, folder, COMPILE_SECONDS)
-    except subprocess.TimeoutExpired as error:
-        raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
-    if result.returncode in NOT_RUN:
-        raise BuildError(f"the compiler {command[0]!r} does not run: {result.stderr.strip()}")
-    if result.returncode:
-        hint = _header_hint(result.stderr)
-        shown = "\n".join(result.stderr.splitlines()[:30])
+    with _finished(command, folder):
+        pass
+
+
+@contextmanager
+def _finished(command: list[str], folder: Path) -> Iterator[None]:
+    """A command that runs beside what is done in the context, whose end waits for it; BuildError where it fails."""
+    with running(command, folder) as process:
+        yield
+        try:
+            _, errors = process.communicate(timeout=COMPILE_SECONDS)
+        except subprocess.TimeoutExpired as error:
+            raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
+    if process.returncode in NOT_RUN:
+        raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}")
+    if process.returncode:
+        hint = _header_hint(errors)
+        shown = "\n".join(errors.splitlines()[:30])
         raise BuildError(f"the C compiler refused the text{hint}\n{' '.join(command)}\n{shown}")
 
 

@@ -5,24 +5,22 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["run_to_end"]
+__all__ = ["running"]
 
 GUARDED = 'exec 3<&0 </dev/null; (read -r end <&3; kill -KILL 0) >/dev/null 2>&1 & exec 3<&-; exec "$@"'
 """The program, and beside it in its process group what ends them all when the pipe from Python closes, as it does also
 where Python is killed."""
 
 
-def run_to_end(command: Sequence[str], folder: Path, seconds: float) -> subprocess.CompletedProcess[str]:
-    """Run a program in a folder, its temporary files there too; ended with all its children if anything ends the wait.
+@contextmanager
+def running(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A program in a folder, its temporary files there too; ended with all its children when the context is left.
 
     A program that cannot be run has the status 126 or 127, as of a shell.
-
-    Raises:
-        subprocess.TimeoutExpired: after so many seconds.
     """
     held, pipe = os.pipe()
     try:
@@ -38,11 +36,10 @@ def run_to_end(command: Sequence[str], folder: Path, seconds: float) -> subproce
             start_new_session=True,
         ) as process:
             try:
-                output, errors = process.communicate(timeout=seconds)
+                yield process
             finally:
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
     finally:
         os.close(held)
         os.close(pipe)
-    return subprocess.CompletedProcess(command, process.returncode, output, errors)

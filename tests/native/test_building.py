@@ -53,13 +53,13 @@ def entries(cache: Path) -> list[Path]:
 def compiler_runs(monkeypatch) -> list[list[str]]:
     """A growing list of the commands run from now on."""
     commands: list[list[str]] = []
-    run = building.run_to_end
+    run = building.running
 
-    def recorded(command, folder, seconds):
+    def recorded(command, folder):
         commands.append(command)
-        return run(command, folder, seconds)
+        return run(command, folder)
 
-    monkeypatch.setattr(building, "run_to_end", recorded)
+    monkeypatch.setattr(building, "running", recorded)
     return commands
 
 

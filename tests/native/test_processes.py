@@ -15,7 +15,7 @@ import pytest
 from scvi_codegen.errors import BuildError
 from scvi_codegen.native import building, waiting
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.native.processes import run_to_end
+from scvi_codegen.native.processes import running
 from scvi_codegen.rendering.source import Source
 
 SLOW_COMPILER = """#!/bin/sh
@@ -88,8 +88,36 @@ def test_a_compiler_that_takes_too_long_is_ended(slow_compiler, monkeypatch):
 
 
 def test_output_status_and_temporary_files_are_those_of_the_program(tmp_path):
-    result = run_to_end(["sh", "-c", 'echo "$TMPDIR"; echo no >&2; exit 3', "name"], tmp_path, 10)
-    assert (result.stdout, result.stderr, result.returncode) == (f"{tmp_path}\n", "no\n", 3)
+    with running(["sh", "-c", 'echo "$TMPDIR"; echo no >&2; exit 3', "name"], tmp_path) as process:
+        assert process.communicate(timeout=10) == (f"{tmp_path}\n", "no\n")
+    assert process.returncode == 3
+
+
+MEETING_COMPILER = """#!/bin/sh
+case "$*" in *" -c "*) ;; *) exec cc "$@" ;; esac
+touch "{folder}/$$"
+for _ in $(seq 200); do
+  [ $(ls {folder} | wc -l) -ge 2 ] && exec cc "$@"
+  sleep 0.05
+done
+exit 1
+"""
+"""Compiles nothing before another compiles, too."""
+
+
+def test_text_and_binding_are_compiled_at_the_same_time(tmp_path, monkeypatch):
+    script, folder = tmp_path / "meeting-cc", tmp_path / "met"
+    folder.mkdir()
+    script.write_text(MEETING_COMPILER.format(folder=folder))
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
+    text = {
+        "header": "int met(void);\n",
+        "code": "int met(void)\n{\n  return 2;\n}\n",
+        "declarations": "int met(void);",
+    }
+    assert building.load(Source(prefix="met", **text), flags=PORTABLE_FLAGS).lib.met() == 2
 
 
 def told(monkeypatch, seconds: float, patience: float) -> list[str]:
