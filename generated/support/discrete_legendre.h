@@ -1,7 +1,7 @@
 /* The discrete Lagrangian and its Legendre transforms. Before it: newton.h, and action, which sums the Lagrangian along
  * the curve given by z. */
 
-int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
+SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
 {
   const solver_options standard = NAME(default_options)();

@@ -1,5 +1,5 @@
 /* Where sweeps fail, Newton's iteration. Before it: newton.h. */
-static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)
 {
   const newton_data newtons = newton_in(workspace);

@@ -4,6 +4,13 @@
 #pragma clang diagnostic ignored "-Wunused-function" /* a method takes what it needs of what is inline here */
 #endif
 
+/* What is seldom run, with all that only it calls, is compiled for size: in half the time. */
+#ifdef __GNUC__
+#define SELDOM __attribute__((cold))
+#else
+#define SELDOM
+#endif
+
 /* fmax without its care for NaN, and without a call. */
 static inline real larger(real a, real b)
 {

@@ -21,8 +21,8 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
   return status;
 }
 
-/* The increments by sweeps from the curve continued from so many former steps as guess says, or afresh if there are none
- * or it leads nowhere. On success guess says from how many steps the next is continued. */
+/* The increments by sweeps from the curve continued from so many former steps as guess says, or afresh if there are
+ * none or it leads nowhere. On success guess says from how many steps the next is continued. */
 HOT int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
     const solver_options *options, solver_report *report, double *workspace)
 {
