@@ -53,8 +53,7 @@ def functions_of(code: str) -> dict[str, Function]:
 
 
 def _preprocessed(code: str) -> str:
-    """With the macros in function heads replaced: NAME begins an exported name, HOT says how a function is stored, SELDOM
-    how it is optimised."""
+    """With the macros in function heads replaced: NAME begins exported names, HOT and SELDOM say how to optimise."""
     prefix, stored = re.search(r"^#define NAME\(word\) (\w+)##word", code, re.MULTILINE), HOT.search(code)
     text = re.sub(r"\bNAME\((\w+)\)", rf"{prefix[1]}\1", code) if prefix else code
     text = re.sub(r"^(static )?SELDOM ", r"\1", text, flags=re.MULTILINE)
