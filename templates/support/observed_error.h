@@ -3,7 +3,7 @@ static void observe_error(run_memory *run, const step_data *step, const solver_d
     double *workspace)
 {
   const double error = largest_error(run, step, data, dq, workspace);
-  if (error > run->error) {
+  if (!isnan(run->error) && !(error <= run->error)) {
     run->error = error;
     run->error_t = step->t;
   }

@@ -258,3 +258,10 @@ def test_solve_motion_takes_the_tolerance_of_steps(kepler):
     with pytest.raises(StateError, match="t_end"):
         sc.solve_motion(kepler, (0.0, 20.0), [*q, *p], h=0.1, rtol=1e-12)
     assert not sc.solve_motion(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
+
+
+def test_an_error_that_nothing_tells_is_not_said_to_be_small():
+    stepper = sc.compile_stepper(sc.problem("cart-pole").system, sc.SCVI(2))
+    start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
+    assert math.isnan(stepper.integrate(*start, h=0.816, steps=2).step_error)  # solved by Newton's iteration
+    assert 0.0 < stepper.integrate(*start, h=0.01, steps=2).step_error < 1e-3
