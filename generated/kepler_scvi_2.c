@@ -310,7 +310,6 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #define LANES 2
 #define HOT static inline __attribute__((always_inline))
 #define SWEEPS_AFTER 0
-#define STALLED 0.0625
 #define NODES 2
 
 #include "support/vectors.h"

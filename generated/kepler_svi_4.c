@@ -190,7 +190,6 @@ static const double STAGE_HIGHEST[4] = {
 #define LANES 4
 #define HOT static inline __attribute__((always_inline))
 #define SWEEPS_AFTER 1
-#define STALLED 0.0625
 
 #include "support/vectors.h"
 #include "support/inverse_roots.h"

@@ -140,7 +140,6 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #define LANES 2
 #define HOT static inline __attribute__((always_inline))
 #define SWEEPS_AFTER 1
-#define STALLED 0.0625
 
 #include "support/vectors.h"
 #include "support/vector_library.h"

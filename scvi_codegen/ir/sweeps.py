@@ -29,9 +29,6 @@ __all__ = [
 
 LaneTable: TypeAlias = tuple[tuple[float, ...], ...]
 
-STALLED = 0.0625
-"""A sweep that shrinks the square of the last change by less has come to rounding."""
-
 
 @dataclass(frozen=True, slots=True)
 class SplitVector:
@@ -100,7 +97,6 @@ class SeparableSweep:
     kind: ClassVar[str] = "separable"
     sweeps_after: ClassVar[int] = 1
     """The final one, with all digits of the coefficients."""
-    stalled: ClassVar[float] = STALLED
     mass_entries: ClassVar[tuple[tuple[int, int], ...]] = ()
     diagonal: ClassVar[bool] = True
 
@@ -186,7 +182,6 @@ class CoupledSweep(PointSweep):
 
     kind: ClassVar[str] = "coupled"
     sweeps_after: ClassVar[int] = 0
-    stalled: ClassVar[float] = STALLED
 
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
@@ -212,7 +207,6 @@ class HamiltonianSweep(PointSweep):
 
     kind: ClassVar[str] = "hamiltonian"
     sweeps_after: ClassVar[int] = 0
-    stalled: ClassVar[float] = STALLED
     projected: ClassVar[bool] = False
     diagonal: ClassVar[bool] = True
     mass_entries: ClassVar[tuple[tuple[int, int], ...]] = ()
@@ -322,7 +316,6 @@ class ShootingSweep(CurveSweep):
 
     kind: ClassVar[str] = "shooting"
     sweeps_after: ClassVar[int] = 0
-    stalled: ClassVar[float] = STALLED
 
     def memory(self, dimension: int) -> int:
         """Z of the last two steps, v0 and m."""
@@ -364,8 +357,6 @@ class CollocationSweep(CurveSweep):
 
     kind: ClassVar[str] = "collocation"
     sweeps_after: ClassVar[int] = 0
-    stalled: ClassVar[float] = 0.5
-    """Runge-Kutta methods of few stages contract slowly."""
 
     def memory(self, dimension: int) -> int:
         """Z of the last two steps and v0."""

@@ -122,7 +122,6 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamilt
         meaning=meaning,
         defines={
             "SWEEPS_AFTER": str(sweep.sweeps_after),
-            "STALLED": print_number(sweep.stalled),
             **_facts(sweep, hamiltonian=hamiltonian),
         },
         functions=tuple(map(_function, sorted(functions))),

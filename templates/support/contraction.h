@@ -1,9 +1,9 @@
-/* When sweeps have come near enough to their fixed point. Before it: STALLED, and SWEEPS_AFTER, how many sweeps follow
- * the last one that is measured. Changes are squared, as are the thresholds here. */
+/* When sweeps have come near enough to their fixed point. Before it: SWEEPS_AFTER, how many sweeps follow the last one
+ * that is measured. Changes are squared, as are the thresholds here. */
 
 #define MARGIN 16.0 /* what is left is to be less than a quarter of the tolerance */
 #define FASTEST_CONTRACTION 1e-6 /* what a thousandfold contraction in one sweep is believed to be */
-#define SLOWEST_CONTRACTION 0.25 /* and what slower ones are taken for, as long as nothing else is known */
+#define SLOWEST_CONTRACTION 0.5 /* and what slower ones are taken for: they end where they stop shrinking */
 #define ROUNDING_LEVEL 1e-25 /* changes below 3e-13 of the state may be rounding */
 #define PROGRESS_LEVEL 1e-20 /* above 1e-10, sweeps that gain less than a factor of 1.4 are given up */
 #define FIRST_SWEEPS 4 /* but not at once: the first ones need not contract */
@@ -14,13 +14,14 @@ static inline double smaller(double a, double b)
   return a < b ? a : b;
 }
 
-/* What follows a sweep would change the points by, with a margin: the rate of contraction is that from the sweep
- * before, whose change is infinite before the first. */
+/* What all that follows a sweep would change the points by, with a margin: change r / (1 - r), r being the rate of
+ * contraction from the sweep before, whose change is infinite before the first. Squared, 1 / (1 - r) is at most
+ * 2 / (1 - r^2); the 4 is in the margin. */
 static inline double expected_change(double change, double last, int absolute)
 {
   const double seen = smaller(larger(change / last, FASTEST_CONTRACTION), SLOWEST_CONTRACTION);
-  const double ratio = last < INFINITY ? seen : 1.0;
-  return absolute ? change : MARGIN * ratio * change * (SWEEPS_AFTER ? ratio : 1.0);
+  const double ratio = last < INFINITY ? seen : 1.0, gap = last < INFINITY ? 1.0 - seen : 1.0;
+  return absolute ? change : MARGIN * ratio * change * (SWEEPS_AFTER ? ratio : 1.0) / (gap * gap);
 }
 
 /* Whether a sweep that changed the points by the root of `change` (relative to the state) was good enough: what follows
@@ -29,7 +30,7 @@ static inline double expected_change(double change, double last, int absolute)
 static inline int sweep_status(double change, double last, const solver_options *options, int k)
 {
   const int small = expected_change(change, last, options->absolute) <= options->tolerance * options->tolerance;
-  const int stopped = (change == 0.0) | ((k > 0) & (change >= last * STALLED) & (change < ROUNDING_LEVEL));
+  const int stopped = (change == 0.0) | ((k > 0) & (change >= last) & (change < ROUNDING_LEVEL));
   const int slow =
       (k >= options->max_iterations) | ((k > FIRST_SWEEPS) & (change > 0.5 * last) & (change > PROGRESS_LEVEL));
   return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
