@@ -34,6 +34,7 @@ from scvi_codegen.lowering.solvers.ladder import control_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
@@ -59,7 +60,7 @@ SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 def compile_stepper(
     system: MechanicalSystem,
-    method: Method,
+    method: Method | str,
     *,
     solver: str = "auto",
     flags: tuple[str, ...] = TUNED_FLAGS,
@@ -71,7 +72,7 @@ def compile_stepper(
 
     Args:
         system: what moves.
-        method: how its motion is discretised.
+        method: how its motion is discretised, or a name as the command line takes it: ``"svi"``, ``"svi:6"``.
         solver: of the stage equations: ``"fixed-point"`` (fast, points as vector lanes; for every method of at most 32
             points on every system, but variational SCVI with more than 8 coordinates, and SVI with fewer points than
             the degree), ``"newton"`` (always, also for stiff systems and large steps), ``"explicit"`` (Stoermer-Verlet
@@ -88,6 +89,7 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
+    method = as_method(method)
     key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries))
 
     @cache
@@ -132,7 +134,7 @@ def _text_of(source: Source | None) -> str:
 
 def generate_source(
     system: MechanicalSystem,
-    method: Method,
+    method: Method | str,
     *,
     solver: str = "auto",
     prefix: str | None = None,
@@ -152,6 +154,7 @@ def generate_source(
         MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
             text for a microcontroller.
     """
+    method = as_method(method)
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import MethodWarning, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -17,6 +18,8 @@ __all__ = ["energy_report", "momentum_report"]
 Array = NDArray[np.float64]
 
 MOST_SHOWN = 12
+LARGE_ERROR, LOST = 1e-3, 0.1
+"""Relative errors from which a quantity is said to be hardly conserved, and not at all."""
 
 
 def energy_report(system: MechanicalSystem, trajectory: Trajectory) -> str:
@@ -27,7 +30,21 @@ def energy_report(system: MechanicalSystem, trajectory: Trajectory) -> str:
     what = "relative energy error" if scale else "energy error"
     if system.depends_on_time:
         return f"energy: L depends on time, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
-    return f"{what}: {np.abs(error).max():.2e} at most, drift {_drift(trajectory.t, error):+.1e} over the run"
+    largest = np.abs(error).max()
+    drift = f"drift {_drift(trajectory.t, error):+.1e} over the run"
+    return f"{what}: {largest:.2e} at most, {drift}{_verdict(largest) if scale else ''}"
+
+
+def _verdict(error: float) -> str:
+    """What is said of an error that is no small one, with a warning."""
+    if error < LARGE_ERROR:
+        return ""
+    warnings.warn(
+        f"what the motion conserves is off by {error:.2g} of its size: take a smaller step, or more stages",
+        MethodWarning,
+        stacklevel=2,
+    )
+    return ": NOT conserved" if error >= LOST else ": hardly conserved"
 
 
 def _drift(t: Array, error: Array) -> float:
@@ -49,6 +66,6 @@ def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
     largest = np.fmax.reduce(changes, axis=tuple(range(changes.ndim - 1)))
     for name, exact, error in list(zip(described.map_names, described.map_exact, largest, strict=True))[:MOST_SHOWN]:
         note = "" if exact else " (not guaranteed by this method)"
-        yield f"relative error of {name}: {error:.2e} at most{note}"
+        yield f"relative error of {name}: {error:.2e} at most{note}{_verdict(error)}"
     if len(largest) > MOST_SHOWN:
         yield f"and {len(largest) - MOST_SHOWN} conserved quantities more, {largest[MOST_SHOWN:].max():.2e} at most"

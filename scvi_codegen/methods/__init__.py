@@ -45,6 +45,7 @@ __all__ = [
     "Specification",
     "SpectralCollocation",
     "StoermerVerlet",
+    "as_method",
     "method_from_specification",
 ]
 
@@ -67,6 +68,32 @@ REQUIRED: dict[str, tuple[str, ...]] = {
     name: tuple(key for key, value in signature(make).parameters.items() if value.default is Parameter.empty)
     for name, make in METHODS.items()
 }
+
+
+SIZES = ("degree", "stages", "order")
+"""The number that a name may end in: ``svi:6``."""
+DEFAULT_SIZE = 8
+"""Where the name has none and the method needs one."""
+
+
+def as_method(method: Method | str) -> Method:
+    """A method as it is, or of a name as the command line takes it: ``"svi"`` (degree 8), ``"svi:6"``, ``"gauss:3"``.
+
+    Raises:
+        MethodError: for an unknown name, a number that is none or that the method does not take, and other types.
+    """
+    if isinstance(method, Method):
+        return method
+    if not isinstance(method, str):
+        raise MethodError(f"a method is wanted, as SVI(8), or a name such as 'svi:8', not {method!r}")
+    name, colon, number = method.partition(":")
+    size = next((argument for argument in SIZES if argument in ARGUMENTS.get(name, ())), None)
+    if colon and not (size and number.isascii() and number.isdigit()):
+        raise MethodError(f"there is no method {method!r}: write svi, svi:6, gauss:3, stoermer-verlet, ..")
+    specification: dict[str, Any] = {"method": name}
+    if size and (number or size in REQUIRED[name]):
+        specification[size] = int(number or DEFAULT_SIZE)
+    return method_from_specification(specification)
 
 
 def method_from_specification(specification: Specification) -> Method:

@@ -31,14 +31,16 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
     return array
 
 
-def checked_states(interface: Interface, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
-    """(n,) times and (n, m) positions and momenta, contiguous, of one state or many."""
-    positions, momenta = real_array(q, "q"), real_array(p, "p")
+def checked_states(
+    interface: Interface, q: ArrayLike, p: ArrayLike, t: ArrayLike, *, second: str = "p"
+) -> tuple[Array, Array, Array]:
+    """(n,) times and (n, m) positions and momenta (or what ``second`` names), contiguous, of one state or many."""
+    positions, momenta = real_array(q, "q"), real_array(p, second)
     if positions.ndim == 1:
-        positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
+        positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, second)
     elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
         raise StateError(
-            f"states must have shape (n, {interface.dimension}), not q {positions.shape} and p {momenta.shape}"
+            f"states must have shape (n, {interface.dimension}), not q {positions.shape} and {second} {momenta.shape}"
         )
     count = positions.size // interface.dimension
     times = real_array(t, "the time t")

@@ -192,13 +192,32 @@ class Integrator:
             events=self.events,
         )
 
-    def momentum(self, q: ArrayLike, v: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
-        """(m,) momenta p = dL/dv at (q, v, t), the Legendre transform."""
-        return self._transform("momentum", self._vector(q, "q"), self._vector(v, "v"), t, parameters)
+    def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
+        return self._transform("momentum", q, v, t, parameters, "v")
 
-    def velocity(self, q: ArrayLike, p: ArrayLike, t: float = 0.0, parameters: Parameters = None) -> Array:
-        """(m,) velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from rest)."""
-        return self._transform("velocity", self._vector(q, "q"), self._vector(p, "p"), t, parameters)
+    def velocity(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from rest).
+
+        Returns:
+            (m,), or (n, m) for (n, m) states with one time or (n,) times.
+        """
+        return self._transform("velocity", q, p, t, parameters, "p")
+
+    def momenta_given(
+        self, q: ArrayLike, p: ArrayLike | None, velocity: ArrayLike | None, t: float, parameters: Parameters
+    ) -> ArrayLike:
+        """The momenta of a state that is given by one of p and velocity.
+
+        Raises:
+            StateError: if both or none are given.
+        """
+        if (p is None) == (velocity is None):
+            raise StateError(f"give p or velocity, {'one' if p is None else 'not both'} of them, beside q")
+        if velocity is None:
+            assert p is not None
+            return p
+        return self._transform("momentum", q, velocity, t, parameters, "velocity")
 
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Energy p.v - L: a float for (m,) states, (n,) for (n, m) states with one time or (n,) times."""
@@ -342,13 +361,25 @@ class Integrator:
             raise step_failure(status, report, step=0, h=h)
         return p0, p1, float(action[0])
 
-    def _transform(self, name: str, q: Array, other: Array, t: float, parameters: Parameters) -> Array:
+    def _transform(
+        self, name: str, q: ArrayLike, other: ArrayLike, t: ArrayLike, parameters: Parameters, label: str
+    ) -> Array:
+        if np.ndim(q) == 1:
+            at, values = checked_number(t, "the time t"), self._parameters(parameters)
+            return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
+        times, positions, others = checked_states(self.interface, q, other, t, second=label)
+        values, result = self._parameters(parameters), np.empty_like(others)
+        for k, (at, position, row) in enumerate(zip(times.tolist(), positions, others, strict=True)):
+            result[k] = self._transformed(name, at, position, row, values)
+        return result
+
+    def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
         result = np.empty_like(other)
         status = self.binding.function(name)(
-            checked_number(t, "the time t"),
+            t,
             self.binding.pointer(q),
             self.binding.pointer(other),
-            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(values),
             self.binding.pointer(result),
             self.binding.workspace(),
         )

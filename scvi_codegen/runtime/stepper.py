@@ -42,8 +42,9 @@ class Stepper(Integrator):
     def integrate(
         self,
         q: ArrayLike,
-        p: ArrayLike,
+        p: ArrayLike | None = None,
         *,
+        velocity: ArrayLike | None = None,
         h: float | None = None,
         steps: int | None = None,
         t_end: float | None = None,
@@ -60,6 +61,7 @@ class Stepper(Integrator):
 
         Args:
             q, p: (m,) initial positions and momenta.
+            velocity: (m,) initial velocities, in place of p.
             h: step size, negative to go back.
             steps: number of steps.
             t_end: instead of both: where to go, by steps that choose their length. The last ends there exactly.
@@ -83,7 +85,17 @@ class Stepper(Integrator):
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
         stepper = self if events is None else self.with_events(events)
-        run = stepper.start(q, p, h=h, t=t, t_end=t_end, tolerance=tolerance, parameters=parameters, options=options)
+        run = stepper.start(
+            q,
+            p,
+            velocity=velocity,
+            h=h,
+            t=t,
+            t_end=t_end,
+            tolerance=tolerance,
+            parameters=parameters,
+            options=options,
+        )
         if run.goal is None and steps is None:
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if run.goal is not None and steps is not None:
@@ -140,8 +152,9 @@ class Stepper(Integrator):
     def start(
         self,
         q: ArrayLike,
-        p: ArrayLike,
+        p: ArrayLike | None = None,
         *,
+        velocity: ArrayLike | None = None,
         h: float | None = None,
         t: float = 0.0,
         t_end: float | None = None,
@@ -149,7 +162,8 @@ class Stepper(Integrator):
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """A run from (q, p) at t, to be advanced at will: by steps of h, or of their own lengths to t_end."""
+        """A run from (q, p), or q and a velocity, at t, to be advanced at will: by steps of h, or of their own lengths to t_end."""
+        p = self.momenta_given(q, p, velocity, t, parameters)
         if t_end is not None and h is None:
             goal = Goal.checked(t_end, tolerance)
             return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)

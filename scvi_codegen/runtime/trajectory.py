@@ -112,6 +112,11 @@ class Trajectory(KeptStates):
                 return found.event
         return None
 
+    @property
+    def velocity(self) -> Array:
+        """(n, m) velocities of the states."""
+        return self.stepper.velocity(self.q, self.p, self.t, self.parameters)
+
     def at(self, t: ArrayLike) -> tuple[Array, Array]:
         """States between those kept: steps of a part of h, as accurate as the method and continuous in t.
 

@@ -29,7 +29,7 @@ def bench(
     double-pendulum, relativistic-particle, fput-chain:8, :64, :256), 64 trajectories of one at once
     (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), drift (the energy over ten million
     steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up
-    or compile (larger systems, from text to first step); by default all.
+    or compile (larger systems, from text to first step); by default all; kepler is both of its kind.
     Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
 
     \b
