@@ -2,18 +2,19 @@
  * MOMENTA and MOVES, and evaluate, which gives the equations and their Jacobian. */
 
 #define STOPPED_SHRINKING REAL(0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
+#define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* what is left of positions that a force has stiffly settled */
 #define KEEP_CHANGE REAL(1e-2) /* factors are kept while updates are below this part of the state */
 #define KEEP_RATE REAL(0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
 
 /* How far the last update moved the stages and the end momentum: the largest ratio to its own size, the ratio of the
  * largest to the largest size, and the largest itself. */
 typedef struct {
-  real relative, overall, absolute;
+  real relative, overall, absolute, stages; /* stages: overall, of the positions of the stages alone */
 } movement;
 
 static movement no_movement(void)
 {
-  const movement none = {0, 0, 0};
+  const movement none = {0, 0, 0, 0};
   return none;
 }
 
@@ -76,6 +77,7 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
     }
   }
   measure(moved, change, size_q);
+  moved->stages = moved->overall;
   for (int i = 0; p0 && i < M; i++) {
     change[i] = data->update[PLACE[i] * blocks + B];
     p0[i] -= change[i];
@@ -85,7 +87,8 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
 }
 
 /* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
- * longer shrinking. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off
+ * longer shrinking. A stiff force makes of the rounding of positions much more in the momenta: there positions alone
+ * are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off
  * from slow progress. */
 static int has_converged(const solver_options *options, const movement *moved, real last, int trials)
 {
@@ -93,8 +96,10 @@ static int has_converged(const solver_options *options, const movement *moved, r
     return 0;
   if (options->absolute)
     return moved->absolute < options->tolerance;
-  return moved->relative <= options->tolerance ||
-      (trials > 2 && moved->overall <= ROUNDOFF_LEVEL && moved->relative >= STOPPED_SHRINKING * last);
+  if (moved->relative <= options->tolerance)
+    return 1;
+  return trials > 2 && moved->relative >= STOPPED_SHRINKING * last &&
+      (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
 }
 
 /* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */

@@ -162,7 +162,10 @@ class Stepper(Integrator):
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """A run from (q, p), or q and a velocity, at t, to be advanced at will: by steps of h, or of their own lengths to t_end."""
+        """A run from (q, p), or q and a velocity, at t, to be advanced at will.
+
+        By steps of h, or of their own lengths to t_end.
+        """
         p = self.momenta_given(q, p, velocity, t, parameters)
         if t_end is not None and h is None:
             goal = Goal.checked(t_end, tolerance)

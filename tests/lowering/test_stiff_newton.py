@@ -1,0 +1,47 @@
+"""Newton's iteration ends where rounding does in a stiff system: a pendulum whose rod is a spring."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SVI, RadauIIA
+from scvi_codegen.native.options import SolverOptions
+
+STIFFNESS = 1e8
+EPSILON = 2.0**-52
+
+
+def spring_pendulum():
+    return LagrangianSystem.from_text(
+        name="spring pendulum",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - 9.81*y - k/2*(sqrt(x**2 + y**2) - 1)**2",
+        parameters={"k": STIFFNESS},
+    )
+
+
+@pytest.mark.parametrize("method", [RadauIIA(3), SVI(1), SVI(2)], ids=lambda method: method.name)
+def test_steps_are_those_of_60_digits_up_to_the_rounding_of_positions(method):
+    """The momenta's error is what rounding of a position does through the spring in a step: h k epsilon."""
+    system = spring_pendulum()
+    stepper, derived = compile_stepper(system, method, solver="newton", flags=QUICK_FLAGS), derived_step(system, method)
+    for h in (0.01, 0.001):
+        run = stepper.integrate([1.0, 0.0], [0.0, 0.1], h=h, steps=200)
+        for k in (0, 3, 100):
+            q, p = stepper.step(run.q[k], run.p[k], h)
+            exact = derived(run.q[k], run.p[k], h, 0.0)
+            assert max(abs(exact.q - q)) < 16 * EPSILON
+            assert max(abs(exact.p - p)) < 4 * h * STIFFNESS * EPSILON
+
+
+def test_what_has_not_converged_is_still_refused():
+    stepper = compile_stepper(spring_pendulum(), SVI(1), solver="newton", flags=QUICK_FLAGS)
+    with pytest.raises(StepFailedError, match="not converged"):
+        stepper.step([1.0, 0.0], [0.0, 100.0], 0.1, options=SolverOptions(max_iterations=2))
+    assert np.isfinite(stepper.step([1.0, 0.0], [0.0, 0.1], 0.001)).all()
