@@ -33,10 +33,24 @@ from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 
-__all__ = ["MechanicalSystem", "named_parameters"]
+__all__ = ["Clock", "MechanicalSystem", "named_parameters"]
 
 MOST_OPERATIONS = 200
 """Of a formula that a notebook shows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clock:
+    """How time runs where the system moves in a transformed one, tau (:func:`reparametrise`).
+
+    Attributes:
+        rate: dt/dtau, a function of the coordinates (of a Hamiltonian also of the momenta).
+        energy: the parameter that is the energy of the initial state; the function of the system is then
+            rate (energy of the state - energy), zero along the motion.
+    """
+
+    rate: Expr
+    energy: Symbol
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +63,7 @@ class MechanicalSystem(ABC):
         time: the symbol ``t``.
         parameters: the symbols that stay adjustable in the compiled integrator; one may be absent from the function.
         defaults: their default values, parallel to ``parameters``.
+        clock: how time runs, if not evenly.
     """
 
     name: str
@@ -56,6 +71,7 @@ class MechanicalSystem(ABC):
     time: Symbol
     parameters: tuple[Symbol, ...]
     defaults: tuple[float, ...]
+    clock: Clock | None = None
 
     @property
     @abstractmethod

@@ -1,0 +1,70 @@
+"""Other coordinates for the same motion: L is a scalar, so new coordinates are put in, and that is all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.grammar import closest, parse_expression
+from scvi_codegen.formulas.symbols import DOT, check_names, symbol
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+
+__all__ = ["change_coordinates"]
+
+
+def change_coordinates(
+    system: LagrangianSystem, old: Mapping[str, str], *, coordinates: Sequence[str]
+) -> LagrangianSystem:
+    """The system in other coordinates, by a point transformation q = q(u, t): v = q_u u' + q_t.
+
+    Momenta change by the transposed derivative, p_u = q_u^T p_q; energy and Lagrangian keep their values.
+
+    Args:
+        system: in the old coordinates.
+        old: each old coordinate that is replaced, as text in the new ones, those that stay, parameters and ``t``.
+        coordinates: names of the new coordinates, in order; together with those that stay as many as before.
+
+    Raises:
+        SystemDefinitionError: naming the coordinate or symbol at fault; and where the new mass matrix is singular.
+
+    >>> plane = LagrangianSystem.from_text(
+    ...     name="plane", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - x**2 - y**2")
+    >>> polar = change_coordinates(plane, {"x": "r*cos(phi)", "y": "r*sin(phi)"}, coordinates=["r", "phi"])
+    >>> sympy.simplify(polar.lagrangian)
+    phi_dot**2*r**2/2 - r**2 + r_dot**2/2
+    """
+    names = [q.name for q in system.coordinates]
+    for name in old:
+        if name not in names:
+            raise SystemDefinitionError(f"'{system.name}' has no coordinate '{name}'{closest(name, names)}")
+    staying = [name for name in names if name not in old]
+    new = [*coordinates, *staying]
+    check_names(new, tuple(parameter.name for parameter in system.parameters))
+    if len(new) != len(names):
+        raise SystemDefinitionError(f"{len(old)} coordinates are replaced by {len(coordinates)}: give as many new ones")
+    variables = tuple(symbol(name) for name in new)
+    known = {given.name: given for given in (*variables, *system.parameters, system.time)}
+    positions = {symbol(name): parse_expression(text, known) for name, text in old.items()}
+    replaced = {**positions, **{symbol(q.name + DOT): _rate(f, variables, system.time) for q, f in positions.items()}}
+    clock = system.clock and replace(system.clock, rate=system.clock.rate.xreplace(replaced))
+    return LagrangianSystem(
+        name=f"{system.name} in {', '.join(coordinates)}",
+        coordinates=variables,
+        time=system.time,
+        parameters=system.parameters,
+        defaults=system.defaults,
+        lagrangian=system.lagrangian.xreplace(replaced),
+        clock=clock,
+    )
+
+
+def _rate(position: Expr, variables: tuple[Symbol, ...], time: Symbol) -> Expr:
+    """The time derivative along a curve of the new coordinates."""
+    slopes = gradient(position, (*variables, time))
+    rates = (*(symbol(variable.name + DOT) for variable in variables), sympy.S.One)
+    return sympy.Add(*(slope * rates[i] for i, slope in slopes.items()))

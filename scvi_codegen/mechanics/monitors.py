@@ -1,0 +1,140 @@
+"""Monitor functions g > 0: how long a unit of transformed time is, dt = g dtau, small where the motion is fast.
+
+Each is a formula in the coordinates (for a Hamiltonian also in the momenta), made from the system itself:
+
+* ``"frequency"``: (sum_ij (M^-1 V_qq)_ij^2)^(-1/4), the period of the fastest vibration, r^(3/2) for Kepler's problem.
+  It is the one to begin with near 1/r singularities.
+* ``"distance"``: (sum_pairs r^-3)^(-1/2) over the distances that occur in the potential: the same scale for bodies of
+  similar masses, and much shorter than the frequency's formula for many of them.
+* ``"potential"``: 1/(-V), for potentials that are negative everywhere.
+* ``"arclength"``: (p^T M^-2 p + V_q^T V_q)^(-1/2), equal lengths along the curve in phase space; it contains momenta.
+
+Sources: E. Hairer, Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2-3; V. Duruisseaux, J. Schmitt,
+M. Leok, SIAM J. Sci. Comput. 43 (2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.grammar import closest, parse_expression
+from scvi_codegen.mechanics.forms import energy, mass_entries
+from scvi_codegen.mechanics.system import MechanicalSystem
+
+__all__ = ["MONITORS", "monitor_function"]
+
+
+MOST_SIMPLIFIED = 200
+"""Operations of a formula that SymPy simplifies in a second: Kepler's comes out as 6 mu^2/r^6."""
+
+
+def monitor_function(system: MechanicalSystem, monitor: str | Expr) -> Expr:
+    """The formula of a monitor: one by name, or text or an expression in coordinates, momenta and parameters.
+
+    Args:
+        system: what moves.
+        monitor: a name among ``MONITORS``, or a formula.
+
+    Raises:
+        SystemDefinitionError: for a formula in other symbols, and a name that the system is not fit for.
+    """
+    if isinstance(monitor, str) and monitor in MONITORS:
+        return MONITORS[monitor](system)
+    known = {given.name: given for given in (*system.coordinates, *system.auxiliaries, *system.parameters)}
+    if isinstance(monitor, Expr):
+        formula = monitor.xreplace({free: known[free.name] for free in monitor.free_symbols if free.name in known})
+    elif isinstance(monitor, str):
+        formula = _read(monitor, known)
+    else:
+        raise SystemDefinitionError(f"a monitor is a name, text or a SymPy expression, not {monitor!r}")
+    unknown = sorted(free.name for free in formula.free_symbols - set(known.values()))
+    if unknown:
+        kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"
+        raise SystemDefinitionError(f"'{unknown[0]}' in the monitor: it may depend on {kinds} of '{system.name}' alone")
+    if not formula.free_symbols & {*system.coordinates, *system.auxiliaries}:
+        raise SystemDefinitionError(f"the monitor {formula} is constant: steps would not adapt")
+    return formula
+
+
+def _read(text: str, known: Mapping[str, Symbol]) -> Expr:
+    try:
+        return parse_expression(text, known)
+    except SystemDefinitionError as error:
+        if text.isidentifier():
+            raise SystemDefinitionError(
+                f"there is no monitor '{text}'{closest(text, list(MONITORS))} "
+                f"There are {', '.join(MONITORS)}, and formulas"
+            ) from None
+        raise error
+
+
+def _potential_and_masses(system: MechanicalSystem, monitor: str) -> tuple[Expr, dict[int, Expr]]:
+    """V(q) and the constant diagonal masses of T = sum m_i v_i^2 / 2."""
+    motion = system.auxiliaries or system.velocities
+    function = energy(system)
+    rest = function.xreplace(dict.fromkeys(motion, sympy.S.Zero))
+    slopes = hessian(function, motion) if system.auxiliaries else mass_entries(system)
+    diagonal = {i: entry for (i, j), entry in slopes.items() if i == j}
+    constant = set(system.parameters)
+    if len(diagonal) < len(slopes) or any(not entry.free_symbols <= constant for entry in diagonal.values()):
+        raise SystemDefinitionError(
+            f"the monitor '{monitor}' needs constant masses, one a coordinate, which '{system.name}' has not: "
+            "give a formula in its coordinates"
+        )
+    return rest, {i: 1 / entry for i, entry in diagonal.items()} if system.auxiliaries else diagonal
+
+
+def _frequency(system: MechanicalSystem) -> Expr:
+    potential, masses = _potential_and_masses(system, "frequency")
+    entries = hessian(potential, system.coordinates)
+    if not entries:
+        raise SystemDefinitionError(
+            f"no force of '{system.name}' changes from place to place: nothing sets a frequency"
+        )
+    squares = sympy.Add(*((entry / masses[i]) ** 2 for (i, _), entry in entries.items()))
+    small = sympy.count_ops(squares) <= MOST_SIMPLIFIED
+    return (sympy.simplify(squares) if small else squares) ** sympy.Rational(-1, 4)
+
+
+def _distance(system: MechanicalSystem) -> Expr:
+    potential, _ = _potential_and_masses(system, "distance")
+    squares = sorted(
+        {
+            power.base
+            for power in potential.atoms(sympy.Pow)
+            if isinstance(power.base, sympy.Add)
+            and power.exp.is_negative
+            and power.base.free_symbols & set(system.coordinates)
+        },
+        key=sympy.default_sort_key,
+    )
+    if not squares:
+        raise SystemDefinitionError(
+            f"no distance in a denominator stands in the potential of '{system.name}': give a formula as its monitor"
+        )
+    return sympy.Add(*(square ** sympy.Rational(-3, 2) for square in squares)) ** sympy.Rational(-1, 2)
+
+
+def _potential(system: MechanicalSystem) -> Expr:
+    potential, _ = _potential_and_masses(system, "potential")
+    return 1 / (-potential)
+
+
+def _arclength(system: MechanicalSystem) -> Expr:
+    if not system.auxiliaries:
+        raise SystemDefinitionError("the monitor 'arclength' contains momenta: give it hamiltonian_of(system)")
+    function = energy(system)
+    slopes = gradient(function, (*system.coordinates, *system.auxiliaries)).values()
+    return sympy.Add(*(slope**2 for slope in slopes)) ** sympy.Rational(-1, 2)
+
+
+MONITORS: Mapping[str, Callable[[MechanicalSystem], Expr]] = MappingProxyType(
+    {"frequency": _frequency, "distance": _distance, "potential": _potential, "arclength": _arclength}
+)
+"""By name."""

@@ -1,0 +1,87 @@
+"""Transformed time: fixed steps in tau that are variable steps in t, and an exactly symplectic map all the same.
+
+With dt = g dtau, g > 0 a monitor (:mod:`scvi_codegen.mechanics.monitors`), Poincare's transformation K = g (H - E)
+of an autonomous Hamiltonian has the same orbits on its level K = 0, that is H = E, run through in tau. Its Lagrangian,
+for g of the coordinates alone, is
+
+    L^(q, q') = g(q) (L(q, q'/g(q)) + E),                                       p = dL^/dq' = dL/dv unchanged,
+
+regular wherever L is. Every method and solver takes it as it takes L; E is a parameter, the energy of the initial
+state. Time is the integral of g along the curve, summed by the method's own quadrature.
+
+Sources: S. Reich, SIAM J. Numer. Anal. 36 (1999); E. Hairer, Appl. Numer. Math. 25 (1997); V. Duruisseaux, J. Schmitt,
+M. Leok, SIAM J. Sci. Comput. 43 (2021), where the singular p_t direction of K = g (H + p_t) rules a Lagrangian out;
+with p_t = -E constant it does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.monitors import monitor_function
+from scvi_codegen.mechanics.system import Clock, MechanicalSystem
+
+__all__ = ["reparametrise"]
+
+ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
+"""Of the parameter that is the energy: the first that is free."""
+
+
+def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSystem:
+    """The same motion in a time tau with dt = g dtau.
+
+    Args:
+        system: an autonomous Lagrangian or Hamiltonian system.
+        monitor: g > 0, as text or expression in the coordinates (for a Hamiltonian also in the momenta), or
+            ``"frequency"``, ``"distance"``, ``"potential"``, ``"arclength"``.
+
+    Returns:
+        A system of the same kind with one more parameter, the energy, and a ``clock`` that gives t.
+
+    Raises:
+        SystemDefinitionError: for a system that depends on time, and a monitor that is none.
+
+    >>> kepler = LagrangianSystem.from_text(
+    ...     name="Kepler", coordinates=["r", "phi"], lagrangian="(r_dot**2 + r**2*phi_dot**2)/2 + 1/r")
+    >>> reparametrise(kepler, "r").lagrangian
+    E*r + r*phi_dot**2/2 + r_dot**2/(2*r) + 1
+    """
+    if system.clock is not None:
+        raise SystemDefinitionError(
+            f"the time of '{system.name}' is transformed already, with dt = {system.clock.rate} dtau"
+        )
+    if system.depends_on_time:
+        raise SystemDefinitionError(
+            f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or the "
+            "reversible controller"
+        )
+    level = _free_symbol(system)
+    rate = monitor_function(system, monitor)
+    common = {
+        "name": f"{system.name} in transformed time",
+        "parameters": (*system.parameters, level),
+        "defaults": (*system.defaults, 0.0),
+        "clock": Clock(rate=rate, energy=level),
+    }
+    if isinstance(system, HamiltonianSystem):
+        return replace(system, hamiltonian=_distributed(rate, system.hamiltonian - level), **common)
+    assert isinstance(system, LagrangianSystem)
+    slowed = system.lagrangian.xreplace({v: v / rate for v in system.velocities})
+    return replace(system, lagrangian=_distributed(rate, slowed + level), **common)
+
+
+def _distributed(factor: Expr, total: Expr) -> Expr:
+    """The factor on every term, so that powers of it meet."""
+    return sympy.Add(*(factor * term for term in sympy.Add.make_args(total)))
+
+
+def _free_symbol(system: MechanicalSystem) -> Symbol:
+    taken = {given.name for given in (*system.coordinates, *system.auxiliaries, *system.parameters)}
+    return symbol(next(name for name in ENERGY_NAMES if name not in taken))
