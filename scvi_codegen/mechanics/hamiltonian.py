@@ -26,7 +26,7 @@ from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, sin
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_twin"]
+__all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_twin", "positive_parameters"]
 
 LARGEST_INVERSE = 3
 """Coupled momenta (velocities) whose quadratic form is inverted symbolically."""
@@ -251,11 +251,11 @@ def _legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals:
     solution = {x: _inverse_slope(system, slopes[i], x, duals[i], variables) for i, x in enumerate(variables)}
     still, moving = f.as_independent(*variables, as_Add=True)
     dual = sympy.Add(*(x * y for x, y in zip(solution.values(), duals, strict=True)), -moving.xreplace(solution))
-    positive = _positive_parameters(system)
+    positive = positive_parameters(system)
     return sympy.simplify(dual.xreplace(positive)).xreplace({dummy: given for given, dummy in positive.items()}) - still
 
 
-def _positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
+def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     """Stand-ins for the parameters with positive default values, so that roots of their squares are taken."""
     return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
 
@@ -284,9 +284,7 @@ def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, 
             f"Legendre's transform of '{system.name}' needs the solution of coupled equations that are not linear; "
             "give the other function yourself, or use the system as it is"
         )
-    positive = {
-        symbol: sympy.Dummy(symbol.name, positive=True) for symbol, value in system.constants.items() if value > 0
-    }
+    positive = positive_parameters(system)
     back = {dummy: symbol for symbol, dummy in positive.items()}
     for root in _roots(slope.xreplace(positive) - y, x):
         found = root.xreplace(back)

@@ -25,6 +25,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import closest, parse_expression
 from scvi_codegen.mechanics.forms import energy, mass_entries
+from scvi_codegen.mechanics.hamiltonian import positive_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["MONITORS", "monitor_function"]
@@ -98,8 +99,11 @@ def _frequency(system: MechanicalSystem) -> Expr:
             f"no force of '{system.name}' changes from place to place: nothing sets a frequency"
         )
     squares = sympy.Add(*((entry / masses[i]) ** 2 for (i, _), entry in entries.items()))
-    small = sympy.count_ops(squares) <= MOST_SIMPLIFIED
-    return (sympy.simplify(squares) if small else squares) ** sympy.Rational(-1, 4)
+    if sympy.count_ops(squares) > MOST_SIMPLIFIED:
+        return squares ** sympy.Rational(-1, 4)
+    positive = positive_parameters(system)
+    root = sympy.simplify(squares.xreplace(positive)) ** sympy.Rational(-1, 4)
+    return root.xreplace({stand_in: given for given, stand_in in positive.items()})
 
 
 def _distance(system: MechanicalSystem) -> Expr:
