@@ -102,8 +102,8 @@ def _frequency(system: MechanicalSystem) -> Expr:
     if sympy.count_ops(squares) > MOST_SIMPLIFIED:
         return squares ** sympy.Rational(-1, 4)
     positive = positive_parameters(system)
-    root = sympy.simplify(squares.xreplace(positive)) ** sympy.Rational(-1, 4)
-    return root.xreplace({stand_in: given for given, stand_in in positive.items()})
+    root = sympy.factor(sympy.simplify(squares.xreplace(positive))) ** sympy.Rational(-1, 4)
+    return sympy.powdenest(root, force=True).xreplace({stand_in: given for given, stand_in in positive.items()})
 
 
 def _distance(system: MechanicalSystem) -> Expr:
