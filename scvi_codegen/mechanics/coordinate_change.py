@@ -8,9 +8,9 @@ from dataclasses import replace
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.grammar import closest, parse_expression
+from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, check_names, symbol
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 

@@ -21,10 +21,10 @@ from types import MappingProxyType
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient, hessian
-from scvi_codegen.formulas.grammar import closest, parse_expression
-from scvi_codegen.mechanics.forms import energy, mass_entries
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import positive_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -78,9 +78,9 @@ def _read(text: str, known: Mapping[str, Symbol]) -> Expr:
 def _potential_and_masses(system: MechanicalSystem, monitor: str) -> tuple[Expr, dict[int, Expr]]:
     """V(q) and the constant diagonal masses of T = sum m_i v_i^2 / 2."""
     motion = system.auxiliaries or system.velocities
-    function = energy(system)
+    function = forms_of(system).energy
     rest = function.xreplace(dict.fromkeys(motion, sympy.S.Zero))
-    slopes = hessian(function, motion) if system.auxiliaries else mass_entries(system)
+    slopes = hessian(function, motion) if system.auxiliaries else forms_of(system).mass
     diagonal = {i: entry for (i, j), entry in slopes.items() if i == j}
     constant = set(system.parameters)
     if len(diagonal) < len(slopes) or any(not entry.free_symbols <= constant for entry in diagonal.values()):
@@ -133,7 +133,7 @@ def _potential(system: MechanicalSystem) -> Expr:
 def _arclength(system: MechanicalSystem) -> Expr:
     if not system.auxiliaries:
         raise SystemDefinitionError("the monitor 'arclength' contains momenta: give it hamiltonian_of(system)")
-    function = energy(system)
+    function = forms_of(system).energy
     slopes = gradient(function, (*system.coordinates, *system.auxiliaries)).values()
     return sympy.Add(*(slope**2 for slope in slopes)) ** sympy.Rational(-1, 2)
 

@@ -64,17 +64,18 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
         )
     level = _free_symbol(system)
     rate = monitor_function(system, monitor)
-    common = {
-        "name": f"{system.name} in transformed time",
-        "parameters": (*system.parameters, level),
-        "defaults": (*system.defaults, 0.0),
-        "clock": Clock(rate=rate, energy=level),
-    }
-    if isinstance(system, HamiltonianSystem):
-        return replace(system, hamiltonian=_distributed(rate, system.hamiltonian - level), **common)
-    assert isinstance(system, LagrangianSystem)
-    slowed = system.lagrangian.xreplace({v: v / rate for v in system.velocities})
-    return replace(system, lagrangian=_distributed(rate, slowed + level), **common)
+    named = replace(
+        system,
+        name=f"{system.name} in transformed time",
+        parameters=(*system.parameters, level),
+        defaults=(*system.defaults, 0.0),
+        clock=Clock(rate=rate, energy=level),
+    )
+    if isinstance(named, HamiltonianSystem):
+        return replace(named, hamiltonian=_distributed(rate, named.hamiltonian - level))
+    assert isinstance(named, LagrangianSystem)
+    slowed = named.lagrangian.xreplace({v: v / rate for v in named.velocities})
+    return replace(named, lagrangian=_distributed(rate, slowed + level))
 
 
 def _distributed(factor: Expr, total: Expr) -> Expr:

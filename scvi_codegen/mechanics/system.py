@@ -122,6 +122,7 @@ class MechanicalSystem(ABC):
             sympy.srepr(self.formula),
             " ".join(symbol.name for symbol in symbols),
             repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
+            sympy.srepr(self.clock.rate) if self.clock else "",
         )
 
     def to_text(self) -> str:
