@@ -27,6 +27,8 @@ _HOMES = {
     "exact.discrete_lagrangian": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
     "runtime.events": ("Crossings", "Event"),
     "mechanics.hamiltonian": ("HamiltonianSystem", "hamiltonian_of", "lagrangian_of"),
+    "mechanics.reparametrisation": ("reparametrise",),
+    "mechanics.coordinate_change": ("change_coordinates",),
     "derivation.equations": ("StepEquations", "derive"),
     "errors": (
         "BuildError",

@@ -30,10 +30,12 @@ from scvi_codegen.exact.discrete_lagrangian import exact_map as exact_map
 from scvi_codegen.files.cache import CacheInfo as CacheInfo
 from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache
+from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
+from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry as Symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import check_symmetry as check_symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries as symmetries

@@ -189,6 +189,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         parameters=system.parameters,
         defaults=system.defaults,
         hamiltonian=_legendre_dual(system, system.velocities, symbols),
+        clock=system.clock,
     )
 
 
@@ -203,6 +204,8 @@ def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
         raise SystemDefinitionError(
             f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine momenta"
         )
+    if system.clock and system.clock.rate.free_symbols & set(system.momenta):
+        raise SystemDefinitionError(f"the clock of '{system.name}' contains momenta, that of a Lagrangian may not")
     return LagrangianSystem(
         name=system.name,
         coordinates=system.coordinates,
@@ -210,6 +213,7 @@ def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
         parameters=system.parameters,
         defaults=system.defaults,
         lagrangian=_legendre_dual(system, system.momenta, system.velocities),
+        clock=system.clock,
     )
 
 

@@ -2,8 +2,8 @@
 
 Each is a formula in the coordinates (for a Hamiltonian also in the momenta), made from the system itself:
 
-* ``"frequency"``: (sum_ij (M^-1 V_qq)_ij^2)^(-1/4), the period of the fastest vibration, r^(3/2) for Kepler's problem.
-  It is the one to begin with near 1/r singularities.
+* ``"frequency"``: (sum_ij (M^-1 V_qq)_ij^2)^(-1/4), the period of the fastest vibration, r^(3/2) for Kepler's problem
+  (a number in front, which would only rescale tau, is left out). It is the one to begin with near 1/r singularities.
 * ``"distance"``: (sum_pairs r^-3)^(-1/2) over the distances that occur in the potential: the same scale for bodies of
   similar masses, and much shorter than the frequency's formula for many of them.
 * ``"potential"``: 1/(-V), for potentials that are negative everywhere.
@@ -30,9 +30,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["MONITORS", "monitor_function"]
 
-
 MOST_SIMPLIFIED = 200
-"""Operations of a formula that SymPy simplifies in a second: Kepler's comes out as 6 mu^2/r^6."""
+"""Operations of a formula that SymPy simplifies in a second: Kepler's comes out as 5 mu^2/r^6."""
 
 
 def monitor_function(system: MechanicalSystem, monitor: str | Expr) -> Expr:
@@ -102,7 +101,8 @@ def _frequency(system: MechanicalSystem) -> Expr:
     if sympy.count_ops(squares) > MOST_SIMPLIFIED:
         return squares ** sympy.Rational(-1, 4)
     positive = positive_parameters(system)
-    root = sympy.factor(sympy.simplify(squares.xreplace(positive))) ** sympy.Rational(-1, 4)
+    _, simplest = sympy.factor(sympy.simplify(squares.xreplace(positive))).as_coeff_Mul()
+    root = simplest ** sympy.Rational(-1, 4)
     return sympy.powdenest(root, force=True).xreplace({stand_in: given for given, stand_in in positive.items()})
 
 
