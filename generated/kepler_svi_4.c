@@ -285,6 +285,7 @@ static const double EXTRAPOLATION[4][4] = {
 #endif
 
 #include "support/time.h"
+#include "support/even_time.h"
 #include "support/run.h"
 
 /* h^1 sum_n w_n lagrangian along the curve given by z. */

@@ -157,6 +157,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 
 #include "support/no_error.h"
 #include "support/time.h"
+#include "support/even_time.h"
 #include "support/run.h"
 
 /* h^1 sum_n w_n lagrangian along the curve given by z. */

@@ -45,6 +45,7 @@ typedef struct {
   long long iterations; /* of the solver, over all steps */
   double change; /* the last update, measured as above */
   double t; /* start of the last step tried */
+  double duration; /* of the last step: h */
   long long stored; /* states, where steps choose their length */
 } two_point_pendulum_report;
 

@@ -189,7 +189,8 @@ def program_of(
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     stages = discretise(system, method)
-    splitting = splitting_of(system, method) if solver in ("auto", "explicit") else None
+    explicit = solver in ("auto", "explicit") and not system.integrands
+    splitting = splitting_of(system, method) if explicit else None
     swept = lanes and solver in ("auto", "fixed-point") and splitting is None
     sweep = sweep_of(system, stages) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
@@ -226,6 +227,7 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         map_exact=tuple(each.exact for each in program.momentum_maps),
         has_fallback=program.newton and program.sweep is not None,
         momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
+        energy_parameter=system.clock.energy.name if system.clock else "",
     )
 
 

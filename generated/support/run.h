@@ -1,5 +1,5 @@
 /* One step, and runs of many with compensated sums. Before it: step.h, time.h, prepare and solve of a solver, which
- * give the increments of a step, and observe_error. */
+ * give the increments of a step, duration, which says how long it lasts, and observe_error. */
 
 solver_options NAME(default_options)(void)
 {
@@ -34,7 +34,8 @@ int NAME(step)(real t, real h, const real *q0, const real *p0, const real *param
   status = solve(&step, &data, memory, &guess, dq, dp, options ? options : &standard, report, memory + MEMORY);
   if (status != OK)
     return status;
-  if (!reaches(q0, dq) || !reaches(p0, dp))
+  report->duration = duration(&step, &data, memory, guess, memory + MEMORY);
+  if (!reaches(q0, dq) || !reaches(p0, dp) || 0 * report->duration != 0)
     return NOT_FINITE;
   report->steps = 1;
   for (int i = 0; i < M; i++) {
@@ -98,7 +99,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
   solver_report unread;
   solver_data data;
   long long stored = 0;
-  real dq[2 * M] = {0}, dp[2 * M] = {0}; /* increments, then their low parts */
+  real passed = 0, dq[2 * M] = {0}, dp[2 * M] = {0}; /* time; increments, then their low parts */
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   load_state(run, &now);
@@ -110,7 +111,9 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     report->t = step.t = now.t;
     status = solve(&step, &data, run->memory, &run->guess, dq, dp, options ? options : &standard, report,
         workspace + SCRATCH);
-    if (status == OK && (!reaches(now.q, dq) || !reaches(now.p, dp)))
+    if (status == OK)
+      passed = duration(&step, &data, run->memory, run->guess, workspace + SCRATCH);
+    if (status == OK && (!reaches(now.q, dq) || !reaches(now.p, dp) || 0 * passed != 0))
       status = NOT_FINITE;
     if (status != OK) {
       save_state(&now, run);
@@ -121,7 +124,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
     add_compensated(now.p, now.carry_p, dp);
     run->iterations += report->iterations - before;
     run->step++;
-    add_to_time(&now.t, &now.t_low, step.h);
+    add_to_time(&now.t, &now.t_low, passed);
     report->steps++;
     if (run->step % every == 0) {
       t[stored] = now.t;
@@ -132,6 +135,7 @@ int NAME(advance)(run_memory *run, long long steps, long long every, const real 
       stored++;
     }
   }
+  report->duration = passed;
   save_state(&now, run);
   return OK;
 }

@@ -115,7 +115,7 @@ def solve_motion(
         trajectory = stepper.integrate(
             q,
             p,
-            **_steps(start, end, h, rtol),
+            **_steps(stepper, start, end, h, rtol),
             t=start,
             parameters=parameters,
             options=options,
@@ -130,11 +130,13 @@ def solve_motion(
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
 
 
-def _steps(start: float, end: float, h: float | None, rtol: float | None) -> dict[str, Any]:
+def _steps(stepper: Stepper, start: float, end: float, h: float | None, rtol: float | None) -> dict[str, Any]:
     """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
     if rtol is not None:
         return {"h": h, "t_end": end, "tolerance": rtol}
     assert h is not None
+    if stepper.interface.energy_parameter:
+        return {"h": math.copysign(checked_step(h), end - start), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}
 

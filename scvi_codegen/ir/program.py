@@ -21,7 +21,7 @@ from scvi_codegen.ir.sweeps import (
 if TYPE_CHECKING:
     pass
 
-__all__ = ["MomentumMap", "Program"]
+__all__ = ["Integrals", "MomentumMap", "Program"]
 
 WORTH_REMEMBERING = 32
 """Unknowns from which on factors of the Newton matrix go from step to step. With 16 (Kepler's problem, degree 8) new
@@ -35,6 +35,19 @@ class MomentumMap:
     name: str
     formula: str
     exact: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Integrals:
+    """Functions f that are integrated along a run, by the method's own quadrature: h sum_n weights[n] f(u_n) a step.
+
+    Attributes:
+        kernel: the functions, at the arguments of the points.
+        weights: (g,) of the points.
+    """
+
+    kernel: Kernel
+    weights: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +82,7 @@ class Program:
         order: of the method; where none is claimed, the number of its points.
         stage_highest: (B,) what gives the highest Legendre coefficient of the velocities of the stages; empty where the
             unknowns are others.
+        integrals: what is integrated along a run, or ``None``; the first is the time that passes.
     """
 
     prefix: str
@@ -99,6 +113,7 @@ class Program:
     newton: bool
     order: int
     stage_highest: tuple[float, ...]
+    integrals: Integrals | None = None
 
     @property
     def dimension(self) -> int:
@@ -128,7 +143,8 @@ class Program:
         pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
         actions = {family.action.name: family.action for family in self.families if self.newton and family.action}
         maps = (self.momentum_kernel,) if self.momentum_kernel else ()
-        return (*pairs, self.legendre, *({self.energy.name: self.energy} | actions).values(), *maps)
+        integrands = (self.integrals.kernel,) if self.integrals else ()
+        return (*pairs, self.legendre, *({self.energy.name: self.energy} | actions).values(), *maps, *integrands)
 
     @property
     def action(self) -> bool:

@@ -131,6 +131,7 @@ class PointSweep:
         guess: from the velocities of former steps to those of the next.
         kernel: what gives the velocities.
         force: F alone.
+        integrands: what is integrated along the curve, if anything.
     """
 
     points: int
@@ -145,11 +146,12 @@ class PointSweep:
     guess: GuessTables
     kernel: Kernel
     force: Kernel
+    integrands: Kernel | None = None
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those with lanes."""
-        return (self.kernel, self.force)
+        return (self.kernel, self.force, *((self.integrands,) if self.integrands else ()))
 
     @property
     def error_power(self) -> int:

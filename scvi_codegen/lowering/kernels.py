@@ -11,7 +11,14 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["system_kernel"]
+__all__ = ["integrand_kernel", "system_kernel"]
+
+
+def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) -> Kernel | None:
+    """What a run of the system integrates along its curve, at the arguments u; ``None`` if nothing."""
+    if not system.integrands:
+        return None
+    return system_kernel(system, name, system.integrands, of=of, purpose="What is integrated along the curve.")
 
 
 def system_kernel(

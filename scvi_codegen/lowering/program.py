@@ -18,13 +18,14 @@ from collections.abc import Sequence
 
 import sympy
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.program import MomentumMap, Program
+from scvi_codegen.ir.program import Integrals, MomentumMap, Program
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.ir.sweeps import Splitting, Sweep
 from scvi_codegen.lowering.families import lowered_family
-from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.mechanics.forms import forms_of
@@ -99,6 +100,7 @@ def lower(
         newton=newton,
         order=method.order or len(stages.blocks),
         stage_highest=_stage_highest(stages) if newton and splitting is None else (),
+        integrals=_integrals(system, method, stages),
     )
 
 
@@ -108,6 +110,18 @@ def _stage_highest(stages: StageSystem) -> tuple[float, ...]:
     if not isinstance(shape, Velocities) or not 1 < len(shape.blocks) == len(set(shape.blocks)) == len(stages.blocks):
         return ()
     return lower_vector(legendre_functional(shape.blocks, len(shape.blocks) - 1))
+
+
+def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) -> Integrals | None:
+    kernel = integrand_kernel(system, "integrands", stages.families[0].arguments)
+    if kernel is None:
+        return None
+    if not isinstance(stages.shape, Velocities):
+        raise MethodError(
+            f"{method.name} keeps no curve at the end of a step whose points give the time of '{system.name}': take "
+            "an SVI, or a Runge-Kutta method in phase space"
+        )
+    return Integrals(kernel=kernel, weights=lower_vector(stages.shape.weights))
 
 
 def _legendre_kernel(system: MechanicalSystem) -> Kernel:

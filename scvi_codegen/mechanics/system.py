@@ -110,6 +110,11 @@ class MechanicalSystem(ABC):
         return dict(zip(self.parameters, self.defaults, strict=True))
 
     @property
+    def integrands(self) -> tuple[Expr, ...]:
+        """What a run integrates along its curve, in the coordinates and auxiliaries: the rate of the clock."""
+        return (self.clock.rate,) if self.clock else ()
+
+    @property
     def depends_on_time(self) -> bool:
         """Whether time occurs in the function: energy is then not conserved."""
         return self.time in self.formula.free_symbols

@@ -131,6 +131,7 @@ def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventS
         dimension=interface.dimension,
         kernel=kernel,
         uses_velocity=uses_velocity,
+        transformed=bool(interface.energy_parameter),
         nodes=lower_vector(to_unit(points)),
         coefficients=lower_matrix(coefficients),
         doubts=(0.5 ** (DEGREE - 2), 0.5 ** (DEGREE - 1)),

@@ -116,7 +116,7 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamilt
     mass = sweep.mass if isinstance(sweep, SeparableSweep) else None
     applied = (*sweep.kernels, *((mass,) if mass and not meaning.are_points else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    solver = ("newton_fallback" if newton else "no_fallback", "sweep_solver") if meaning.are_points else ()
+    solver = _solver(sweep, newton=newton) if meaning.are_points else ()
     return SweepText(
         lanes=lanes,
         meaning=meaning,
@@ -180,6 +180,14 @@ def _support(sweep: Sweep) -> tuple[str, ...]:
             return (mass, "known_velocity", "curve", "ends_by_transform", "collocation_sweep")
         case _:
             return (mass, "unknown_velocity", "curve", "curve_points", "ends_by_quadrature", "collocation_sweep")
+
+
+def _solver(sweep: Sweep, *, newton: bool) -> tuple[str, ...]:
+    """Headers of the solver around a sweep whose lanes are points, in order."""
+    solver = ("newton_fallback" if newton else "no_fallback", "sweep_solver")
+    if not isinstance(sweep, PointSweep) or sweep.integrands is None:
+        return solver
+    return (*solver, f"{sweep.kind}_integrals", "integrals_after_fallback" if newton else "integrals_after_sweep")
 
 
 def _tables(sweep: Sweep, meaning: Lanes) -> Iterator[str]:

@@ -111,6 +111,7 @@ class Interface:
         map_names, map_formulas: of the momentum maps, what symmetries conserve.
         map_exact: whether the method is known to conserve them exactly, to round-off.
         momentum_names: of a Hamiltonian; see :attr:`momenta`.
+        energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
     """
 
     prefix: str
@@ -129,6 +130,7 @@ class Interface:
     map_exact: tuple[bool, ...] = ()
     momentum_names: tuple[str, ...] = ()
     has_fallback: bool = False
+    energy_parameter: str = ""
 
     @property
     def dimension(self) -> int:

@@ -78,6 +78,7 @@ class EventSearch:
         prefix, dimension: of the integrator.
         kernel: the functions at u = (q, p, v).
         uses_velocity: whether v occurs in them.
+        transformed: whether time is, so that the integrator's velocities are dq/dtau.
         nodes: (d + 1,) where they are evaluated on a part of a step, as fractions of it.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
         doubts: of the last two of these, what part of them is in doubt.
@@ -87,9 +88,15 @@ class EventSearch:
     dimension: int
     kernel: Kernel
     uses_velocity: bool
+    transformed: bool
     nodes: tuple[float, ...]
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
+
+    @property
+    def velocity(self) -> str:
+        """The support header that gives v."""
+        return "event_velocity_by_clock" if self.transformed else "event_velocity"
 
 
 def render(program: Program, control: Control | None = None) -> Source:
@@ -124,9 +131,14 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
 
 
 def render_ensemble(program: Program) -> Source | None:
-    """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver."""
+    """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver.
+
+    Also with integrals: where time is one of these, trajectories have no common times.
+    """
     sweep = program.sweep
     if not isinstance(sweep, SeparableSweep | CoupledSweep) or (isinstance(sweep, CoupledSweep) and sweep.projected):
+        return None
+    if program.integrals:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {

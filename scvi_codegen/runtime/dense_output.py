@@ -23,11 +23,12 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import step_failure
+from scvi_codegen.runtime.clock import states_by_clock
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.memory import Memory
 
-__all__ = ["checked_times", "grid_tolerance", "lengths_at", "states_at", "times_of_run"]
+__all__ = ["checked_times", "grid_tolerance", "lengths_at", "states_and_steps_at", "states_at", "times_of_run"]
 
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0
@@ -41,17 +42,26 @@ def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
         StateError: for times outside, or if the states kept do not stand at whole steps (those of ``t_eval``).
         StepFailedError: if a step of a part of h fails.
     """
+    q, p, _ = states_and_steps_at(states, times)
+    return q, p
+
+
+def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array, Array]:
+    """The same, and (n,) what steps are made of, tau or t."""
     times = _within(times, states.t[0], states.t[-1])
+    if states.tau is not None:
+        _check_on_grid(states)
+        return states_by_clock(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     if states.goal is not None and np.isnan(states.lengths[:-1]).any():
-        return _run_to_each(states, left, times, states.goal)
+        return *_run_to_each(states, left, times, states.goal), times
     _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
     whole = _whole_steps(times - t, np.nan_to_num(states.lengths[left], nan=np.inf))
     between = np.flatnonzero(whole)
     _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
     _take_parts(states, t, times - t, q, p)
-    return q, p
+    return q, p, times
 
 
 def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal: Goal) -> tuple[Array, Array]:
@@ -154,7 +164,7 @@ def _within(times: Array, first: float, last: float) -> Array:
 
 def grid_tolerance(states: KeptStates) -> Array:
     """(n,) by how much a state may seem to be off the end of a step: times are rounded."""
-    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.t).max()
+    rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped).max()
     tolerance: Array = np.fmax(ON_GRID * np.abs(states.lengths), rounding)
     return tolerance
 

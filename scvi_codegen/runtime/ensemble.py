@@ -89,10 +89,18 @@ class Ensemble:
             raise StateError(f"q has shape {start_q.shape}, p {start_p.shape}")
         self.count = len(start_q)
         self.parameters = _parameters(stepper, parameters, self.count)
+        if not stepper.has_energy(parameters):
+            for j in range(self.count):
+                level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
+                self.parameters[j, level] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
         kept = self.steps // self.every + 1
         self.q, self.p = (empty_array((kept, self.count, stepper.dimension)) for _ in "qp")
         self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = start_q, start_p
+        self.times = None
+        if stepper.interface.energy_parameter:
+            self.times = np.full((kept, self.count), np.nan)
+            self.times[0] = self.t0
         self.status = np.full(self.count, OK, dtype="<U16")
         self.done = np.zeros(self.count, dtype=np.int64)
 
@@ -143,7 +151,8 @@ class Ensemble:
         unfinished = (self.status == OK) & (self.done < self.steps)
         number = self.every * np.arange(len(self.q), dtype=np.float64)
         return EnsembleTrajectory(
-            t=times_after(self.t0, self.h, number)[0],
+            t=times_after(self.t0 if self.times is None else 0.0, self.h, number)[0],
+            times=self.times,
             q=self.q,
             p=self.p,
             status=np.where(unfinished, INTERRUPTED, self.status),
@@ -273,6 +282,8 @@ class _Alone:
         work.done[j] = run.steps
         rows = slice(row, row + len(trajectory) - 1)
         work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
+        if work.times is not None:
+            work.times[rows, j] = trajectory.t[1:]
 
 
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:

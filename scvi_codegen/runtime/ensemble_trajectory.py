@@ -33,7 +33,7 @@ class EnsembleTrajectory:
     """States of k trajectories at common times, the initial one first.
 
     Attributes:
-        t: (n,) times.
+        t: (n,) times; where time is transformed tau, from 0.
         q, p: (n, k, m) positions and momenta; NaN after a failure.
         status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
             ``"interrupted"``).
@@ -41,6 +41,7 @@ class EnsembleTrajectory:
         h: step size.
         parameters: (k, number of parameters).
         stepper: the compiled integrator.
+        times: (n, k) where time is transformed, else ``None``: every trajectory has its own.
     """
 
     t: Array
@@ -51,6 +52,7 @@ class EnsembleTrajectory:
     h: float
     parameters: Array
     stepper: Integrator = field(repr=False)
+    times: Array | None = None
 
     def __len__(self) -> int:
         return len(self.status)
@@ -105,6 +107,7 @@ class EnsembleTrajectory:
             MissingLibraryError: without h5netcdf or zarr (extra ``data``).
         """
         suffix, known = Path(path).suffix.lower(), checked_units(units)
+        self._check_common_times()
         if suffix in LABELLED:
             check_format(path)
             write_whole(path, lambda made: LABELLED[suffix](self._labelled(known), made))
@@ -126,7 +129,12 @@ class EnsembleTrajectory:
             StateError: for units of something else.
             MissingLibraryError: without xarray (extra ``data``).
         """
+        self._check_common_times()
         return to_dataset(self._labelled(checked_units(units)))
+
+    def _check_common_times(self) -> None:
+        if self.times is not None:
+            raise StateError("in transformed time trajectories have no common times: files of ensembles need them")
 
     def _labelled(self, units: Mapping[str, str]) -> Labelled:
         """The arrays with names for their dimensions."""

@@ -114,7 +114,7 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
         StateError: if states between were not kept.
         EventError, StepFailedError: as :meth:`CrossingSearch.search`.
     """
-    lengths, spans, tolerance = states.lengths.copy(), np.diff(states.t), grid_tolerance(states)[:-1]
+    lengths, spans, tolerance = states.lengths.copy(), np.diff(states.stepped), grid_tolerance(states)[:-1]
     short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
     if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
         raise StateError(

@@ -5,7 +5,7 @@ All calls into C release the GIL and share nothing, so one integrator may be use
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +19,14 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.events import Event, EventLike, as_events
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_states, checked_vector
+from scvi_codegen.runtime.inputs import (
+    Array,
+    Parameters,
+    checked_parameters,
+    checked_states,
+    checked_vector,
+    parameter_index,
+)
 
 __all__ = ["Integrator"]
 
@@ -123,7 +130,7 @@ class Integrator:
 
         Args:
             q, p: (m,) positions and momenta.
-            h: step size, negative to go back.
+            h: step size, negative to go back; in transformed time of tau.
             t: time.
             parameters: by name (others keep their defaults) or all in order.
             options: convergence of the stage equations.
@@ -135,7 +142,8 @@ class Integrator:
             StateError: on wrong shapes, names or non-finite numbers.
             StepFailedError: if the stage equations cannot be solved.
         """
-        q0, p0, values = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
+        q0, p0 = self._vector(q, "q"), self._vector(p, "p")
+        values = self.parameters_at(q0, p0, parameters)
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
         report = self.binding.new("report *")
         status = self.binding.function("step")(
@@ -192,6 +200,30 @@ class Integrator:
             events=self.events,
         )
 
+    def parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
+        """(k,) values in order; in transformed time the energy is that of the state (q, p) unless it is given."""
+        values = self._parameters(parameters)
+        if not self.has_energy(parameters):
+            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
+        return values
+
+    def has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
+        """Whether the energy that transformed time needs is among the parameters given; true where it needs none."""
+        name = self.interface.energy_parameter
+        return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
+
+    def rates(self, q: ArrayLike, p: ArrayLike, parameters: Parameters = None) -> Array:
+        """(n,) rates dt/dtau at (n, m) states; 1 where time is not transformed."""
+        _, positions, momenta = checked_states(self.interface, q, p, 0.0)
+        found = np.ones(positions.size // self.dimension)
+        if not self.interface.energy_parameter:
+            return found
+        values = self.binding.pointer(self._parameters(parameters))
+        pointers = map(self.binding.pointer, (positions, momenta))
+        if self.binding.function("rates")(len(found), *pointers, values, self.binding.pointer(found)):
+            raise StateError("the rate of time, the monitor, is not a positive number at a state")
+        return found
+
     def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
         return self._transform("momentum", q, v, t, parameters, "v")
@@ -220,20 +252,23 @@ class Integrator:
         return self._transform("momentum", q, velocity, t, parameters, "velocity")
 
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
-        """Energy p.v - L: a float for (m,) states, (n,) for (n, m) states with one time or (n,) times."""
+        """Energy p.v - L of the system itself: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
+        values = self._parameters(parameters)
         result = np.empty(len(times))
         status = self.binding.function("energies")(
             len(times),
             self.binding.pointer(times),
             self.binding.pointer(positions),
             self.binding.pointer(momenta),
-            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(values),
             self.binding.pointer(result),
             self.binding.workspace(),
         )
         if status:
             raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
+        if name := self.interface.energy_parameter:
+            result = values[parameter_index(self.interface, name)] + result / self.rates(positions, momenta, values)
         return float(result[0]) if np.ndim(q) == 1 else result
 
     def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
@@ -374,6 +409,19 @@ class Integrator:
         return result
 
     def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
+        """In transformed time between p and dq/dt, on the level of the state's own energy."""
+        if not self.interface.energy_parameter:
+            return self._called(name, t, q, other, values)
+        if name == "velocity":
+            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, other, t, values)
+            return self._called(name, t, q, other, values) / self.rates(q, other, values)
+        rate = self.rates(q, np.zeros_like(q), values)
+        p = self._called(name, t, q, other * rate, values)
+        if self.rates(q, p, values) != rate:
+            raise StateError("the rate of time depends on momenta, so that velocities do not give them: give p")
+        return p
+
+    def _called(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
         result = np.empty_like(other)
         status = self.binding.function(name)(
             t,

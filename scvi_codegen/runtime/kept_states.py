@@ -23,6 +23,7 @@ class KeptStates:
 
     Attributes:
         lengths: (n,) of the step that follows each state, not a number for a state between two steps.
+        tau: (n,) of each state where time is transformed, else ``None``; lengths are then of tau.
     """
 
     t: Array
@@ -34,6 +35,12 @@ class KeptStates:
     stepper: Integrator = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
     goal: Goal | None = field(default=None, repr=False)
+    tau: Array | None = None
+
+    @property
+    def stepped(self) -> Array:
+        """(n,) what lengths are differences of: tau, or t."""
+        return self.t if self.tau is None else self.tau
 
     @property
     def forward(self) -> float:

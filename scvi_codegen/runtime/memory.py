@@ -64,7 +64,7 @@ class Memory:
             binding.pointer(p0),
         )
         goal = h if isinstance(h, Goal) else None
-        return cls(stepper, memory, checked_parameters(interface, parameters), options, goal)
+        return cls(stepper, memory, stepper.parameters_at(q0, p0, parameters), options, goal)
 
     @classmethod
     def restored(
@@ -87,6 +87,8 @@ class Memory:
         _check_memory(memory)
         if (memory.h == 0.0) != (goal is not None):
             raise StateError("a saved run whose steps choose their length goes on to a t_end, any other does not")
+        if not stepper.has_energy(parameters):
+            raise StateError("a saved run in transformed time goes on with its own energy: give its run.parameters")
         return cls(stepper, memory, checked_parameters(stepper.interface, parameters), options, goal)
 
     @property

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.runtime.dense_output import lengths_at, states_at
+from scvi_codegen.runtime.clock import part_of_step
+from scvi_codegen.runtime.dense_output import lengths_at, states_and_steps_at
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import SLICE_SECONDS, record, trajectory_of
@@ -35,23 +36,31 @@ class Observation:
         run: to be advanced.
         every: keep the present state and each whose step number is a multiple of this, if no times are given.
         times: (n,) sorted as the run goes; keep the states at these.
+        end: in transformed time, where the run ends, by a last step that is shorter.
     """
 
-    def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None) -> None:
+    def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None, end: float | None = None) -> None:
         self.run, self.every, self.times = run, checked_count(every, "every", least=1), times
         self.search = CrossingSearch(run.stepper) if run.stepper.events else None
-        self.states: list[tuple[Array, Array, Array, Array, NDArray[np.int64]]] = []
+        self.end, self.arrived = end, False
+        self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations = 0
 
+    @property
+    def ended(self) -> bool:
+        """Whether the run ended inside of a step, which is not taken: by a terminal event, or where it was to end."""
+        return self.arrived or (self.search is not None and self.search.ended)
+
     def advance(self, steps: int | None, progress: Callable[[int], None] | None = None) -> Trajectory:
-        """Advance by ``steps`` (to the goal), or to the step in which a terminal event ends the run; that is not taken.
+        """Advance by ``steps`` (``None``: to the end), or to the step in which a terminal event ends the run.
 
         Raises:
             StepFailedError: with what was kept as ``trajectory``; the run stands before the failing step.
             EventError: where an event function is not finite.
         """
         goal = self.run.goal
-        most_steps = np.inf if steps is None and goal else checked_count(steps, "steps", least=0)
+        on = steps is None and (goal or self.end is not None)
+        most_steps = np.inf if on else checked_count(steps, "steps", least=0)
         self._keep(record(self.run, 0), first=True)
         most = max(1, NUMBERS // self.run.stepper.dimension)
         portion, done = min(FIRST_STEPS, most), 0
@@ -62,7 +71,7 @@ class Observation:
             except StepFailedError as failure:
                 failure.trajectory = self.trajectory()
                 raise
-            if self.search is not None and self.search.ended:
+            if self.ended:
                 break
             done += size
             if progress is not None:
@@ -78,11 +87,14 @@ class Observation:
             part = record(self.run, size)
         except StepFailedError as error:
             part, failure = Trajectory.before(error), error
+        if self.end is not None and (part.t[-1] - self.end) * self.run.h >= 0.0:
+            self.run.rewind(before)
+            part, failure = self._arrived(part), None
         if self.search is not None:
-            reached = self.search.search(part, first=self.run.steps - len(part) + 1)
+            reached = self.search.search(part, first=self.run.steps - len(part) + 1 + self.arrived)
             if self.search.ended:
                 self.run.rewind(before)
-                part, failure = self._ended(record(self.run, reached)), None
+                part, failure, self.arrived = self._ended(record(self.run, reached)), None, False
         self._keep(part)
         if failure is not None:
             raise failure
@@ -90,28 +102,54 @@ class Observation:
     def _ended(self, part: Trajectory) -> Trajectory:
         """The part with the state at which the event ended it."""
         assert self.search is not None
-        last = self.search.found[-1][-1:]
+        last = self.search.found[-1][-1]
+        _, _, tau = self._inside(part, float(last["t"]))
+        return self._closed(part, part.lengths, last["t"], last["q"], last["p"], tau)
+
+    def _arrived(self, part: Trajectory) -> Trajectory:
+        """The part up to the end, by a last step of such a length; the run stands before that step."""
+        assert self.end is not None
+        self.arrived = True
+        whole = int(np.count_nonzero((self.end - part.t) * self.run.h >= 0.0)) - 1
+        part = record(self.run, whole)
+        q, p, tau = self._inside(part, self.end)
+        lengths = part.lengths.copy()
+        if tau is not None:
+            lengths[-1] = tau - part.stepped[-1]
+        return self._closed(part, lengths, self.end, q, p, tau)
+
+    def _inside(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
+        """The state at a time in the step that follows a part, and its tau; of plain time the last state."""
+        if part.tau is None or t == part.t[-1]:
+            return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
+        run = self.run
+        q, p, x = part_of_step(run.stepper, run.t, run.h, t, part.q[-1], part.p[-1], run.parameters, run.options)
+        return q, p, float(part.tau[-1]) + x * run.h
+
+    def _closed(self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None) -> Trajectory:
+        """A part with one more state, inside of a step."""
         return self._made(
-            np.append(part.t, last["t"]),
-            np.concatenate([part.q, last["q"]]),
-            np.concatenate([part.p, last["p"]]),
+            np.append(part.t, t),
+            np.concatenate([part.q, [q]]),
+            np.concatenate([part.p, [p]]),
             np.append(part.iterations, np.int32(0)),
-            np.append(part.lengths, np.nan),
+            np.append(lengths, np.nan),
+            np.append(part.stepped, t if tau is None else tau),
         )
 
     def _keep(self, part: Trajectory, *, first: bool = False) -> None:
         """What is wanted of a part, whose first state was dealt with unless it is the first of all."""
-        ended = self.search is not None and self.search.ended
         total = self.iterations + np.cumsum(part.iterations, dtype=np.int64)
         self.iterations = int(total[-1])
         if self.times is not None:
             self._keep_times(part, total, first=first)
             return
-        number = self.run.steps - (len(part) - 1 - ended) + np.arange(len(part))
+        number = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part))
         wanted = number % self.every == 0
         wanted[0] = first
-        wanted[-1] |= ended or self.run.arrived
-        self.states.append((part.t[wanted], part.q[wanted], part.p[wanted], part.lengths[wanted], total[wanted]))
+        wanted[-1] |= self.ended or self.run.arrived
+        q, p = part.q[wanted], part.p[wanted]
+        self.states.append((part.t[wanted], q, p, part.lengths[wanted], part.stepped[wanted], total[wanted]))
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
         assert self.times is not None
@@ -119,15 +157,18 @@ class Observation:
         left, right = forward * part.t[0], forward * part.t[-1]
         after = forward * self.times >= left if first else forward * self.times > left
         times = self.times[after & (forward * self.times <= right)]
-        q, p = states_at(part, times)
+        q, p, stepped = states_and_steps_at(part, times)
         behind = np.searchsorted(forward * part.t, forward * times, side="right") - 1
-        self.states.append((times, q, p, lengths_at(part, times), total[behind]))
+        self.states.append((times, q, p, lengths_at(part, times), stepped, total[behind]))
 
     def trajectory(self) -> Trajectory:
         """All that was kept so far."""
-        t, q, p, lengths, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
-        return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32), lengths)
+        t, q, p, lengths, stepped, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
+        return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32), lengths, stepped)
 
-    def _made(self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], lengths: Array) -> Trajectory:
+    def _made(
+        self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], lengths: Array, stepped: Array
+    ) -> Trajectory:
         crossings = self.search.crossings() if self.search is not None else ()
-        return trajectory_of(self.run, t, q, p, iterations, lengths=lengths, events=crossings)
+        tau = stepped if self.run.stepper.interface.energy_parameter else None
+        return trajectory_of(self.run, t, q, p, iterations, lengths=lengths, events=crossings, tau=tau)

@@ -15,6 +15,7 @@ from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["SLICE_SECONDS", "record", "record_states", "record_until", "trajectory_of"]
@@ -57,13 +58,23 @@ def record_states(
         done += report.steps
         filled = 1 + (first + done) // every - first // every
         if status:
-            kept = trajectory_of(memory, t[:filled], q[:filled], p[:filled], iterations[:filled])
+            kept = trajectory_of(
+                memory, t[:filled], q[:filled], p[:filled], iterations[:filled], tau=_tau(memory, first, every, filled)
+            )
             raise step_failure(status, report, step=memory.steps, h=memory.h, kept=kept)
         if progress is not None:
             progress(done)
         elapsed = max(time.perf_counter() - began, 1e-6)
         portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
-    return trajectory_of(memory, t, q, p, iterations)
+    return trajectory_of(memory, t, q, p, iterations, tau=_tau(memory, first, every, len(t)))
+
+
+def _tau(memory: Memory, first: int, every: int, count: int) -> Array | None:
+    """Of the state after ``first`` steps and those after it that ``every`` divides; 0 before the first step."""
+    if not memory.stepper.interface.energy_parameter:
+        return None
+    numbers = np.append(first, every * (first // every + np.arange(1, count)))
+    return times_after(0.0, memory.h, numbers)[0]
 
 
 def record_until(
@@ -131,6 +142,7 @@ def trajectory_of(
     *,
     lengths: Array | None = None,
     events: tuple[Crossings, ...] = (),
+    tau: Array | None = None,
 ) -> Trajectory:
     """These states as states of this integration, each before a step of h if no lengths are given."""
     step_error, step_error_t = memory.step_error
@@ -150,6 +162,7 @@ def trajectory_of(
         stepper=memory.stepper,
         options=memory.options,
         events=events,
+        tau=tau,
     )
 
 

@@ -25,7 +25,15 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
     def maps(rows: NDArray[np.intp]) -> Array:
         return stepper.momentum_maps(q[rows], p[rows], t[rows], parameters)
 
-    found = {"velocity": _velocities(stepper, parameters, t, q, p), "energy": np.full(len(t), np.nan)}
+    def rates(rows: NDArray[np.intp]) -> Array:
+        return stepper.rates(q[rows], p[rows], parameters)
+
+    per_time = np.full(len(t), np.nan)
+    _fill(per_time, given, rates)
+    found = {
+        "velocity": _velocities(stepper, parameters, t, q, p) / per_time[:, np.newaxis],
+        "energy": np.full(len(t), np.nan),
+    }
     _fill(found["energy"], given, energies)
     if names := stepper.momentum_map_names:
         found["momentum_map"] = np.full((len(t), len(names)), np.nan)

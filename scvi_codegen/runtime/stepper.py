@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.dense_output import times_of_run
@@ -62,13 +63,14 @@ class Stepper(Integrator):
         Args:
             q, p: (m,) initial positions and momenta.
             velocity: (m,) initial velocities, in place of p.
-            h: step size, negative to go back.
+            h: step size, negative to go back; in transformed time (:func:`~scvi_codegen.reparametrise`) of tau.
             steps: number of steps.
-            t_end: instead of both: where to go, by steps that choose their length. The last ends there exactly.
+            t_end: instead of both: where to go, by steps that choose their length. The last ends there exactly. In
+                transformed time instead of steps alone: steps of h, the last of them shorter, lead there.
             tolerance: relative error of the end of such a step; by default round-off. Many of them add up.
             every: steps between kept states; the one at t_end is kept, too.
             t: initial time.
-            parameters, options: as in :meth:`step`.
+            parameters, options: as in :meth:`step`; an energy that transformed time needs is that of (q, p).
             progress: called now and then with the number of steps done.
             t_eval: (n,) times, sorted as the run goes: keep the states at these instead, as :meth:`Trajectory.at` gives
                 them.
@@ -85,25 +87,30 @@ class Stepper(Integrator):
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
         stepper = self if events is None else self.with_events(events)
+        if t_eval is not None and every != 1:
+            raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
+        clocked = bool(self.interface.energy_parameter)
         run = stepper.start(
             q,
             p,
             velocity=velocity,
             h=h,
             t=t,
-            t_end=t_end,
+            t_end=None if clocked else t_end,
             tolerance=tolerance,
             parameters=parameters,
             options=options,
         )
+        if clocked and t_end is not None:
+            return _go_until(run, t_end, steps, every, t_eval, progress)
         if run.goal is None and steps is None:
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if run.goal is not None and steps is not None:
             raise StateError(f"steps that choose their length go to t_end={t_end}: leave out steps={steps}")
-        if t_eval is not None and every != 1:
-            raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
         if t_eval is None:
             return run.record(steps, every=every, progress=progress)
+        if clocked:
+            raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
         return Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress)
 
     def integrate_ensemble(
@@ -167,6 +174,8 @@ class Stepper(Integrator):
         By steps of h, or of their own lengths to t_end.
         """
         p = self.momenta_given(q, p, velocity, t, parameters)
+        if h is None and self.interface.energy_parameter:
+            raise StateError("in transformed time steps of tau have one length: give h")
         if t_end is not None and h is None:
             goal = Goal.checked(t_end, tolerance)
             return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
@@ -192,6 +201,24 @@ class Stepper(Integrator):
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
         return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+
+
+def _go_until(
+    run: Run,
+    t_end: float,
+    steps: int | None,
+    every: int,
+    t_eval: ArrayLike | None,
+    progress: Callable[[int], None] | None,
+) -> Trajectory:
+    """The trajectory of a run in transformed time to t_end."""
+    end = checked_number(t_end, "the time t_end")
+    if steps is not None:
+        raise StateError(f"the run ends after steps={steps} or at t_end={end:g}: give one of the two")
+    if (end - run.t) * run.h < 0.0:
+        raise StateError(f"steps of h = {run.h:g} do not lead from t = {run.t:g} to t_end = {end:g}")
+    times = None if t_eval is None else times_of_run(t_eval, run.t, end)
+    return Observation(run, every=every, times=times, end=end).advance(None, progress)
 
 
 def _end_of(run: Run, steps: int | None) -> float:

@@ -50,6 +50,8 @@ class Trajectory(KeptStates):
         h: step size (negative: backward).
         lengths: (n,) of the step that follows each state, h for steps that are all the same; not a number for a state
             between two steps, of ``t_eval`` or where an event ended the run.
+        tau: (n,) of a system in transformed time (:func:`~scvi_codegen.reparametrise`): h and lengths are steps of it;
+            else ``None``.
         parameters: (k,) values in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
         options: convergence of the stage equations, ``None`` for the defaults.

@@ -1,7 +1,7 @@
-/* The search for zero crossings, by nothing of an integrator but its public functions. Before it: numbers.h, the kernel
- * event_functions, EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES, EVENT_NODES: where on a part of a step functions are
- * evaluated, as fractions of it, EVENT_COEFFICIENTS: from values there to coefficients of x^k, with x from -1 to 1 on
- * the part, and EVENT_DOUBTS: what part of the last two of these is in doubt. */
+/* The search for zero crossings, by nothing of an integrator but its public functions. Before it: numbers.h,
+ * event_velocity, the kernel event_functions, EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES, EVENT_NODES: where on a part
+ * of a step functions are evaluated, as fractions of it, EVENT_COEFFICIENTS: from values there to coefficients of x^k,
+ * with x from -1 to 1 on the part, and EVENT_DOUBTS: what part of the last two of these is in doubt. */
 enum {
   EVENT_SPLITS = 6, /* a step is split into parts at most so many times over */
   EVENT_TRIALS = 200, /* at most so many states are tried for one crossing: bisection takes 52 */
@@ -22,7 +22,7 @@ int NAME(event_values)(real t, const real *q, const real *p, const real *paramet
   memcpy(u, q, sizeof(real) * M);
   memcpy(u + M, p, sizeof(real) * M);
   if (EVENTS_USE_VELOCITIES)
-    status = NAME(velocity)(t, q, p, parameters, u + 2 * M, workspace);
+    status = event_velocity(t, q, p, parameters, u + 2 * M, workspace);
   if (status != OK)
     return status;
   event_functions(u, t, parameters, value);
@@ -31,12 +31,12 @@ int NAME(event_values)(real t, const real *q, const real *p, const real *paramet
 
 /* The state at a fraction of a step, and the functions there. */
 typedef struct {
-  real fraction, g[EVENTS], q[M], p[M];
+  real fraction, t, g[EVENTS], q[M], p[M];
 } event_sample;
 
 /* A step whose inside is searched, and where its crossings go. */
 typedef struct {
-  real t, end, h;
+  real t, h;
   const real *q, *p, *parameters;
   const solver_options *options;
   event_watch *watch;
@@ -47,9 +47,9 @@ typedef struct {
 } event_step;
 
 /* The functions at the state of a sample; says which is not finite. */
-static int evaluate_functions(const event_step *step, real t, event_sample *sample)
+static int evaluate_functions(const event_step *step, event_sample *sample)
 {
-  const int status = NAME(event_values)(t, sample->q, sample->p, step->parameters, sample->g, step->workspace);
+  const int status = NAME(event_values)(sample->t, sample->q, sample->p, step->parameters, sample->g, step->workspace);
   if (status == NOT_FINITE)
     for (int e = EVENTS - 1; e >= 0; e--)
       if (!all_finite(sample->g + e, 1))
@@ -64,9 +64,10 @@ static int take_sample(const event_step *step, real fraction, event_sample *samp
   const int status = NAME(step)(step->t, fraction * step->h, step->q, step->p, step->parameters, step->options,
       sample->q, sample->p, &own, step->workspace);
   sample->fraction = fraction;
+  sample->t = step->t + own.duration;
   step->report->iterations += own.iterations;
   step->report->change = own.change;
-  return status == OK ? evaluate_functions(step, step->t + fraction * step->h, sample) : status;
+  return status == OK ? evaluate_functions(step, sample) : status;
 }
 
 static int changes_sign(real from, real to)
@@ -194,7 +195,7 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   status = enclose_crossing(step, e, *from, &at);
   if (status != OK)
     return status;
-  crossing->t = at.fraction < 1.0 ? step->t + at.fraction * step->h : step->end;
+  crossing->t = at.t;
   crossing->function = e;
   memcpy(crossing->q, at.q, sizeof at.q);
   memcpy(crossing->p, at.p, sizeof at.p);
@@ -310,14 +311,15 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   memset(report, 0, sizeof *report);
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
-    const event_step step = {t[start], t[k], h[start], q + start * M, p + start * M, parameters, options, watch, found,
-        room, filled, report, workspace};
+    const event_step step = {t[start], h[start], q + start * M, p + start * M, parameters, options, watch, found, room,
+        filled, report, workspace};
     int status;
     report->t = t[start];
     right.fraction = k > 0 ? 1.0 : 0.0;
+    right.t = t[k];
     memcpy(right.q, q + k * M, sizeof right.q);
     memcpy(right.p, p + k * M, sizeof right.p);
-    status = evaluate_functions(&step, t[k], &right);
+    status = evaluate_functions(&step, &right);
     if (status == OK && k > 0) {
       left.fraction = 0.0;
       status = search_step(&step, &left, &right);

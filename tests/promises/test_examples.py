@@ -18,6 +18,7 @@ from scvi_codegen.models.model_file import load_model
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
     "curves_and_quadratures",
+    "eccentric_comet",
     "custom_sympy_system",
     "import_generated_stepper",
     "inspect_derivation",
@@ -75,6 +76,15 @@ def test_kepler_conservation_tells_the_methods_apart(tmp_path):
     assert max(errors["SVI, degree 4"]) < 1.1 * min(errors["SVI, degree 4"])
     assert errors["spectral collocation, degree 4"][2] > 10 * errors["spectral collocation, degree 4"][0]
     assert min(errors["explicit Euler"]) > 0.1
+
+
+def test_eccentric_comet_keeps_its_energy(tmp_path):
+    rows = [line[12:].split() for line in output_of("eccentric_comet", tmp_path).splitlines()[1:]]
+    (stretched, regular) = ([float(word) for word in row] for row in rows)
+    assert stretched[1] > 1000 * stretched[2]
+    assert stretched[3] < 1e-9
+    assert regular[3] < 1e-11
+    assert regular[4] < 1e-9
 
 
 def test_curves_and_quadratures_win_where_they_say(tmp_path):

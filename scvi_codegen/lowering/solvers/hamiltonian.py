@@ -9,7 +9,7 @@ variational method still has a generating function.
 from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import HamiltonianSweep
-from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
@@ -44,4 +44,5 @@ def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
         guess=guess_tables(tables.blocks, lanes),
         kernel=system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
+        integrands=integrand_kernel(system, "integrand_lanes", of),
     )

@@ -35,10 +35,12 @@ __all__ = ["separable_sweep"]
 def separable_sweep(problem: StepProblem) -> SeparableSweep | None:
     """The fixed-point iteration of a separable system; ``None`` of others, and with too many points.
 
+    Nothing is integrated along its curve, whose velocities it does not keep.
+
     Position form and phase-space form are the same there.
     """
     system, shape = problem.lagrangian, problem.shape
-    if system is None or not forms_of(system).separable:
+    if system is None or not forms_of(system).separable or system.integrands:
         return None
     if isinstance(shape, Accelerations):
         tables: VelocityTables | None = tableau_tables(shape.tableau.c, shape.tableau.A, shape.tableau.b)

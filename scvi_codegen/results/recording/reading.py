@@ -18,6 +18,7 @@ from scvi_codegen.files.labelled import checked_units
 from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
 from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -76,7 +77,8 @@ class RecordedRun:
             raise TypeError(
                 f"a recorded run is indexed by slices, as in run[-1000:], not by {rows!r}; see run.q, run.p"
             )
-        return self._trajectory(tuple(self.gather(self.rows(rows), range(len(COLUMNS)))))
+        wanted = self.rows(rows)
+        return self._trajectory(tuple(self.gather(wanted, range(len(COLUMNS)))), wanted)
 
     @cached_property
     def stepper(self) -> Stepper:
@@ -104,7 +106,10 @@ class RecordedRun:
 
     def pieces(self) -> Iterator[Trajectory]:
         """The run in parts, one after the other."""
-        yield from map(self._trajectory, self._pieces())
+        first = 0
+        for piece in self._pieces():
+            yield self._trajectory(piece, np.arange(first, first + len(piece[0])))
+            first += len(piece[0])
 
     def _pieces(self) -> Iterator[Piece]:
         for path in self._paths[:-1]:
@@ -174,8 +179,10 @@ class RecordedRun:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`."""
         write_states(self.states(units), path)
 
-    def _trajectory(self, piece: tuple[Any, ...]) -> Trajectory:
+    def _trajectory(self, piece: tuple[Any, ...], rows: NDArray[np.int64]) -> Trajectory:
         t, q, p, iterations = piece
+        taken = self.manifest.every * rows
+        transformed = bool(self.manifest.interface.energy_parameter)
         return Trajectory(
             t=t,
             q=q,
@@ -185,6 +192,7 @@ class RecordedRun:
             h=self.manifest.h,
             parameters=np.array(self.manifest.parameters),
             stepper=self.stepper,
+            tau=times_after(0.0, self.manifest.h, taken)[0] if transformed else None,
         )
 
 

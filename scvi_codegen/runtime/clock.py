@@ -1,0 +1,91 @@
+"""Transformed time: the part of a step that ends at a time, and states between.
+
+A run of a system with a clock takes steps of tau, dt = rate dtau, and carries t along, summed by the method's own
+quadrature. What users give and get is in t: velocities are dq/dt and energies those of the system itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.kept_states import KeptStates
+
+__all__ = ["part_of_step", "states_by_clock"]
+
+
+def part_of_step(
+    stepper: Integrator,
+    t: float,
+    h: float,
+    end: float,
+    q: Array,
+    p: Array,
+    parameters: Array,
+    options: SolverOptions | None,
+) -> tuple[Array, Array, float]:
+    """State at the time ``end`` inside a step of h from (q, p) at t, and at what part of the step that is.
+
+    Raises:
+        StepFailedError: if a step of a part of h fails.
+    """
+    binding = stepper.binding
+    start_q, start_p, q1, p1 = (np.array(x, dtype=float) for x in (q, p, q, p))
+    part, report = binding.number("double *"), binding.new("report *")
+    status = binding.function("part_of_step")(
+        t,
+        h,
+        end,
+        binding.pointer(start_q),
+        binding.pointer(start_p),
+        binding.pointer(parameters),
+        binding.options(options),
+        binding.pointer(q1),
+        binding.pointer(p1),
+        part,
+        report,
+        binding.workspace(),
+    )
+    if status:
+        raise step_failure(status, report, step=0, h=h)
+    return q1, p1, float(part[0])
+
+
+def states_by_clock(states: KeptStates, times: Array) -> tuple[Array, Array, Array]:
+    """(n, m) positions and momenta, and (n,) tau, at (n,) times within the states."""
+    assert states.tau is not None
+    (q, p), tau = np.empty((2, len(times), states.q.shape[1])), np.empty(len(times))
+    left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
+    for kept in np.unique(left):
+        t_near, q_near, p_near, h = _steps_from(states, int(kept))
+        for k in np.flatnonzero(left == kept):
+            j = int(np.searchsorted(states.forward * t_near, states.forward * times[k], side="right")) - 1
+            q[k], p[k], part = q_near[j], p_near[j], 0.0
+            if times[k] != t_near[j]:
+                q[k], p[k], part = part_of_step(
+                    states.stepper, t_near[j], h, times[k], q[k], p[k], states.parameters, states.options
+                )
+            tau[k] = states.tau[kept] + (j + part) * h
+    return q, p, tau
+
+
+def _steps_from(states: KeptStates, kept: int) -> tuple[Array, Array, Array, float]:
+    """The states of all steps from one that was kept to the one before the next, and the length of these steps."""
+    assert states.tau is not None
+    t, q, p = (array[kept : kept + 1] for array in (states.t, states.q, states.p))
+    h = float(np.nan_to_num(states.lengths[kept], nan=states.h))
+    count = round((states.tau[kept + 1] - states.tau[kept]) / h) if kept + 1 < len(states) else 1
+    if count <= 1:
+        return t, q, p, h
+    from scvi_codegen.runtime.memory import Memory
+
+    run = Memory.started(
+        states.stepper, q[0], p[0], h=h, t=float(t[0]), parameters=states.parameters, options=states.options
+    )
+    times, positions, momenta = np.empty(count - 1), *np.empty((2, count - 1, q.shape[1]))
+    status, report = run.advance(count - 1, 1, times, positions, momenta, np.empty(count - 1, dtype=np.int32))
+    if status:
+        raise step_failure(status, report, step=run.steps, h=h)
+    return np.append(t, times), np.concatenate([q, positions]), np.concatenate([p, momenta]), h

@@ -1,0 +1,11 @@
+/* Velocities that functions of events are given, dq/dt where an integrator has dq/dtau. Before it: answers.h. */
+static int event_velocity(real t, const real *q, const real *p, const real *parameters, real *v, real *workspace)
+{
+  real rate;
+  int status = NAME(velocity)(t, q, p, parameters, v, workspace);
+  if (status == OK)
+    status = NAME(rates)(1, q, p, parameters, &rate);
+  for (int i = 0; status == OK && i < M; i++)
+    v[i] /= rate;
+  return status;
+}
