@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,6 +13,8 @@ from samples import Sample, compile_quickly, sample_named, stepper_for
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.stepper import Stepper
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell
 
 
 @pytest.fixture(scope="session")
