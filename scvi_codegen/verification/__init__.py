@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
@@ -71,6 +71,8 @@ def verify(
         MethodError: if the method does not take the system, or has no such solver.
         StateError: if only one of q and p is given, or no state is found.
     """
+    if system.clock is not None:
+        raise MethodError(f"certificates of motions in transformed time are not made: '{system.name}' has none")
     began = time.perf_counter()
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
