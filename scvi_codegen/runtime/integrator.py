@@ -5,20 +5,16 @@ All calls into C release the GIL and share nothing, so one integrator may be use
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
-from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.runtime.events import Event, EventLike, as_events
+from scvi_codegen.runtime.compiled_method import CompiledMethod
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -31,90 +27,8 @@ from scvi_codegen.runtime.inputs import (
 __all__ = ["Integrator"]
 
 
-def no_text() -> None:
-    """Of a method without a text for many trajectories, or for steps that choose their length."""
-
-
-class Integrator:
-    """One method for one system, compiled.
-
-    Attributes:
-        title: system and method, one line.
-        coordinates, parameters: names in order.
-        defaults: (k,) default parameter values.
-        dimension: degrees of freedom m.
-        momentum_map_names: what symmetries conserve.
-        source: the C text it was compiled from.
-        events: zero crossings that every run records.
-    """
-
-    def __init__(
-        self,
-        source: Source,
-        interface: Interface,
-        *,
-        ensemble: Callable[[], Source | None] = no_text,
-        controlled: Callable[[], Source | None] = no_text,
-        flags: tuple[str, ...] = building.TUNED_FLAGS,
-        events: tuple[Event, ...] = (),
-    ) -> None:
-        self.interface, self.flags, self.events = interface, flags, events
-        self._ensemble, self._controlled = ensemble, controlled
-        self._with_control: Self | None = None
-        self._plain = source
-        self.source = _watching(source, interface, events) if events else source
-        self.binding = Binding(building.load(self.source, flags=flags), interface.prefix, interface.workspace)
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.title}>"
-
-    def _repr_html_(self) -> str:
-        interface = self.interface
-        parameters = zip(interface.parameters, interface.defaults, strict=True)
-        return card(
-            interface.title,
-            (
-                ("method", plain(", ".join(interface.notes))),
-                ("coordinates", listed(interface.coordinates)),
-                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
-                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
-            ),
-        )
-
-    @property
-    def ensemble(self) -> Source | None:
-        """The C text for many trajectories at once, derived when first asked for; ``None`` if the method has none."""
-        return self._ensemble()
-
-    @property
-    def title(self) -> str:
-        """System and method, one line."""
-        return self.interface.title
-
-    @property
-    def coordinates(self) -> tuple[str, ...]:
-        """Coordinate names."""
-        return self.interface.coordinates
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Parameter names."""
-        return self.interface.parameters
-
-    @property
-    def defaults(self) -> Array:
-        """(k,) default parameter values."""
-        return np.array(self.interface.defaults, dtype=float)
-
-    @property
-    def momentum_map_names(self) -> tuple[str, ...]:
-        """What symmetries of the system conserve: ``"angular momentum"``, ``"boost of x"``."""
-        return self.interface.map_names
-
-    @property
-    def dimension(self) -> int:
-        """Degrees of freedom m."""
-        return self.interface.dimension
+class Integrator(CompiledMethod):
+    """What a compiled method computes."""
 
     def step(
         self,
@@ -161,44 +75,6 @@ class Integrator:
         if status:
             raise step_failure(status, report, step=0, h=h)
         return q1, p1
-
-    def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
-        """The same integrator, whose runs record these events in place of its own."""
-        wanted = as_events(events)
-        if wanted == self.events:
-            return self
-        return type(self)(
-            self._plain,
-            self.interface,
-            ensemble=self._ensemble,
-            controlled=self._controlled,
-            flags=self.flags,
-            events=wanted,
-        )
-
-    def controlled(self) -> Self:
-        """The same integrator with steps that choose their length, loaded once; MethodError where it has none."""
-        if self._with_control is None:
-            self._with_control = self._loaded_with_control()
-        return self._with_control
-
-    def _loaded_with_control(self) -> Self:
-        source = self._controlled()
-        if source is None:
-            raise MethodError(
-                f"{self.interface.method} has no steps that choose their length for this system: they need a "
-                "fixed-point iteration (solver 'auto' or 'fixed-point') of two points or more; give h and steps"
-            )
-        if source == self._plain:
-            return self
-        return type(self)(
-            source,
-            self.interface,
-            ensemble=self._ensemble,
-            controlled=self._controlled,
-            flags=self.flags,
-            events=self.events,
-        )
 
     def parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
         """(k,) values in order; in transformed time the energy is that of the state (q, p) unless it is given."""
@@ -441,9 +317,3 @@ class Integrator:
 
     def _parameters(self, parameters: Parameters) -> Array:
         return checked_parameters(self.interface, parameters)
-
-
-def _watching(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
-    from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
-
-    return with_events(source, interface, tuple(event.function for event in events))

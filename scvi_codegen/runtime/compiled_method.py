@@ -1,0 +1,150 @@
+"""A method compiled for one system: its text, loaded, and what it is called, also with events and controlled steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Self
+
+import numpy as np
+
+from scvi_codegen.display.cards import card, listed, plain
+from scvi_codegen.errors import MethodError
+from scvi_codegen.native import building
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.events import Event, EventLike, as_events
+from scvi_codegen.runtime.inputs import (
+    Array,
+)
+
+__all__ = ["CompiledMethod", "no_text"]
+
+
+def no_text() -> None:
+    """Of a method without a text for many trajectories, or for steps that choose their length."""
+
+
+class CompiledMethod:
+    """One method for one system, compiled.
+
+    Attributes:
+        title: system and method, one line.
+        coordinates, parameters: names in order.
+        defaults: (k,) default parameter values.
+        dimension: degrees of freedom m.
+        momentum_map_names: what symmetries conserve.
+        source: the C text it was compiled from.
+        events: zero crossings that every run records.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        interface: Interface,
+        *,
+        ensemble: Callable[[], Source | None] = no_text,
+        controlled: Callable[[], Source | None] = no_text,
+        flags: tuple[str, ...] = building.TUNED_FLAGS,
+        events: tuple[Event, ...] = (),
+    ) -> None:
+        self.interface, self.flags, self.events = interface, flags, events
+        self._ensemble, self._controlled = ensemble, controlled
+        self._with_control: Self | None = None
+        self._plain = source
+        self.source = _watching(source, interface, events) if events else source
+        self.binding = Binding(building.load(self.source, flags=flags), interface.prefix, interface.workspace)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.title}>"
+
+    def _repr_html_(self) -> str:
+        interface = self.interface
+        parameters = zip(interface.parameters, interface.defaults, strict=True)
+        return card(
+            interface.title,
+            (
+                ("method", plain(", ".join(interface.notes))),
+                ("coordinates", listed(interface.coordinates)),
+                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
+                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
+            ),
+        )
+
+    @property
+    def ensemble(self) -> Source | None:
+        """The C text for many trajectories at once, derived when first asked for; ``None`` if the method has none."""
+        return self._ensemble()
+
+    @property
+    def title(self) -> str:
+        """System and method, one line."""
+        return self.interface.title
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Coordinate names."""
+        return self.interface.coordinates
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Parameter names."""
+        return self.interface.parameters
+
+    @property
+    def defaults(self) -> Array:
+        """(k,) default parameter values."""
+        return np.array(self.interface.defaults, dtype=float)
+
+    @property
+    def momentum_map_names(self) -> tuple[str, ...]:
+        """What symmetries of the system conserve: ``"angular momentum"``, ``"boost of x"``."""
+        return self.interface.map_names
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return self.interface.dimension
+
+    def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
+        """The same integrator, whose runs record these events in place of its own."""
+        wanted = as_events(events)
+        if wanted == self.events:
+            return self
+        return type(self)(
+            self._plain,
+            self.interface,
+            ensemble=self._ensemble,
+            controlled=self._controlled,
+            flags=self.flags,
+            events=wanted,
+        )
+
+    def controlled(self) -> Self:
+        """The same integrator with steps that choose their length, loaded once; MethodError where it has none."""
+        if self._with_control is None:
+            self._with_control = self._loaded_with_control()
+        return self._with_control
+
+    def _loaded_with_control(self) -> Self:
+        source = self._controlled()
+        if source is None:
+            raise MethodError(
+                f"{self.interface.method} has no steps that choose their length for this system: they need a "
+                "fixed-point iteration (solver 'auto' or 'fixed-point') of two points or more; give h and steps"
+            )
+        if source == self._plain:
+            return self
+        return type(self)(
+            source,
+            self.interface,
+            ensemble=self._ensemble,
+            controlled=self._controlled,
+            flags=self.flags,
+            events=self.events,
+        )
+
+
+def _watching(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+    from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
+
+    return with_events(source, interface, tuple(event.function for event in events))
