@@ -142,6 +142,7 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
 #include "support/lagrangian.h"
 #include "support/energies.h"
 #include "support/momentum_maps.h"
+#include "support/gather.h"
 #include "support/stages.h"
 
 /* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */

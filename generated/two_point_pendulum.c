@@ -38,17 +38,7 @@ static const double MOMENTUM_ROW[1] = {1.0};
 static const double STRAIGHT[1] = {1.0};
 static const double MOMENTA[1] = {0.0};
 static const double MOVES[1] = {1.0};
-
-/* Quadrature: 2 points. Gather tables have one row a
- * block and one column a point, scatter tables one row a point and one column a row of equations, a last one for p1.
- * {i, j}: slope d value_i / d u_j. */
 static const double QUADRATURE_WEIGHT[2] = {0.5, 0.5};
-static const double QUADRATURE_GATHER_0[1][2] = {{0.21132486540518713, 0.7886751345948129}};
-static const double QUADRATURE_GATHER_1[1][2] = {{1.0, 1.0}};
-static const double QUADRATURE_SCATTER_0[2][2] = {{0.7886751345948129, 1.0}, {0.21132486540518713, 1.0}};
-static const double QUADRATURE_SCATTER_1[2][2] = {{-1.0, 0.0}, {-1.0, 0.0}};
-static const int QUADRATURE_SLOPE_0[1][2] = {{0, 0}};
-static const int QUADRATURE_SLOPE_1[1][2] = {{0, 0}};
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
 static const int PLACE[SITES] = {0};
@@ -97,31 +87,17 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 #include "support/legendre.h"
 #include "support/lagrangian.h"
 #include "support/energies.h"
-#include "support/stages.h"
+#include "support/gather.h"
+#include "support/entry.h"
 
-/* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */
-static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian,
-    const band *shape)
+/* Quadrature points, 2: u = (q, v) at each. */
+static void quadrature_points(const step_data *step, const double *z, double *u)
 {
   const double h = step->h;
-  double *u = step->scratch, *value = u + 4, *slope = value + 4;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, 1, u + 0, 2, 1);
-  offset(step, 2, u + 0, 2);
-  gather(QUADRATURE_GATHER_1[0], 2, 1, z, 1, u + 1, 2, 1);
-  for (int n = 0; n < 2; n++) {
-    if (jacobian)
-      quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, slope + n * 2);
-    else
-      quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
-  }
-  scatter(QUADRATURE_SCATTER_0[0], 2, QUADRATURE_WEIGHT, h, value + 0, 2, 1, rows, size);
-  scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 1, 2, 1, rows, size);
-  if (!jacobian)
-    return;
-  scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0, 1,
-      slope + 0, 2, jacobian, shape);
-  scatter_slopes(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 1,
-      slope + 1, 2, jacobian, shape);
+  u[0] = step->q0[0] + (step->carry_q[0] + h * (0.21132486540518713 * z[0]));
+  u[1] = z[0];
+  u[2] = step->q0[0] + (step->carry_q[0] + h * (0.7886751345948129 * z[0]));
+  u[3] = z[0];
 }
 
 /* The stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
@@ -129,8 +105,28 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
 static void evaluate(const step_data *step, const double *z, double *rows, double *size_p, double *size_q,
     double *jacobian, const band *shape)
 {
-  begin_rows(step, z, rows, size_p, size_q, jacobian, shape);
-  add_quadrature(step, z, rows, size_p, jacobian, shape);
+  const double h = step->h;
+  double u[4], value[4], slope[4];
+  quadrature_points(step, z, u);
+  for (int n = 0; n < 2; n++) {
+    if (jacobian)
+      quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, slope + n * 2);
+    else
+      quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
+  }
+
+  /* (34d), to be 0, where q1 = q0 + h sum_b END_POSITION[b] z_b, (34c). */
+  rows[0] = step->p0[0] + 0.7886751345948129 * (0.5 * h * value[0]) + 0.21132486540518713 * (0.5 * h * value[2]) -
+      0.5 * value[1] - 0.5 * value[3];
+  /* p1 - p0, (34e). */
+  rows[1] = 0.5 * h * value[0] + 0.5 * h * value[2];
+  size_p[0] = MATH(fabs)(step->p0[0]) + MATH(fabs)(0.5 * h * value[0]) + MATH(fabs)(0.5 * h * value[2]);
+  size_q[0] = MATH(fabs)(step->q0[0]) + MATH(fabs)(h * z[0]);
+  if (!jacobian)
+    return;
+  memset(jacobian, 0, sizeof(double) * band_size(shape));
+  *entry(jacobian, shape, 0, 0, 0, 0) = 0.7886751345948129 * (0.5 * (h * h) * slope[0] * 0.21132486540518713) +
+      0.21132486540518713 * (0.5 * (h * h) * slope[2] * 0.7886751345948129) + (-0.5 * slope[1] - 0.5 * slope[3]);
 }
 
 #include "support/newton.h"
@@ -213,9 +209,7 @@ static double quadrature_sum(const step_data *step, const double *z)
 {
   const double h = step->h;
   double *u = step->scratch, sum = 0;
-  gather(QUADRATURE_GATHER_0[0], 2, h, z, 1, u + 0, 2, 1);
-  offset(step, 2, u + 0, 2);
-  gather(QUADRATURE_GATHER_1[0], 2, 1, z, 1, u + 1, 2, 1);
+  quadrature_points(step, z, u);
   for (int n = 0; n < 2; n++) {
     double value[1];
     lagrangian(u + n * 2, step->t, step->parameters, value);

@@ -1,20 +1,6 @@
 /* Sums between blocks of unknowns z and points, the same for every method. Before it: real, M, B, POINTS, PLACE,
- * band.h, step.h. Unknown b of site i is z[i B + b]; row r of site i is rows[i (B + 1) + r], the last one for p1. The
- * first M sites are the coordinates. */
-
-/* scale sum_b table[b][n] z_b for so many sites i from z on and every point n, into u[n * across + i * along]. */
-static inline void gather(const real *table, int points, real scale, const real *z, int sites, real *u, int across,
-    int along)
-{
-  for (int i = 0; i < sites; i++) {
-    real sum[POINTS] = {0};
-    for (int b = 0; b < B; b++)
-      for (int n = 0; n < points; n++)
-        sum[n] += table[b * points + n] * z[i * B + b];
-    for (int n = 0; n < points; n++)
-      u[n * across + i * along] = scale * sum[n];
-  }
-}
+ * band.h, step.h, gather.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
+ * coordinates. */
 
 /* u = q0 + u at every point, with what rounding cut off q0 before. */
 static inline void offset(const step_data *step, int points, real *u, int across)

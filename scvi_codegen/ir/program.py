@@ -21,11 +21,14 @@ from scvi_codegen.ir.sweeps import (
 if TYPE_CHECKING:
     pass
 
-__all__ = ["Integrals", "MomentumMap", "Program"]
+__all__ = ["FEW_UNKNOWNS", "Integrals", "MomentumMap", "Program"]
 
 WORTH_REMEMBERING = 32
 """Unknowns from which on factors of the Newton matrix go from step to step. With 16 (Kepler's problem, degree 8) new
 ones take as long as the additional iterations with old ones, with 34 twice as long, with 144 ten times."""
+
+FEW_UNKNOWNS = 3
+"""Up to so many, equations may be written out in place of loops over tables."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +85,8 @@ class Program:
         order: of the method; where none is claimed, the number of its points.
         stage_highest: (B,) what gives the highest Legendre coefficient of the velocities of the stages; empty where the
             unknowns are others.
+        numbers: the paper's, of equations for a few unknowns, and of those for q1 and p1; ``""`` where
+            it has none.
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
     """
 
@@ -113,6 +118,7 @@ class Program:
     newton: bool
     order: int
     stage_highest: tuple[float, ...]
+    numbers: tuple[str, str, str]
     integrals: Integrals | None = None
 
     @property

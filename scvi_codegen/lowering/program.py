@@ -21,7 +21,7 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.program import Integrals, MomentumMap, Program
+from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program
 from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.ir.sweeps import Splitting, Sweep
 from scvi_codegen.lowering.families import lowered_family
@@ -101,7 +101,17 @@ def lower(
         order=method.order or len(stages.blocks),
         stage_highest=_stage_highest(stages) if newton and splitting is None else (),
         integrals=_integrals(system, method, stages),
+        numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
+
+
+def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:
+    """The paper's numbers: of the last ``count`` rows, where those before them give what occurs in no other; q1, p1."""
+    paper = method.paper_form(system)
+    known = dict.fromkeys(row.number for row in paper.rows[-count:] if row.number[:1].isdigit())
+    rows = ", ".join(f"({number})" for number in known)
+    q1, p1 = (f"({number})" if number[:1].isdigit() else "" for number in paper.end_numbers)
+    return rows, q1, p1
 
 
 def _stage_highest(stages: StageSystem) -> tuple[float, ...]:

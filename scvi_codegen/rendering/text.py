@@ -23,6 +23,7 @@ from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, MAX_ITERATIONS, SINGLE, Target
+from scvi_codegen.rendering.written_out import written_out
 
 __all__ = [
     "EMBEDDED",
@@ -215,7 +216,7 @@ def _context(program: Program, target: Target) -> dict[str, object]:
         "max_iterations": MAX_ITERATIONS,
         "most_iterations": "INT_MAX",
         "embedded": False,
-        "written_out": False,
+        "written_out": written_out(program, target),
         "control": None,
         **_lane_context(program),
     }

@@ -1,0 +1,15 @@
+/* Unknowns z to values at points. Before it: real, B, POINTS. Unknown b of site i is z[i B + b]. */
+
+/* scale sum_b table[b][n] z_b for so many sites i from z on and every point n, into u[n * across + i * along]. */
+static inline void gather(const real *table, int points, real scale, const real *z, int sites, real *u, int across,
+    int along)
+{
+  for (int i = 0; i < sites; i++) {
+    real sum[POINTS] = {0};
+    for (int b = 0; b < B; b++)
+      for (int n = 0; n < points; n++)
+        sum[n] += table[b * points + n] * z[i * B + b];
+    for (int n = 0; n < points; n++)
+      u[n * across + i * along] = scale * sum[n];
+  }
+}
