@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
 from scvi_codegen.runtime.compiled_method import CompiledMethod
 from scvi_codegen.runtime.inputs import (
@@ -275,7 +275,7 @@ class Integrator(CompiledMethod):
     def _transform(
         self, name: str, q: ArrayLike, other: ArrayLike, t: ArrayLike, parameters: Parameters, label: str
     ) -> Array:
-        if np.ndim(q) == 1:
+        if real_array(q, "q").ndim == 1:
             at, values = checked_number(t, "the time t"), self._parameters(parameters)
             return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
         times, positions, others = checked_states(self.interface, q, other, t, second=label)

@@ -86,7 +86,11 @@ class Memory:
         buffer[:] = saved
         _check_memory(memory)
         if (memory.h == 0.0) != (goal is not None):
-            raise StateError("a saved run whose steps choose their length goes on to a t_end, any other does not")
+            raise StateError(
+                "these bytes are not a saved run of fixed steps: one whose steps choose their length goes on to a t_end"
+                if goal is None
+                else "these bytes are not a saved run whose steps choose their length: one of fixed steps has no t_end"
+            )
         if not stepper.has_energy(parameters):
             raise StateError("a saved run in transformed time goes on with its own energy: give its run.parameters")
         return cls(stepper, memory, checked_parameters(stepper.interface, parameters), options, goal)

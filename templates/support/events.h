@@ -64,7 +64,7 @@ static int take_sample(const event_step *step, real fraction, event_sample *samp
   const int status = NAME(step)(step->t, fraction * step->h, step->q, step->p, step->parameters, step->options,
       sample->q, sample->p, &own, step->workspace);
   sample->fraction = fraction;
-  sample->t = step->t + own.duration;
+  sample->t = step->t + part_lasts(fraction * step->h, &own);
   step->report->iterations += own.iterations;
   step->report->change = own.change;
   return status == OK ? evaluate_functions(step, sample) : status;
