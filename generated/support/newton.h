@@ -88,8 +88,8 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
 
 /* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
  * longer shrinking. A stiff force makes of the rounding of positions much more in the momenta: there positions alone
- * are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off
- * from slow progress. */
+ * are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they must have done so
+ * once, and twice to tell round-off from slow progress. */
 static int has_converged(const solver_options *options, const movement *moved, real last, int trials)
 {
   if (trials < 2)
@@ -124,7 +124,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const r
 /* Factors of the Jacobian just evaluated; remembers where. Returns 0 if it is singular. */
 static int linearise(const step_data *step, const newton_data *data, const band *shape)
 {
-  if (POINT) {
+  if (POINT > 0) {
     data->point[0] = step->t;
     memcpy(data->point + 1, step->q0, sizeof(real) * M);
     memcpy(data->point + 1 + M, step->carry_q, sizeof(real) * M);

@@ -33,7 +33,7 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   const newton_data data = newton_in(workspace);
   int status = NOT_CONVERGED, keep = 0;
   (void)unused;
-  if (POINT && *guess == 2)
+  if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, &data) : 1;
   if (*guess) {
     gather(EXTRAPOLATION[0], B, 1, memory, M, data.z, 1, B);
@@ -47,6 +47,6 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   gather(END_POSITION, 1, step->h, data.z, M, dq, 0, 1);
   memcpy(memory, data.z, sizeof(real) * N);
   memcpy(memory + N, data.point, sizeof(real) * POINT);
-  *guess = POINT && keep ? 2 : 1;
+  *guess = POINT > 0 && keep ? 2 : 1;
   return status;
 }

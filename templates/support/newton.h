@@ -124,7 +124,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const r
 /* Factors of the Jacobian just evaluated; remembers where. Returns 0 if it is singular. */
 static int linearise(const step_data *step, const newton_data *data, const band *shape)
 {
-  if (POINT) {
+  if (POINT > 0) {
     data->point[0] = step->t;
     memcpy(data->point + 1, step->q0, sizeof(real) * M);
     memcpy(data->point + 1 + M, step->carry_q, sizeof(real) * M);
