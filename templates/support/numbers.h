@@ -4,8 +4,9 @@
 #pragma clang diagnostic ignored "-Wunused-function" /* a method takes what it needs of what is inline here */
 #endif
 
-/* What is seldom run, with all that only it calls, is compiled for size: in half the time. */
-#ifdef __GNUC__
+/* What is seldom run, with all that only it calls, is compiled for size: in half the time. Not on a board: functions
+ * that are not inlined for it take more of the stack. */
+#if defined(__GNUC__) && __STDC_HOSTED__
 #define SELDOM __attribute__((cold))
 #else
 #define SELDOM
