@@ -6,7 +6,10 @@ folders of Zarr. Every variable has a ``long_name``, and ``units`` where they we
 
 from __future__ import annotations
 
+import errno
 import importlib
+import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +79,11 @@ class Labelled:
         units = {"units": self.units[name]} if name in self.units else {}
         return {"long_name": LONG_NAMES[name], **units}
 
+    def size(self) -> int:
+        """Bytes of all arrays, texts left out."""
+        shapes = [(self.shape(name), _kind(name)) for name in self.along()]
+        return sum(int(np.prod(shape)) * kind.itemsize for shape, kind in shapes)
+
     def along(self) -> list[str]:
         """Names of the arrays along t."""
         return [name for name in self.dimensions if name not in self.whole]
@@ -117,7 +125,9 @@ def to_dataset(labelled: Labelled) -> xarray.Dataset:
 
 
 def write_hdf5(labelled: Labelled, path: Path) -> None:
-    """A file of netCDF4."""
+    """A file of netCDF4; OSError where there is no room for it, which HDF5 itself does not survive."""
+    if shutil.disk_usage(path.parent).free < labelled.size():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
     texts = imported("h5py").string_dtype()
     with imported("h5netcdf").File(path, "w") as file:
         file.attrs.update(labelled.attributes)
