@@ -85,7 +85,7 @@ class TestHelp:
             words = re.split(r" {2,}| > ", line)[0].split()
             if "--steps" not in words and words[0] == "run":
                 words += ["--span", "10"] if "--span" not in words else []
-            words += ["--list"] if words[0] == "reproduce" else []  # running it takes minutes
+            words += {"reproduce": ["--list"], "bench": ["--quick"]}.get(words[0], [])  # running them takes minutes
             output_of(*words)
 
     def test_version(self):
