@@ -55,14 +55,14 @@ def written_out(program: Program, target: Target) -> WrittenOut | None:
     """The equations written out, ``None`` where loops over tables are shorter."""
     if not program.newton or program.unknowns > FEW_UNKNOWNS:
         return None
-    writer = _Writer(program, target)
+    writer = _Statements(program, target)
     entries = writer.entries()
     if sum(len(group) for groups in entries.values() for group in groups) > MOST_TERMS:
         return None
     return writer.written(entries)
 
 
-class _Writer:
+class _Statements:
     """Writes tables as sums."""
 
     def __init__(self, program: Program, target: Target) -> None:
