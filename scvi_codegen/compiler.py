@@ -81,7 +81,7 @@ def compile_stepper(
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
         symmetries: known beside those that are found
-        (:func:`~scvi_codegen.mechanics.symmetry.symmetry.check_symmetry`): their momentum
+        (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`): their momentum
             maps are tracked, too.
         events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
 

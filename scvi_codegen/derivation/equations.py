@@ -127,7 +127,8 @@ class StepEquations:
 
     def _conserved(self) -> Iterator[str]:
         if self.symmetries:
-            yield "\nconserved (momentum maps of symmetries affine in the coordinates, which are what is searched)"
+            variables = "positions and momenta" if self.system.auxiliaries else "the coordinates"
+            yield f"\nconserved (momentum maps of symmetries affine in {variables}, which are what is searched)"
         for symmetry in self.symmetries:
             yield f"  {symmetry}{'' if self.method.exactness.keeps(symmetry) else '  (not guaranteed by this method)'}"
 

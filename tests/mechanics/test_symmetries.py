@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from itertools import combinations
 
@@ -16,7 +17,8 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, check_symmetry, symmetries
+from scvi_codegen.mechanics.symmetry.checking import check_symmetry
+from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
     SCVI,
@@ -265,6 +267,41 @@ def test_a_hamiltonian_has_the_symmetries_of_its_lagrangian():
         assert formulas(hamiltonian_of(system)) == formulas(system)
 
 
+def phase_space(hamiltonian: str, coordinates: str, momenta: str, **parameters: float) -> HamiltonianSystem:
+    return HamiltonianSystem.from_text(
+        name="phase space",
+        coordinates=coordinates.split(),
+        momenta=momenta.split(),
+        hamiltonian=hamiltonian,
+        parameters=parameters,
+    )
+
+
+ROTATOR = phase_space("(x**2 + p**2)**2/4", "x", "p")
+CYLINDER = phase_space(
+    "(log((x1**2 + y1**2 - 1)*(x2**2 + y2**2 - 1)/((x1 - x2)**2 + (y1 - y2)**2))"
+    " + log((x1*x2 + y1*y2 - 1)**2 + (x1*y2 - x2*y1)**2))/(4*pi)",
+    "x1 x2",
+    "y1 y2",
+)
+"""Two vortices of strength 1 outside a cylinder of radius 1, with their images."""
+
+
+def test_symmetries_that_mix_positions_and_momenta():
+    assert formulas(ROTATOR) == {"quadratic invariant": "x**2 + p**2"}
+    assert formulas(CYLINDER) == {"quadratic invariant": "x1**2 + x2**2 + y1**2 + y2**2"}
+    isotropic = phase_space("(p**2 + r**2)/(2*m) + k*(x**2 + y**2)/2", "x y", "p r", m=1.3, k=2.0)
+    assert formulas(isotropic) == {
+        "angular momentum": "x*r - y*p",
+        "quadratic invariant": "k*m*x*y + p*r",
+        "quadratic invariant (2)": "k*m*x**2 + p**2",
+    }  # with the energy, Fradkin's tensor
+
+
+def test_an_energy_is_no_symmetry_but_of_time():
+    assert symmetries(phase_space("p**2/(2*m) + k*x**2/2", "x", "p", m=1.3, k=2.0)) == ()
+
+
 def rate(system: MechanicalSystem, symmetry: Symmetry) -> sympy.Expr:
     """dJ/dt along a motion, by SymPy's own derivatives: accelerations from the Euler-Lagrange equations, solved."""
     at = dict(zip(symmetry.momenta, forms_of(system).momentum, strict=True))
@@ -302,6 +339,33 @@ def test_given_directions_are_checked():
         assert check_symmetry(kepler, direction).formula == "q1*p_q2 - q2*p_q1"
     assert check_symmetry(particle("m*g*y", g=9.81), [0, "-t"]).formula == "m*y - p_y*t - g*m*t**2/2"
     assert check_symmetry(hamiltonian_of(kepler), ["-q2", "q1"]).formula == "q1*p_q2 - q2*p_q1"
+
+
+def test_given_generators_are_checked():
+    assert check_symmetry(ROTATOR, generator="x**2 + p**2").direction == (2 * Symbol("p", real=True),)
+    assert check_symmetry(CYLINDER, generator="x1**2 + y1**2 + x2**2 + y2**2", name="impulse").name == "impulse"
+    kepler = problem("kepler").system
+    lenz = check_symmetry(kepler, generator="(q1*p_q2 - q2*p_q1)*p_q2 - mu*q1/sqrt(q1**2 + q2**2)")
+    assert sympy.simplify(rate(kepler, lenz)) == 0
+    turned = sum(p * xi for p, xi in zip(lenz.momenta, lenz.direction, strict=True)) - lenz.gauge
+    assert sympy.expand(turned - lenz.momentum_map) == 0
+
+
+WRONG_GENERATORS = {
+    "its rate of change, is p*x*(2*p**2 + 2*x**2)/2, not 0": {"generator": "x**2/2"},
+    "a direction, perhaps with its gauge, or a generator alone": {"generator": "x", "direction": ["x"]},
+    "wants a direction, or a generator": {},
+    "unknown name 'y'": {"generator": "y"},
+    "'y' is not a coordinate, momentum, time or parameter": {"generator": Symbol("y")},
+    "a generator is text or a SymPy expression, not [1]": {"generator": [1]},
+    "a generator may on momenta": {"direction": [Symbol("p")]},
+}
+
+
+@pytest.mark.parametrize("message", WRONG_GENERATORS)
+def test_a_wrong_generator_is_refused_with_its_rate(message):
+    with pytest.raises(SystemDefinitionError, match=re.escape(message)):
+        check_symmetry(ROTATOR, **WRONG_GENERATORS[message])
 
 
 def test_a_gauge_of_ones_own():
@@ -457,6 +521,28 @@ def test_a_given_symmetry_is_tracked(quickly_compiled):
     assert errors[0] < ROUNDOFF
     assert 1e-12 < errors[1] < 1e-5  # the quadrature of cos(theta) theta_dot is not exact
     assert plain.momentum_map_names == ("momentum of x",)
+
+
+def test_a_given_generator_is_tracked(quickly_compiled):
+    entry = problem("kepler")
+    lenz = check_symmetry(
+        entry.system, generator="(q1*p_q2 - q2*p_q1)*p_q2 - mu*q1/sqrt(q1**2 + q2**2)", name="Runge-Lenz vector x"
+    )
+    stepper = compile_stepper(
+        entry.system, SVI(4), flags=quickly_compiled(entry.system, SVI(4)).flags, symmetries=[lenz]
+    )
+    assert stepper.interface.map_exact == (True, False)
+    run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.02, steps=200)
+    assert run.momentum_maps()[0, 1] == pytest.approx(0.5, abs=1e-15)  # the eccentricity
+    assert 0 < np.abs(run.momentum_errors()[:, 1]).max() < 1e-11
+
+
+def test_rotations_of_phase_space_are_kept(quickly_compiled):
+    run = quickly_compiled(ROTATOR, SVI(3)).integrate([1.0], [0.5], h=0.1, steps=400)
+    assert np.abs(run.momentum_errors()).max() < ROUNDOFF
+    outside = quickly_compiled(CYLINDER, SVI(3)).integrate([2.0, -1.5], [0.0, 0.5], h=0.1, steps=400)
+    assert np.ptp(outside.q[:, 0]) > 1
+    assert np.abs(outside.momentum_errors()).max() < ROUNDOFF
 
 
 def test_ensembles_track_them_with_parameters_of_their_own(quickly_compiled):

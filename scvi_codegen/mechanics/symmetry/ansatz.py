@@ -29,6 +29,7 @@ __all__ = [
     "is_shift",
     "monomial_columns",
     "planes_of",
+    "polynomial_in",
     "rigid_columns",
     "turn",
 ]
@@ -126,15 +127,34 @@ def combined(row: Mapping[int, Expr], columns: Sequence[Column]) -> Terms:
     return {monomial: coefficient for monomial, coefficient in terms.items() if coefficient != 0}
 
 
-def independent(found: list[Terms]) -> list[Terms]:
-    """Without those that are products of linear ones; ``found`` spans the products that it has."""
-    linear = [terms for terms in found if all(len(monomial.factors) <= 1 for monomial in terms)]
-    kept, known = list(linear), [*linear, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2))]
+def polynomial_in(system: MechanicalSystem, terms: Terms) -> Expr:
+    """The polynomial in the symbols of the system."""
+    state = (*system.coordinates, *system.momentum_symbols)
+    return sympy.Add(
+        *(
+            sympy.Mul(coefficient, system.time**monomial.power, *(state[i] for i in monomial.factors))
+            for monomial, coefficient in terms.items()
+        )
+    )
+
+
+def independent(found: Sequence[Terms], first: Sequence[Terms] = (), trivial: Sequence[Terms] = ()) -> list[Terms]:
+    """Those ``first``, and those found that are no sums of these, of products of linear ones and of ``trivial`` ones.
+
+    ``found`` and ``first`` span the products that they have; where some are ``first``, the linear ones are among them.
+    """
+    kept = list(first) or [terms for terms in found if _is_linear(terms)]
+    linear = [terms for terms in kept if _is_linear(terms)]
+    known = [*kept, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2)), *trivial]
     rank = _rank(known)
-    for terms in sorted((terms for terms in found if terms not in linear), key=len):
+    for terms in sorted((terms for terms in found if not _is_linear(terms)), key=len):
         if _rank([*known, terms]) > rank:
             kept, known, rank = [*kept, terms], [*known, terms], rank + 1
     return kept
+
+
+def _is_linear(terms: Terms) -> bool:
+    return all(len(monomial.factors) <= 1 for monomial in terms)
 
 
 def _product(a: Terms, b: Terms) -> Terms:

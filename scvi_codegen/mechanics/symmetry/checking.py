@@ -1,0 +1,180 @@
+"""Whether a direction or a generator that a user knows is a symmetry, and the change of L or the rate that says no."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy
+from sympy import Expr
+
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.canonical import evaluated, unsupported_part
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.symmetry.ansatz import combined, gauge_columns, polynomial_in
+from scvi_codegen.mechanics.symmetry.gauge import integrated, is_total_derivative
+from scvi_codegen.mechanics.symmetry.invariants import conserved
+from scvi_codegen.mechanics.symmetry.sampling import rates_of
+from scvi_codegen.mechanics.symmetry.symmetry import MOST_COORDINATES, Symmetry
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["check_symmetry"]
+
+LONGEST_SHOWN = 300
+DECIDED_AT = 3
+"""Points at which the change of L is looked at."""
+
+
+def check_symmetry(
+    system: MechanicalSystem,
+    direction: Sequence[Expr | str] | None = None,
+    *,
+    gauge: Expr | str | None = None,
+    generator: Expr | str | None = None,
+    name: str = "given symmetry",
+) -> Symmetry:
+    """The symmetry with a direction or a generator of the user's, whatever its form, if it is one.
+
+    Args:
+        system: what moves.
+        direction: xi, m expressions in coordinates, time and parameters, as SymPy or as text.
+        generator: in place of a direction G(q, p, t), which moves q by G_p and p by -G_q, if {G, H} + G_t = 0: G is
+            conserved. Momenta of a Lagrangian are ``p_`` and the coordinate.
+        gauge: f with L_q . xi + L_v . dxi/dt = df/dt; left out, it is searched among those quadratic in q and, of a
+            Lagrangian, integrated.
+        name: what the conserved quantity is called.
+
+    Raises:
+        SystemDefinitionError: with the change of L, if it is not the time derivative of f, or if that is not decided;
+            with the rate of a generator that is not conserved; naming the symbol, if one is unknown.
+
+    >>> from scvi_codegen.models.systems import kepler
+    >>> print(check_symmetry(kepler(), ["-q2", "q1"]))
+    given symmetry = q1*p_q2 - q2*p_q1
+    """
+    if generator is not None:
+        if direction is not None or gauge is not None:
+            raise SystemDefinitionError("give check_symmetry a direction, perhaps with its gauge, or a generator alone")
+        return _generated(system, _expression(system, generator, "generator"), name)
+    if direction is None:
+        raise SystemDefinitionError("check_symmetry wants a direction, or a generator")
+    if isinstance(direction, str) or len(direction) != system.dimension:
+        names = ", ".join(q.name for q in system.coordinates)
+        raise SystemDefinitionError(f"a direction has {system.dimension} components, one for each of {names}")
+    xi = tuple(_expression(system, component) for component in direction)
+    f = None if gauge is None else _expression(system, gauge, "gauge")
+    p, q, t = system.momentum_symbols, system.coordinates, system.time
+    product = sympy.Add(*(a * b for a, b in zip(p, xi, strict=True)), -(f or 0))
+    quadratic = system.dimension <= MOST_COORDINATES
+    gauges = list(gauge_columns(system.dimension, quadratic=quadratic)) if f is None else []
+    rows = [row for row in conserved(system, rates_of(system), [product, *gauges]) if 0 in row]
+    if not rows and f is None and not system.auxiliaries:
+        f = _integrated_gauge(system, xi)
+        product, gauges, rows = product - f, [], [{0: sympy.S.One}]
+    if not rows:
+        raise SystemDefinitionError(_defect(system, xi, f))
+    terms = combined({c: x / rows[0][0] for c, x in rows[0].items() if c}, [product, *gauges])
+    added = polynomial_in(system, terms)
+    return Symmetry(
+        name=name,
+        coordinates=q,
+        momenta=p,
+        time=t,
+        direction=xi,
+        gauge=(f or sympy.S.Zero) - added,
+        momentum_map=product + added,
+    )
+
+
+def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
+    """The symmetry of phase space that G generates."""
+    motion = rates_of(system)
+    q, p, t = system.coordinates, system.momentum_symbols, system.time
+    if not conserved(system, motion, [G]):
+        slopes = gradient(G, (*q, *p, t))
+        velocities = motion.transformed if motion.hamiltonian else motion.arguments[len(q) :]
+        moved = (*velocities, *motion.forces, sympy.S.One)
+        rate = sympy.Add(*(slope * moved[i] for i, slope in slopes.items())).xreplace(motion.numbers)
+        rate = rate if motion.hamiltonian else rate.xreplace(dict(zip(p, motion.transformed, strict=True)))
+        raise SystemDefinitionError(
+            f"{G} generates no symmetry of '{system.name}': {{G, H}} + G_t, its rate of change, is {_cut(rate)}, not 0"
+        )
+    slopes = gradient(G, p)
+    direction = tuple(slopes.get(i, sympy.S.Zero) for i in range(len(q)))
+    gauge = sympy.Add(*(a * b for a, b in zip(p, direction, strict=True)), -G)
+    return Symmetry(name=name, coordinates=q, momenta=p, time=t, direction=direction, gauge=gauge, momentum_map=G)
+
+
+def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
+    """The f of a direction whose f is not quadratic."""
+    change, motion = _change(system, xi), rates_of(system)
+    f = integrated(system, change)
+    if f is not None:
+        product = sympy.Add(*(a * b for a, b in zip(system.momentum_symbols, xi, strict=True)), -f)
+        if conserved(system, motion, [product]):
+            return f
+    parameters = {x: mp.mpf(value) for x, value in motion.constants.items()}
+    if is_total_derivative(system, change, motion.points(parameters, DECIDED_AT)) is False:
+        raise SystemDefinitionError(_defect(system, xi, None))
+    raise SystemDefinitionError(
+        f"whether ({', '.join(map(str, xi))}) is a symmetry of '{system.name}' is not decided: along it L changes by "
+        f"{_cut(change)}, whose f was not found; give it as gauge"
+    )
+
+
+def _expression(system: MechanicalSystem, given: Expr | str, what: str = "component of a direction") -> Expr:
+    """A function of coordinates, time and parameters, of a generator momenta too, from text or SymPy."""
+    generates = what == "generator"
+    momenta = system.momentum_symbols if generates else ()
+    known = {x.name: x for x in (*system.coordinates, *momenta, system.time, *system.parameters)}
+    if isinstance(given, str):
+        return parse_expression(given, known)
+    expression = sympy.sympify(given) if isinstance(given, int | float) else given
+    if not isinstance(expression, Expr):
+        raise SystemDefinitionError(f"a {what} is text or a SymPy expression, not {given!r}")
+    unknown = sorted(free.name for free in expression.free_symbols if free.name not in known)
+    if unknown:
+        kinds = "coordinate, momentum, time or parameter" if generates else "coordinate, time or parameter"
+        rest = "" if generates else " Directions and gauges depend on nothing else; a generator may on momenta"
+        raise SystemDefinitionError(
+            f"'{unknown[0]}' is not a {kinds} of '{system.name}'{closest(unknown[0], known)}{rest}"
+        )
+    expression = evaluated(expression, {free: known[free.name] for free in expression.free_symbols})
+    problem = unsupported_part(expression)
+    if problem:
+        raise SystemDefinitionError(f"in a {what}: {problem}")
+    return expression
+
+
+def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str:
+    """What L changes by along a direction that is no symmetry."""
+    change, what = _change(system, xi), "along it L changes by"
+    if f is None:
+        searched = "a polynomial f quadratic in q; any other f can be given as gauge"
+        reason = f"not the time derivative of {searched if system.auxiliaries else 'any f(q, t)'}"
+    else:
+        change, what = change - _rate(system, f), "the change of L is not the derivative of the gauge but differs by"
+        reason = "not 0"
+    return f"({', '.join(map(str, xi))}) is no symmetry of '{system.name}': {what} {_cut(change)}, {reason}"
+
+
+def _cut(change: Expr) -> str:
+    text = str(change)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} ..."
+
+
+def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
+    """L_q . xi + L_v . dxi/dt; of a Hamiltonian the rate of p . xi."""
+    p = system.auxiliaries or forms_of(system).legendre
+    sign = -1 if system.auxiliaries else 1
+    terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
+    return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
+
+
+def _rate(system: MechanicalSystem, f: Expr) -> Expr:
+    """f_t + f_q . v, with v = H_p of a Hamiltonian."""
+    v = forms_of(system).legendre if system.auxiliaries else system.velocities
+    slopes = gradient(f, (*system.coordinates, system.time))
+    return sympy.Add(*(slope * (*v, sympy.S.One)[i] for i, slope in slopes.items()))
