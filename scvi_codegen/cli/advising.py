@@ -20,20 +20,19 @@ MOST_STEPS = 10**9
 """More are not begun unasked: at a microsecond each these take a quarter of an hour."""
 
 
-def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions) -> Model:
+def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:
     """The model with step and number of steps for an error at the end; prints why, and warnings to stderr.
 
     Raises:
         StateError: if the tolerance is not positive, every pilot run fails, or very many steps are needed.
     """
-    span = model.span if model.span is not None else abs(model.h) * model.step_count
     stepper = compile_stepper(model.system, model.method, solver=solver)
     advice = advise(
         model.system,
         model.method,
         model.q,
         model.momenta(stepper),
-        math.copysign(span, model.h),
+        model.covered,
         tolerance,
         t=model.t,
         solver=solver,
@@ -47,7 +46,7 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
             f"{advice.steps} steps are too many to begin without being told: take a method of higher order, "
             f"a larger --tolerance or a shorter --span, or say --step {advice.h:.6g}"
         )
-    return replace(model, h=advice.h, steps=advice.steps, span=None)
+    return replace(model, h=advice.h, tolerance=None, steps=advice.steps, span=None)
 
 
 def _text(advice: Advice) -> str:

@@ -63,7 +63,7 @@ def integrate_states(
         stepper,
         states.q,
         states.momenta(stepper),
-        h=model.h,
+        h=model.step,
         steps=model.step_count,
         every=model.every,
         t=model.t,
@@ -101,7 +101,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         model.system.name,
         model.method.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
-        f"{counted(model.step_count, 'step')} of {model.h:g} from t = {model.t:g}; "
+        f"{counted(model.step_count, 'step')} of {model.step:g} from t = {model.t:g}; "
         f"{counted(len(result.t), 'state')} kept of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} a step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",

@@ -10,7 +10,7 @@ from pathlib import Path
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 
-__all__ = ["check_memory", "usable_memory"]
+__all__ = ["check_memory", "check_room", "usable_memory"]
 
 COPIES = 2
 """Kept in pieces, then joined and summed up."""
@@ -24,13 +24,22 @@ def check_memory(model: Model, trajectories: int = 1) -> None:
     Raises:
         StateError: naming the size, and the distance between states at which they fit.
     """
-    kept = model.step_count // model.every + 1
+    check_room(model, model.step_count if model.h is not None else 0, trajectories)
+
+
+def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
+    """The same for so many steps: also of a run under way whose steps choose their length, and have no number before.
+
+    Raises:
+        StateError: as :func:`check_memory`.
+    """
+    kept = steps // model.every + 1
     each = 16 * len(model.q) * trajectories + 12  # q and p of each; time and iterations
     room = usable_memory() / (COPIES * each)
     if kept <= room:
         return
     states = f"{kept} states" if trajectories == 1 else f"{kept} states of each of {trajectories} trajectories"
-    ways = [f"keep fewer (--every {-(-model.step_count // int(room - 1))})"] if room >= 2 else []
+    ways = [f"keep fewer (--every {-(-steps // int(room - 1))})"] if room >= 2 else []
     ways += ["write them into a folder as they come (-o NAME.run)"] if trajectories == 1 else []
     needed = f"{COPIES * each * kept / 1e9:.3g} GB of memory"
     raise StateError(f"{states} need {needed}: {' or '.join(ways or ['run fewer'])}")

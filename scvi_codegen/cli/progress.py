@@ -11,7 +11,10 @@ from types import FrameType
 
 import click
 
-__all__ = ["interruptions", "progress_bar"]
+__all__ = ["PARTS", "interruptions", "progress_bar"]
+
+PARTS = 1000
+"""That a bar shows of a run whose steps have no number before."""
 
 
 @contextlib.contextmanager

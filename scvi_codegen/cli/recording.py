@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 import time
@@ -128,15 +129,21 @@ class Recording:
             if value is not None and not recorded:
                 raise click.UsageError(f"{name} is for a run that is written into a folder (-o NAME{SUFFIX})")
 
-    def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions) -> RecordedOutcome:
+    def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions | None) -> RecordedOutcome:
         """Run a model into a folder, as far as it goes. Raises as :func:`record_run`."""
         text = None
         with suppress(ModelFileError):
             text = dump_model(model)
         run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
-        steps, every = model.step_count, model.every
         return self._watched(
-            record_run, run, Path(folder), first=0, steps=steps, every=every, model=text, certificate=self.certificate
+            record_run,
+            run,
+            Path(folder),
+            first=0,
+            steps=None if run.goal else model.step_count,
+            every=model.every,
+            model=text,
+            certificate=self.certificate,
         )
 
     def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
@@ -144,17 +151,20 @@ class Recording:
         if steps is not None and span is not None:
             raise click.UsageError("--span and --steps exclude each other")
         recorded = load_run(folder)
-        goal = recorded.manifest.steps if steps is None else steps
-        if span is not None:
-            goal = max(1, round(span / abs(recorded.manifest.h)))
-        return self._watched(resume_run, Path(folder), first=recorded.steps, steps=goal)
+        manifest, further = recorded.manifest, {}
+        if manifest.goal and span is not None:
+            further["t_end"] = manifest.t + math.copysign(span, manifest.goal.t_end - manifest.t)
+        elif span is not None:
+            steps = max(1, round(span / abs(manifest.h)))
+        goal = manifest.steps if steps is None else steps
+        return self._watched(resume_run, Path(folder), first=recorded.steps, steps=goal, **further)
 
-    def _watched(self, act: Any, *arguments: Any, first: int, steps: int, **settings: Any) -> RecordedOutcome:
+    def _watched(self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any) -> RecordedOutcome:
         """With a progress bar, ended by Ctrl-C or SIGTERM at a state that is written."""
         pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
         settings |= {name: value for name, value in pace.items() if value is not None}
         folder, failure, began, shown = arguments[-1], None, time.perf_counter(), first
-        with interruptions() as caught, progress_bar(steps - first) as advance:
+        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as advance:
 
             def look(done: int) -> None:
                 nonlocal shown
@@ -179,10 +189,12 @@ class Recording:
 def standing(recorded: RecordedRun) -> str:
     """What runs in a folder and how far it is, in two lines."""
     manifest = recorded.manifest
-    t = manifest.t + recorded.steps * manifest.h
-    far = "all" if recorded.finished else f"of {manifest.steps}"
-    return (
-        f"{' '.join(manifest.interface.title.split())}\n"
-        f"{counted(recorded.steps, 'step')} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}; "
-        f"{counted(len(recorded), 'state')} kept in '{recorded.folder}'"
-    )
+    done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
+    if manifest.goal:
+        way = f"{done} of their own lengths from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
+        way += "" if recorded.finished else f" (of {manifest.goal.t_end:g})"
+    else:
+        far = "all" if recorded.finished else f"of {manifest.steps}"
+        way = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
+    kept = f"{counted(len(recorded), 'state')} kept in '{recorded.folder}'"
+    return f"{' '.join(manifest.interface.title.split())}\n{way}; {kept}"

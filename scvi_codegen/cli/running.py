@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scvi_codegen.cli.conservation import energy_report, momentum_report
-from scvi_codegen.cli.memory import check_memory
-from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.memory import check_memory, check_room
+from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import TOLERABLE_ERROR, Trajectory
 
@@ -66,12 +67,12 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
     preparation, seconds = time.perf_counter() - began, 0.0
     pieces, failure = [run.record(0, every=model.every)], None
-    with interruptions() as caught, progress_bar(model.step_count) as advance:
+    with interruptions() as caught, progress_bar(_length(model)) as advance:
         portion = 1
-        while run.steps < model.step_count and not caught and failure is None:
-            before, started = run.steps, time.perf_counter()
+        while not _ended(model, run) and not caught and failure is None:
+            before, started = _reached(model, run), time.perf_counter()
             try:
-                piece = run.record(min(portion, model.step_count - before), every=model.every)
+                piece = run.record(portion if run.goal else min(portion, model.step_count - before), every=model.every)
             except StepFailedError as error:
                 if not isinstance(error.trajectory, Trajectory):
                     raise
@@ -79,7 +80,8 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             elapsed = time.perf_counter() - started
             pieces.append(piece)
             seconds += elapsed
-            advance(run.steps - before)
+            advance(_reached(model, run) - before)
+            check_room(model, run.steps)
             portion = max(1, int(portion * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
     return RunOutcome(
         trajectory=_joined(pieces),
@@ -87,8 +89,22 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
         preparation=preparation,
         seconds=seconds,
         failure=failure,
-        interrupted=bool(caught) and run.steps < model.step_count,
+        interrupted=bool(caught) and not _ended(model, run),
     )
+
+
+def _ended(model: Model, run: Run) -> bool:
+    return run.arrived if run.goal else run.steps >= model.step_count
+
+
+def _length(model: Model) -> int:
+    """Of the bar: steps, or parts of the time."""
+    return PARTS if model.h is None else model.step_count
+
+
+def _reached(model: Model, run: Run) -> int:
+    """Of that length."""
+    return int(PARTS * (run.t - model.t) / model.covered) if run.goal else run.steps
 
 
 def summary(model: Model, outcome: RunOutcome) -> str:
@@ -99,7 +115,7 @@ def summary(model: Model, outcome: RunOutcome) -> str:
         model.system.name,
         f"{method.title}; {order}, {'' if method.symplectic else 'not '}symplectic, "
         f"{'' if method.symmetric else 'not '}symmetric",
-        f"{counted(run.steps, 'step')} of {model.h:g} from t = {model.t:g} to t = {run.t:g}; "
+        f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {run.t:g}; "
         f"{counted(len(trajectory), 'state')} kept",
     ]
     if run.steps:
@@ -108,6 +124,11 @@ def summary(model: Model, outcome: RunOutcome) -> str:
             lines += conserved(model, trajectory)
         lines += worst_step(trajectory)
     return "\n".join([*lines, *final_state(run)])
+
+
+def of_length(h: float | None, run: Run) -> str:
+    """How long the steps of a run are."""
+    return f"of their own lengths ({run.rejected} rejected)" if run.goal or h is None else f"of {h:g}"
 
 
 def _speed(outcome: RunOutcome, every: int) -> str:
@@ -148,14 +169,13 @@ def final_state(run: Run) -> Iterator[str]:
 def _joined(pieces: list[Trajectory]) -> Trajectory:
     """One trajectory; each piece but the first begins with a state that is there already, or was not to be kept."""
     first, *rest = pieces
+    last, t = pieces[-1], np.concatenate([first.t, *(piece.t[1:] for piece in rest)])
     return replace(
-        first,
-        t=np.concatenate([first.t, *(piece.t[1:] for piece in rest)]),
+        last,
+        h=first_length(last.goal, t) if last.goal else last.h,
+        t=t,
         q=np.concatenate([first.q, *(piece.q[1:] for piece in rest)]),
         p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
         iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
-        lengths=np.concatenate([first.lengths, *(piece.lengths[1:] for piece in rest)]),
-        steps=pieces[-1].steps,
-        step_error=pieces[-1].step_error,
-        step_error_t=pieces[-1].step_error_t,
+        lengths=np.concatenate([*(piece.lengths[:-1] for piece in pieces), last.lengths[-1:]]),
     )

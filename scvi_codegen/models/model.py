@@ -37,15 +37,16 @@ class Model:
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h: step size, not 0, negative for a run backward.
-        span: length of time, positive, or ``None`` if ``steps`` is given.
-        steps: number of steps, or ``None`` if ``span`` is given.
+        h: step size, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given.
+        tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off.
+        span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
+        steps: number of steps of h, or ``None`` if ``span`` is given.
         every: distance between kept states in steps.
         t: initial time.
 
     Raises:
-        ModelFileError: naming the field, unless exactly one of p and velocity and one of span and steps is given, each
-            vector has m entries, and every number is finite and in its range.
+        ModelFileError: naming the field, unless exactly one of p and velocity, one of h and tolerance and one of span
+            and steps is given, each vector has m entries, and every number is finite and in its range.
     """
 
     system: MechanicalSystem
@@ -53,7 +54,8 @@ class Model:
     q: tuple[float, ...]
     p: tuple[float, ...] | None = None
     velocity: tuple[float, ...] | None = None
-    h: float
+    h: float | None = None
+    tolerance: float | None = None
     span: float | None = None
     steps: int | None = None
     every: int = 1
@@ -61,20 +63,15 @@ class Model:
 
     def __post_init__(self) -> None:
         _check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
+        _check_one_of("h (step)", self.h, "tolerance", self.tolerance)
         _check_one_of("span", self.span, "steps", self.steps)
         for name in ("q", "p", "velocity"):
             if (vector := getattr(self, name)) is not None:
                 object.__setattr__(self, name, self._vector(name, vector))
-        for name in ("h", "t", "span"):
+        for name in ("h", "tolerance", "t", "span"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, real(value, name))
-        if self.h == 0.0:
-            raise ModelFileError("the step is 0: it must be positive, or negative to go back")
-        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
-            raise ModelFileError(
-                f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
-                "backward, of fewer than 2^53 steps"
-            )
+        self._check_length()
         if self.steps is not None:
             object.__setattr__(self, "steps", checked_count(self.steps, "steps", least=0, error=ModelFileError))
         object.__setattr__(self, "every", checked_count(self.every, "every", least=1, error=ModelFileError))
@@ -94,11 +91,30 @@ class Model:
 
     @property
     def step_count(self) -> int:
-        """Number of steps: ``steps``, or the whole number (at least 1) of steps nearest to ``span``."""
+        """Number of steps of h: ``steps``, or the whole number (at least 1) of steps nearest to ``span``.
+
+        Raises:
+            ModelFileError: where steps choose their length.
+        """
         if self.steps is not None:
             return self.steps
         assert self.span is not None  # by construction
-        return max(1, round(self.span / abs(self.h)))
+        return max(1, round(self.span / abs(self.step)))
+
+    @property
+    def step(self) -> float:
+        """The step h, for what works with steps of one length; ModelFileError where there is none."""
+        if self.h is None:
+            raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
+        return self.h
+
+    @property
+    def covered(self) -> float:
+        """The span of time, negative for a run backward."""
+        if self.h is None:
+            assert self.span is not None  # by construction
+            return self.span
+        return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
 
     def momenta(self, stepper: Stepper) -> Array:
         """(m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
@@ -110,9 +126,38 @@ class Model:
         return stepper.momentum(self.q, self.velocity, self.t, self.system.defaults)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
-        """The run of this model from its initial state; advance it by :attr:`step_count` steps."""
-        p = self.momenta(stepper)
-        return stepper.start(self.q, p, h=self.h, t=self.t, parameters=self.system.defaults, options=options)
+        """The run of this model from its initial state, to be advanced by :attr:`step_count` steps or to its goal."""
+        return stepper.start(
+            self.q,
+            self.momenta(stepper),
+            h=self.h,
+            t=self.t,
+            t_end=self.t + self.covered if self.h is None else None,
+            tolerance=self.tolerance or None,
+            parameters=self.system.defaults,
+            options=options,
+        )
+
+    def _check_length(self) -> None:
+        if self.h is None:
+            self._check_tolerance()
+            return
+        if self.h == 0.0:
+            raise ModelFileError("the step is 0: it must be positive, or negative to go back")
+        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
+            raise ModelFileError(
+                f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
+                "backward, of fewer than 2^53 steps"
+            )
+
+    def _check_tolerance(self) -> None:
+        assert self.tolerance is not None  # by construction
+        if not 0.0 <= self.tolerance < 1.0:
+            raise ModelFileError(f"tolerance is {self.tolerance:g}: a relative error below 1, or 0 for round-off")
+        if self.span is None:
+            raise ModelFileError("steps that choose their length (tolerance) have no number: give span, not steps")
+        if self.span == 0.0:
+            raise ModelFileError("span is 0: it is a length of time, negative to go back")
 
     def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:
         names = [coordinate.name for coordinate in self.system.coordinates]

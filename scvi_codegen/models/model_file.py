@@ -22,6 +22,8 @@
     [run]
     step = 0.5                                          # negative: backward
     span = 100.0                                        # length of time, or steps = 200
+                                                        # or tolerance = 1e-9 (0: round-off) in place of a step: steps
+                                                        # choose their length; then a negative span goes back
     every = 1                                           # distance between kept states; left out: 1
 
 A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
@@ -61,9 +63,10 @@ Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
 SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "catalogue")
-KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": ("step", "span", "steps", "every")}
+RUN_KEYS = ("step", "tolerance", "span", "steps", "every")
+KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "parameters", "initial", "method", "run")
-ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"span", "steps"})
+ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance"}, {"span", "steps"})
 """One of each is given."""
 NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("step", "span")}
 """Keys, or their alternatives, without which there is nothing to run."""
@@ -154,7 +157,8 @@ def _motion(model: Model, names: Sequence[str]) -> dict[str, Any]:
     specification = model.method.specification()
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification.items()}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
-    run = {"step": model.h, **length, "every": model.every}
+    step = {"tolerance": model.tolerance} if model.h is None else {"step": model.h}
+    run = {**step, **length, "every": model.every}
     return {"initial": {"t": model.t, **initial}, "method": method, "run": run}
 
 
@@ -293,13 +297,18 @@ def _read_method(section: Section) -> Method:
 
 
 def _read_run(section: Section) -> dict[str, Any]:
+    _check_one(section, "run", "step", "tolerance")
     _check_one(section, "run", "span", "steps")
-    step = real(section["step"], "[run] step")
+    fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
+    numbers = {field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section}
     every = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
-    if "span" in section:
-        return {"h": step, "span": real(section["span"], "[run] span"), "every": every}
-    steps = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
-    return {"h": step, "steps": steps, "every": every}
+    if "steps" not in section:
+        return {**numbers, "every": every}
+    return {
+        **numbers,
+        "steps": checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError),
+        "every": every,
+    }
 
 
 def _check_one(section: Section, name: str, one: str, other: str) -> None:

@@ -173,7 +173,7 @@ def _example(model: Model) -> ExampleRun:
         p=model.p if model.p is not None else _momenta(model),
         parameters=model.system.defaults,
         t=model.t,
-        h=model.h,
+        h=model.step,
         every=every,
         outputs=steps // every,
     )

@@ -13,12 +13,13 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["SLICE_SECONDS", "record", "record_states", "record_until", "trajectory_of"]
+__all__ = ["SLICE_SECONDS", "first_length", "record", "record_states", "record_until", "trajectory_of"]
 
 SLICE_SECONDS = 0.1
 """Time between looks at the keyboard (and calls of ``progress``) during an integration."""
@@ -152,7 +153,7 @@ def trajectory_of(
         p=p,
         iterations=iterations,
         lengths=np.broadcast_to(memory.h, t.shape) if lengths is None else lengths,
-        h=_length(memory, t),
+        h=memory.h if memory.goal is None else first_length(memory.goal, t),
         goal=memory.goal,
         steps=memory.steps,
         rejected=memory.rejected,
@@ -166,8 +167,6 @@ def trajectory_of(
     )
 
 
-def _length(memory: Memory, t: Array) -> float:
-    """Of steps that are all the same; of others the first, or the sign of all."""
-    if memory.goal is None:
-        return memory.h
-    return float(t[1] - t[0] if len(t) > 1 else memory.goal.t_end - t[0])
+def first_length(goal: Goal, t: Array) -> float:
+    """Of steps that choose their length the first between states, or the sign of all."""
+    return float(t[1] - t[0] if len(t) > 1 else goal.t_end - t[0])

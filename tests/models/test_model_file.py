@@ -159,13 +159,17 @@ def test_a_catalogue_reference_may_be_changed():
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("every", "evry", "unknown key 'evry' in [run]; did you mean 'every'?"),
         ('name = "pendulum"\n', "", "there is no name in [system]"),
-        ("step = 0.25\n", "", "there is no step in [run]"),
+        ("step = 0.25\n", "", "there is no step or tolerance in [run]"),
         ("degree = 3\n", "", "svi needs 'degree'"),
         ("q = [0.5]\n", "", "there is no q in [initial]"),
         ("q_dot = [0]\n", "", "there is no p or q_dot in [initial]"),
         ("q_dot = [0]\n", "q_dot = [0]\np = [0]\n", "[initial] has both of p and q_dot"),
         ("span = 10\n", "", "there is no span or steps in [run]"),
         ("span = 10\n", "span = 10\nsteps = 40\n", "[run] has both of span and steps"),
+        ("span = 10\n", "span = 10\ntolerance = 1e-9\n", "[run] has both of step and tolerance"),
+        ("step = 0.25\nspan = 10\n", "tolerance = 1e-9\nsteps = 40\n", "give span, not steps"),
+        ("step = 0.25\n", "tolerance = 2\n", "tolerance is 2"),
+        ("step = 0.25\nspan = 10\n", "tolerance = 0\nspan = 0\n", "span is 0"),
         ("q = [0.5]", "q = 0.5", "[initial] q must be a list of numbers or a table"),
         ("q = [0.5]", "q = [0.5, 1]", "[initial] q must have 1 numbers for (q), not 2"),
         ("q = [0.5]", "q = {q_ = 1}", "unknown coordinate 'q_' in [initial] q; did you mean 'q'?"),
@@ -208,9 +212,10 @@ def test_mistakes_are_named(old, new, message, tmp_path):
 
 
 def test_all_that_is_missing_is_named_at_once():
-    with pytest.raises(ModelFileError, match=r"no step in \[run\], no span or steps in \[run\]"):
+    with pytest.raises(ModelFileError, match=r"no step or tolerance in \[run\], no span or steps in \[run\]"):
         parse_model(PENDULUM[: PENDULUM.index("[run]")])
-    everything = ["name", "coordinates", "hamiltonian.or.lagrangian", "q", "p.or.q_dot", "step", "span.or.steps"]
+    everything = ["name", "coordinates", "hamiltonian.or.lagrangian", "q", "p.or.q_dot", "step.or.tolerance"]
+    everything.append("span.or.steps")
     with pytest.raises(ModelFileError, match=r" in \[\w+\], no ".join(everything)):
         parse_model("")
     with pytest.raises(ModelFileError, match="must be a section"):

@@ -40,7 +40,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, Choices(**choices))
     if html is not None:
-        start = Start(q=model.q, velocity=model.velocity, p=model.p, h=model.h, t=model.t)
+        start = Start(q=model.q, velocity=model.velocity, p=model.p, h=model.step, t=model.t)
         emit(derivation_html(model.system, model.method, start=start), html)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)

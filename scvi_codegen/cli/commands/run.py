@@ -113,7 +113,7 @@ def run(
     model = read_model(model_name, Choices(**choices))
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
-    options = SolverOptions(**chosen)
+    options = SolverOptions(**chosen) if chosen else None
     if ensemble is not None:
         _run_ensemble(model, ensemble, output, solver, options)
         return
@@ -155,7 +155,7 @@ def _check_combination(
             raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
 
 
-def _run_one(model: Model, output: str | None, plot: str | None, solver: str, options: SolverOptions) -> None:
+def _run_one(model: Model, output: str | None, plot: str | None, solver: str, options: SolverOptions | None) -> None:
     outcome = integrate_model(model, solver=solver, options=options)
     click.echo(summary(model, outcome))
     written = _write_outputs(outcome, output, plot)
@@ -177,7 +177,7 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     click.echo(f"wrote {outcome.recorded.folder}")
 
 
-def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions) -> None:
+def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
     click.echo(ensemble_summary(model, outcome))
     kept = "the states computed were not written to a file (-o)"

@@ -73,7 +73,7 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
 def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
     p = model.momenta(stepper)
     return verification.verify(
-        model.system, model.method, model.q, p, h=model.h, t=model.t, stepper=stepper, solver=solver
+        model.system, model.method, model.q, p, h=model.step, t=model.t, stepper=stepper, solver=solver
     )
 
 

@@ -12,14 +12,17 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.version import __version__
 
 __all__ = ["MANIFEST", "Build", "Manifest", "read_manifest", "write_manifest"]
 
 MANIFEST = "manifest.json"
-FORMAT = 1
+FORMAT, FORMAT_TO_A_TIME = 1, 2
+"""Of runs of so many steps, and of runs whose steps choose their length, which came later."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,10 +60,11 @@ class Manifest:
         source, interface, flags: of its stepper.
         options: when the stage equations count as solved; ``None`` for the defaults.
         parameters: values in the order of ``interface.parameters``.
-        h: step size.
+        h: step size, 0 where steps choose their length.
         t: initial time.
         every: distance between kept states in steps.
-        steps: number of steps wanted.
+        steps: number of steps wanted, ``None`` where steps choose their length.
+        goal: where these lead, else ``None``.
         rows: states in a full file.
         model: the model file it comes from, if it has one.
         certificate: what was found out about the integrator, as JSON, if that was given.
@@ -75,7 +79,8 @@ class Manifest:
     h: float
     t: float
     every: int
-    steps: int
+    steps: int | None
+    goal: Goal | None = None
     rows: int
     model: str | None
     certificate: Any
@@ -83,7 +88,12 @@ class Manifest:
 
     def stepper(self) -> Stepper:
         """The integrator, compiled or from the cache."""
-        return Stepper(self.source, self.interface, flags=self.flags)
+        controlled = self.source if self.goal else None
+        return Stepper(self.source, self.interface, controlled=lambda: controlled, flags=self.flags)
+
+    def reached(self, run: Run) -> bool:
+        """Whether a run is as far as is wanted."""
+        return run.arrived if self.steps is None else run.steps >= self.steps
 
     def continued_by(self, build: Build) -> Manifest:
         """The manifest once ``build`` takes over."""
@@ -102,9 +112,10 @@ class Manifest:
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`, with the C code line by line."""
         document = {
-            "format": FORMAT,
+            "format": FORMAT_TO_A_TIME if self.goal else FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
+            **({"goal": asdict(self.goal)} if self.goal else {}),
             "builds": [asdict(build) for build in self.builds],
             "interface": json.loads(self.interface.to_json()),
             "source": self.source.to_record(),
@@ -115,13 +126,14 @@ class Manifest:
     def from_json(cls, text: str) -> Manifest:
         """The manifest of a text; ValueError, KeyError or TypeError if it is none."""
         document = json.loads(text)
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise ValueError(f"its format is not {FORMAT}")
+        if not isinstance(document, dict) or document.get("format") not in (FORMAT, FORMAT_TO_A_TIME):
+            raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
         plain = {field: document[field] for field in PLAIN}
-        options = document["options"]
+        options, goal = document["options"], document["goal"] if document["format"] == FORMAT_TO_A_TIME else None
         return cls(
             **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
             options=None if options is None else SolverOptions(**options),
+            goal=None if goal is None else Goal(**goal),
             builds=tuple(Build(**build) for build in document["builds"]),
             interface=Interface.from_json(json.dumps(document["interface"])),
             source=Source.from_record(document["source"]),

@@ -17,6 +17,7 @@ from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled import checked_units
 from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
+from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -69,7 +70,9 @@ class RecordedRun:
         return (len(self._paths) - 1) * self.manifest.rows + len(self._last)
 
     def __repr__(self) -> str:
-        return f"<RecordedRun '{self.folder}': {len(self)} states, step {self.steps} of {self.manifest.steps}>"
+        goal = self.manifest.goal
+        end = f"t = {self.t[-1]:g} of {goal.t_end:g}" if goal else f"step {self.steps} of {self.manifest.steps}"
+        return f"<RecordedRun '{self.folder}': {len(self)} states, {end}>"
 
     def __getitem__(self, rows: slice) -> Trajectory:
         """States by number, as a trajectory in memory; ``iterations`` counts as in the whole run."""
@@ -93,7 +96,14 @@ class RecordedRun:
     @property
     def finished(self) -> bool:
         """Whether all steps wanted are done."""
-        return self.steps >= self.manifest.steps
+        goal, steps = self.manifest.goal, self.manifest.steps
+        return bool(goal and self.t[-1] == goal.t_end) if steps is None else self.steps >= steps
+
+    @cached_property
+    def h(self) -> float:
+        """Step size; where steps choose their length, what :class:`Trajectory` says of it."""
+        goal = self.manifest.goal
+        return first_length(goal, self.t[:2]) if goal else self.manifest.h
 
     def resumed(self) -> Run:
         """The run where it stands, to go on with in memory; :func:`resume_run` goes on in the folder.
@@ -101,8 +111,19 @@ class RecordedRun:
         Raises:
             BuildError: without a C compiler.
         """
-        manifest = self.manifest
-        return self.stepper.restore(self._last.memory, parameters=manifest.parameters, options=manifest.options)
+        manifest, goal = self.manifest, self.manifest.goal
+        return self.stepper.restore(
+            self._last.memory,
+            t_end=goal.t_end if goal else None,
+            tolerance=(goal.tolerance or None) if goal else None,
+            parameters=manifest.parameters,
+            options=manifest.options,
+        )
+
+    @cached_property
+    def _standing(self) -> Run:
+        """Where the run stands, to be looked at and not advanced."""
+        return self.resumed()
 
     def pieces(self) -> Iterator[Trajectory]:
         """The run in parts, one after the other."""
@@ -168,7 +189,7 @@ class RecordedRun:
             pieces=self._pieces,
             coordinates=manifest.interface.coordinates,
             parameters=dict(zip(manifest.interface.parameters, manifest.parameters, strict=True)),
-            h=manifest.h,
+            h=self.h,
             about=manifest.about(),
             maps=manifest.interface.map_names,
             quantities=lambda t, q, p: quantities(self.stepper, np.array(manifest.parameters), t, q, p),
@@ -181,19 +202,34 @@ class RecordedRun:
 
     def _trajectory(self, piece: tuple[Any, ...], rows: NDArray[np.int64]) -> Trajectory:
         t, q, p, iterations = piece
-        taken = self.manifest.every * rows
-        transformed = bool(self.manifest.interface.energy_parameter)
+        manifest, run = self.manifest, self._standing
+        taken = manifest.every * rows
+        transformed = bool(manifest.interface.energy_parameter)
+        step_error, step_error_t = run.step_error
         return Trajectory(
             t=t,
             q=q,
             p=p,
             iterations=iterations,
-            lengths=np.broadcast_to(self.manifest.h, t.shape),
-            h=self.manifest.h,
-            parameters=np.array(self.manifest.parameters),
-            stepper=self.stepper,
-            tau=times_after(0.0, self.manifest.h, taken)[0] if transformed else None,
+            lengths=self._lengths(t, rows),
+            h=self.h,
+            goal=manifest.goal,
+            steps=run.steps,
+            rejected=run.rejected,
+            step_error=step_error,
+            step_error_t=step_error_t,
+            parameters=np.array(manifest.parameters),
+            stepper=run.stepper,
+            options=run.options,
+            tau=times_after(0.0, manifest.h, taken)[0] if transformed else None,
         )
+
+    def _lengths(self, t: Array, rows: NDArray[np.int64]) -> Array:
+        """(n,) of the steps after these states, not numbers where the end of one that chose its length is not there."""
+        if self.manifest.goal is None:
+            return np.broadcast_to(self.manifest.h, t.shape)
+        found = np.where((np.diff(rows) == 1) & (self.manifest.every == 1), np.diff(t), np.nan)
+        return np.append(found, np.nan)[: len(t)]
 
 
 class LazyArray:

@@ -20,10 +20,12 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
-from scvi_codegen.runtime.portions import record_states
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -38,7 +40,7 @@ def record_run(
     run: Run,
     folder: str | os.PathLike[str],
     *,
-    steps: int,
+    steps: int | None = None,
     every: int = 1,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     checkpoint_steps: int | None = None,
@@ -48,13 +50,13 @@ def record_run(
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> RecordedRun:
-    """Advance a run by ``steps`` and record every ``every``-th state, the initial one first, in a folder.
+    """Advance a run by ``steps``, or to its goal, and record every ``every``-th state, the first too, in a folder.
 
     Args:
-        run: at its start, from ``stepper.start(q, p, h=h)``.
+        run: at its start, from ``stepper.start(q, p, h=h)``, or ``start(q, p, t_end=..., tolerance=...)``.
         folder: made if it is missing; it must be empty, or hold a run that was ended before its first state.
-        steps: number of steps.
-        every: distance between kept states.
+        steps: number of steps; left out where they choose their length and lead to a goal.
+        every: distance between kept states; the one at a goal is kept, too.
         checkpoint_seconds: what is computed is written at least so often; no more is lost if the process is killed.
         checkpoint_steps: write it also every so many steps.
         rows: states in a file, by default about 16 MiB.
@@ -84,7 +86,8 @@ def record_run(
         h=run.h,
         t=run.t,
         every=checked_count(every, "every", least=1),
-        steps=checked_count(steps, "steps", least=0),
+        steps=_checked_steps(run, steps),
+        goal=run.goal,
         rows=chunk_rows(run.stepper.dimension) if rows is None else checked_count(rows, "rows", least=1),
         model=model,
         certificate=_certificate(certificate),
@@ -96,7 +99,7 @@ def record_run(
     with _locked(target):
         with recorder.telling_where_it_stands():
             _clear(target)
-            recorder.keep(_piece(record_states(run, 0), 0))
+            recorder.keep(_piece(record(run, 0), 0))
             recorder.write()
             write_manifest(target, manifest)
             sync_folder(target)
@@ -108,6 +111,7 @@ def resume_run(
     folder: str | os.PathLike[str],
     *,
     steps: int | None = None,
+    t_end: float | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     checkpoint_steps: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -118,6 +122,8 @@ def resume_run(
     Args:
         folder: of :func:`record_run`.
         steps: number of steps of the whole run, if it is to be longer or shorter than it was meant to be.
+        t_end: the same for steps that choose their length, not before where the run stands. A run that had arrived
+            goes on from there: its step to the former end stays as short as it was.
         checkpoint_seconds, checkpoint_steps, progress, stop: as of :func:`record_run`.
 
     Returns:
@@ -125,6 +131,7 @@ def resume_run(
 
     Raises:
         RecordingError: if the folder holds no run, is being written by another process, or cannot be written.
+        StateError: for steps, or a t_end, of a run of the other kind.
         StepFailedError: if a step fails.
 
     Warns:
@@ -139,8 +146,7 @@ def resume_run(
         continued = manifest.continued_by(Build.of(run.stepper, run.steps))
         if len(continued.builds) > len(manifest.builds):
             _warn_of_another_build(manifest.builds[-1], continued.builds[-1])
-        if steps is not None:
-            continued = replace(continued, steps=checked_count(steps, "steps", least=0))
+        continued, run.goal = _further(continued, run, steps, t_end)
         recorder = _Recorder(target, continued, run, *_pace(checkpoint_seconds, checkpoint_steps))
         recorder.go_on_from(target)
         with recorder.telling_where_it_stands():
@@ -156,8 +162,8 @@ class _Recorder:
     def __init__(self, folder: Path, manifest: Manifest, run: Run, seconds: float, steps: int | None) -> None:
         self.folder, self.manifest, self.run = folder, manifest, run
         self.seconds, self.steps = seconds, steps
-        self.number, self.written = 0, -1
-        self.kept: tuple[list[Piece], int, bytes] = ([], run.steps, run.save())
+        self.number, self.written, self.written_t = 0, -1, run.t
+        self.kept: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.save())
 
     def go_on_from(self, folder: Path) -> None:
         """Take over the last file, to fill it up."""
@@ -165,7 +171,7 @@ class _Recorder:
         chunk = read_chunk(paths[-1])
         full = len(chunk) == self.manifest.rows
         self.number = len(paths) - 1 + full
-        self.kept = ([] if full else [chunk.piece], chunk.step, chunk.memory)
+        self.kept = ([] if full else [chunk.piece], chunk.step, self.run.t, chunk.memory)
         self.written = chunk.step
 
     def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
@@ -187,7 +193,7 @@ class _Recorder:
         """Advance in portions, write files that are full or due, and yield the number of steps done."""
         manifest, run, portion, checked = self.manifest, self.run, 1, time.monotonic()
         wanted = min(LONGEST_PORTION, max(SHORTEST_PORTION, self.seconds))
-        while run.steps < manifest.steps:
+        while not manifest.reached(run):
             began = time.monotonic()
             self._advance(min(portion, self._most_steps()))
             now = time.monotonic()
@@ -199,7 +205,7 @@ class _Recorder:
 
     def _advance(self, steps: int) -> None:
         try:
-            self.keep(_piece(record_states(self.run, steps, every=self.manifest.every), 1))
+            self.keep(_piece(record(self.run, steps, every=self.manifest.every), 1))
         except StepFailedError as error:
             if isinstance(error.trajectory, Trajectory):
                 self.keep(_piece(error.trajectory, 1))
@@ -208,8 +214,8 @@ class _Recorder:
     def _most_steps(self) -> int:
         """Up to the end, the last state of this file, or the next checkpoint."""
         done, every, manifest = self.run.steps, self.manifest.every, self.manifest
-        last = ((self.number + 1) * manifest.rows - 1) * every
-        ends = [manifest.steps, last]
+        last = (done // every + manifest.rows - self._rows()) * every
+        ends = [last] if manifest.steps is None else [last, manifest.steps]
         if self.steps is not None:
             ends.append((done // self.steps + 1) * self.steps)
         return min(ends) - done
@@ -222,7 +228,7 @@ class _Recorder:
 
     def keep(self, piece: Piece) -> None:
         """States and memory together, so that an interruption at any point leaves the one that fits the other."""
-        self.kept = ([*self.kept[0], piece], self.run.steps, self.run.save())
+        self.kept = ([*self.kept[0], piece], self.run.steps, self.run.t, self.run.save())
 
     def checkpoint(self) -> None:
         """Write what was computed since the last time.
@@ -235,15 +241,15 @@ class _Recorder:
 
     def write(self) -> None:
         """Put the file that is being filled in its place, and begin the next one if it is full."""
-        pieces, step, memory = self.kept
+        pieces, step, reached, memory = self.kept
         if step == self.written:
             return
         t, q, p, iterations = map(np.concatenate, zip(no_states(self.run.stepper.dimension), *pieces, strict=True))
         piece = (t, q, p, iterations)
         write_chunk(self.folder, self.number, Chunk(piece, step, memory))
-        self.written = step
+        self.written, self.written_t = step, reached
         full = len(t) == self.manifest.rows
-        self.number, self.kept = self.number + full, ([] if full else [piece], step, memory)
+        self.number, self.kept = self.number + full, ([] if full else [piece], step, reached, memory)
 
     @contextmanager
     def telling_where_it_stands(self) -> Iterator[None]:
@@ -259,12 +265,34 @@ class _Recorder:
         problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
         if self.written < 0:
             return f"{problem}; nothing was recorded"
-        t = self.manifest.t + self.written * self.manifest.h
         return (
-            f"{problem}. It holds the run whole up to step {self.written} (t = {t:g}); {self.run.steps - self.written} "
-            "steps done since are not in it. Once it can be written, go on with "
+            f"{problem}. It holds the run whole up to step {self.written} (t = {self.written_t:g}); "
+            f"{self.run.steps - self.written} steps done since are not in it. Once it can be written, go on with "
             f"'scvi-codegen run --resume {shlex.quote(str(self.folder))}' or resume_run"
         )
+
+
+def _checked_steps(run: Run, steps: int | None) -> int | None:
+    """Of a run of h; none of one with a goal."""
+    if run.goal is None:
+        return checked_count(steps, "steps", least=0)
+    if steps is not None:
+        raise StateError(f"steps that choose their length go to t_end={run.goal.t_end:g}: leave out steps={steps}")
+    return None
+
+
+def _further(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, Goal | None]:
+    """The manifest and the goal of a run that goes on as far as is wanted now."""
+    if run.goal is None:
+        if t_end is not None:
+            raise StateError(f"this run makes steps of h = {run.h:g}: give their number, steps, and no t_end")
+        wanted = manifest.steps if steps is None else steps
+        return replace(manifest, steps=checked_count(wanted, "steps", least=0)), None
+    _checked_steps(run, steps)
+    goal = run.goal if t_end is None else replace(run.goal, t_end=checked_number(t_end, "t_end"))
+    if (goal.t_end - run.t) * (run.goal.t_end - manifest.t) < 0.0:
+        raise StateError(f"the run stands at t = {run.t:g} already, beyond t_end = {goal.t_end:g}")
+    return replace(manifest, goal=goal), goal
 
 
 def _piece(trajectory: Trajectory, first: int) -> Piece:

@@ -1,0 +1,151 @@
+"""Runs in a folder whose steps choose their length: continued bit for bit, extended, read, and on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from recorded_runs import STATE, StopsAfter, assert_same, digests, recorded
+
+from scvi_codegen.cli import main, memory
+from scvi_codegen.errors import RecordingError, StateError
+from scvi_codegen.methods import SVI
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.problems import problem
+from scvi_codegen.results.recording import load_run, record_run, resume_run
+from scvi_codegen.runtime.stepper import Stepper
+
+END, TOLERANCE = 60.0, 1e-10
+MODEL = f"""
+[system]
+catalogue = "kepler"
+[method]
+method = "svi"
+degree = 4
+[run]
+tolerance = {TOLERANCE}
+span = {END}
+"""
+
+
+@pytest.fixture(scope="session")
+def kepler(compiled) -> Stepper:
+    return compiled("kepler", SVI(4))
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    return
+
+
+def controlled(stepper: Stepper, folder: str, t_end: float = END, **settings: object):
+    run = stepper.start(**STATE, t_end=t_end, tolerance=TOLERANCE)
+    return record_run(run, folder, **{"rows": 64} | settings)
+
+
+@pytest.mark.parametrize("every", [1, 7, 5000])
+def test_it_is_the_run_in_memory_in_full_files(kepler, every):
+    found, run = controlled(kepler, "a.run", every=every), kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE)
+    assert_same(found, kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE, every=every))
+    assert found.finished
+    assert found.steps == run.steps > 300
+    assert [len(piece) for piece in found.pieces()][:-1] == [64] * ((len(found) - 1) // 64)
+
+
+@pytest.mark.parametrize("every", [1, 9])
+def test_interrupted_it_has_the_bytes_of_one_that_was_not(kepler, every):
+    whole = controlled(kepler, "whole.run", every=every)
+    found, looks = controlled(kepler, "a.run", every=every, stop=StopsAfter(0), checkpoint_steps=31), 1
+    while not found.finished:
+        assert found.t[-1] < END
+        found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
+    assert looks > 3
+    assert found.steps == whole.steps
+    assert digests("a.run") == digests("whole.run")
+
+
+def test_a_part_is_a_trajectory_that_knows_states_between(kepler):
+    run = kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE)
+    found = controlled(kepler, "a.run")
+    piece, times = found[100:200], np.linspace(run.t[120], run.t[180], 9)
+    assert np.array_equal(piece.at(times)[0], run.at(times)[0])
+    assert np.abs(found[::5].at(times)[0] - run.at(times)[0]).max() < 1e-8
+    assert (piece.steps, piece.rejected, piece.step_error) == (run.steps, run.rejected, run.step_error)
+    assert found[:].h == found.h == run.h
+    assert len(found[:0]) == 0
+
+
+@pytest.mark.parametrize("t_end", [END, -END])
+def test_it_may_be_made_longer_and_shorter_but_not_turned(kepler, t_end):
+    controlled(kepler, "a.run", t_end, every=3)
+    longer = resume_run("a.run", t_end=1.5 * t_end)
+    assert longer.finished
+    assert t_end in longer.t
+    assert longer.t[-1] == 1.5 * t_end
+    assert np.abs(longer.q[-1] - kepler.integrate(**STATE, t_end=1.5 * t_end).q[-1]).max() < 1e-6
+    with pytest.raises(StateError, match="beyond"):
+        resume_run("a.run", t_end=t_end)
+    with pytest.raises(StateError, match="leave out steps"):
+        resume_run("a.run", steps=1000)
+    assert load_run("a.run").manifest == longer.manifest
+
+
+def test_the_other_kind_is_refused(kepler):
+    recorded(kepler, 10, folder="fixed.run")
+    with pytest.raises(StateError, match="no t_end"):
+        resume_run("fixed.run", t_end=3.0)
+    with pytest.raises(StateError, match="leave out steps"):
+        controlled(kepler, "b.run", steps=10)
+    with pytest.raises(StateError, match="steps"):
+        record_run(kepler.start(**STATE, h=0.1), "c.run")
+    with pytest.raises(RecordingError, match="another folder"):
+        controlled(kepler, "fixed.run")
+
+
+def test_a_model_file_has_a_tolerance():
+    model = parse_model(MODEL)
+    assert (model.h, model.tolerance, model.covered) == (None, TOLERANCE, END)
+    assert parse_model(dump_model(model)) == model
+    assert parse_model(MODEL, {"run": {"step": 0.1}}).step_count == 600
+    exact = Model(system=model.system, method=SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), tolerance=0, span=-2.0)
+    assert parse_model(dump_model(exact)) == exact
+    assert parse_model(dump_model(Model.from_problem(problem("kepler"))), {"run": {"tolerance": 0.5}}).h is None
+
+
+def invoke(words: str):
+    return CliRunner().invoke(main, ["run", *words.split()])
+
+
+def test_the_command_line_runs_records_and_resumes_it(kepler):
+    Path("k.toml").write_text(MODEL)
+    plain, half, rest = (
+        invoke("k.toml -o k.npz"),
+        invoke("k.toml -o k.run --span 30"),
+        invoke("--resume k.run --span 60"),
+    )
+    assert [done.exit_code for done in (plain, half, rest)] == [0, 0, 0], plain.output + half.output + rest.output
+    assert "of their own lengths" in plain.output
+    assert "worst step" in plain.output
+    assert f"to t = {END:g}" in rest.output
+    with np.load("k.npz") as file:
+        run = kepler.integrate(file["q"][0], file["p"][0], t_end=END, tolerance=TOLERANCE)
+        assert np.abs(file["q"][-1] - run.q[-1]).max() < 1e-9
+        assert float(file["h"]) == file["t"][1]
+    assert np.abs(load_run("k.run").q[-1] - run.q[-1]).max() < 1e-7
+    refused = invoke("k.toml --steps 10")
+    assert refused.exit_code != 0
+    assert "give span, not steps" in refused.output
+
+
+def test_a_run_that_outgrows_the_memory_is_ended_with_advice(monkeypatch):
+    Path("k.toml").write_text(MODEL)
+    monkeypatch.setattr(memory, "usable_memory", lambda: 8000.0)
+    done = invoke("k.toml")
+    assert done.exit_code != 0
+    assert "keep fewer (--every" in done.output
+    assert "-o NAME.run" in done.output
