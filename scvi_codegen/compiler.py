@@ -124,8 +124,9 @@ def compile_stepper(
 
 
 def _controlled(program: Program) -> Source | None:
-    """The text with steps that choose their length, where there is a fixed-point iteration whose error is known."""
-    return render(program, control_of(program.sweep)) if program.sweep and program.error_power else None
+    """The text with steps that choose their length, where the curve of a step tells its error."""
+    control = control_of(program)
+    return render(program, control) if control else None
 
 
 def _text_of(source: Source | None) -> str:
@@ -142,6 +143,7 @@ def generate_source(
     events: EventLike | Sequence[EventLike] | None = None,
     embedded: Embedded | None = None,
     amalgamate: bool = False,
+    controlled: bool = False,
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`.
 
@@ -149,6 +151,7 @@ def generate_source(
         embedded: the precision, ``"double"`` or ``"single"``, of text for a microcontroller: explicit or Newton's
             iteration alone, which takes half of the stack that lanes take where there are no vector registers.
         amalgamate: whether support headers stand in the source, not beside it; for a microcontroller they always do.
+        controlled: with steps that choose their length, where the curve of a step tells its error.
 
     Raises:
         MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
@@ -158,7 +161,8 @@ def generate_source(
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
-    source = render_embedded(program, embedded) if embedded else render(program)
+    control = control_of(program) if controlled else None
+    source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method)
     found = with_events(source, interface, functions) if functions else source
     return (found.amalgamated() if amalgamate else found), interface

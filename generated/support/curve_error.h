@@ -2,8 +2,6 @@
  * a coordinate, KEPT_VELOCITIES, whether they are velocities, KEPT_UNIT(i), what they move coordinate i by on a step,
  * and RESOLVED, what makes the highest coefficient that of the curve's accelerations. */
 
-#define NEGLIGIBLE 1e-12 /* of displacements relative to the state: rounding leaves no curve of them */
-
 /* Of each coordinate, with everything as a part of its size: the square of what the highest coefficient moves it by,
  * over what the curve bends it by. Returned is the largest of these, or `least` if that is larger. */
 static double curve_error(const step_data *step, const sweep_data *data, const double *memory, const double *dq,

@@ -2,16 +2,16 @@
  * table STAGE_HIGHEST. */
 
 /* z: velocities of the stages. */
-static double stage_error(const step_data *step, const double *z, const double *dq, double least)
+static real stage_error(const step_data *step, const real *z, const real *dq, real least)
 {
-  double largest = 0.0;
+  real largest = 0;
   for (int i = 0; i < M; i++)
-    largest = larger(largest, fabs(step->q0[i]) + fabs(dq[i]));
+    largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   for (int i = 0; i < M; i++) {
-    const double *v = z + i * B;
-    const double unit = step->h / (fabs(step->q0[i]) + fabs(dq[i]) + DBL_EPSILON * largest + DBL_MIN);
-    const double bend = fabs(unit) * (fabs(v[B - 1] - v[0]) + fabs(v[B / 2] - v[0])) + 1e-12;
-    double top = 0.0;
+    const real *v = z + i * B;
+    const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + REAL_EPSILON * largest + REAL_MIN);
+    const real bend = MATH(fabs)(unit) * (MATH(fabs)(v[B - 1] - v[0]) + MATH(fabs)(v[B / 2] - v[0])) + NEGLIGIBLE;
+    real top = 0;
     for (int b = 0; b < B; b++)
       top += (4 * B - 6) * unit * STAGE_HIGHEST[b] * v[b];
     if (top * top > least * bend)

@@ -11,17 +11,30 @@ __all__ = ["Control"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """Guesses for steps on a ladder, h = 2^(k / rungs), and how the error of a step goes with its length.
+    """Steps on a ladder, h = 2^(k / rungs), by sweeps or by Newton's iteration.
 
     Attributes:
         mantissas: 2^(k / rungs) for the rungs of an octave.
+        ladder: of sweeps, ``None`` without these.
+        stage_growth: of the error of the curve of Newton's iteration from rung to rung; 0 where that tells no error.
+    """
+
+    mantissas: tuple[float, ...]
+    ladder: Ladder | None
+    stage_growth: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ladder:
+    """Guesses of sweeps for steps on a ladder, and how the error of a step goes with its length.
+
+    Attributes:
         reach: rungs between one step and the next, at most.
         alone: by the change into the next step, -reach .. reach: from the last step to the next.
         last, before: by the changes into the last step and into the next: from these two steps.
         growth: of the error of a curve from rung to rung.
     """
 
-    mantissas: tuple[float, ...]
     reach: int
     alone: tuple[LaneTable, ...]
     last: tuple[tuple[LaneTable, ...], ...]

@@ -1,7 +1,8 @@
 """A folder with everything one integrator needs: C for C programs, an importable package for Python.
 
     pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
-                   support/                         what it includes, the same C for every integrator
+                   support/                         what it includes, the same C for every integrator but for the
+                                                    tables of steps that choose their length
                    main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
                    __init__.py  interface.json      ``import pendulum_svi`` gives ``pendulum_svi.stepper``
                    model.toml  README.md            what it was made from, and how to use it
@@ -24,7 +25,7 @@ from pathlib import Path
 from string import Template
 from typing import IO, TYPE_CHECKING
 
-from scvi_codegen.errors import ModelFileError, PackageError, StateError
+from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.runtime.stepper import Stepper
@@ -39,6 +40,10 @@ INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1
 FILE_NAME = re.compile(r"(support/)?[\w.]+")
 OUTPUTS = 20
+COMPARED = 1e-9
+"""Tolerance of steps that choose their length beside an example of steps that do not."""
+ADVANCE_TO = "_advance_to("
+"""In the header of an integrator whose steps may choose their length."""
 
 OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
 """Folder names that would collide with ``main.c`` or hide what the package imports."""
@@ -114,7 +119,8 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
             raise
         raise PackageError(f"{target / INTERFACE_FILE} is damaged ({error!r}): generate the folder again") from error
     source = Source(prefix=interface.prefix, header=header, code=code, declarations=declarations, support=support)
-    return Stepper(source, interface)
+    controlled = source if ADVANCE_TO in declarations else None
+    return Stepper(source, interface, controlled=lambda: controlled)
 
 
 def _read(file: Path) -> str:
@@ -150,30 +156,44 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None) ->
     from scvi_codegen.compiler import generate_source
     from scvi_codegen.rendering.text import render_example
 
-    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix, embedded=embedded)
+    source, interface = generate_source(
+        model.system,
+        model.method,
+        solver=solver,
+        prefix=prefix,
+        embedded=embedded,
+        controlled=not embedded or model.h is None,
+    )
     texts = source.files
-    texts |= render_example(interface, _example(model), embedded or "double")
+    texts |= render_example(interface, _example(model, controlled=ADVANCE_TO in source.header), embedded or "double")
     described = _model_text(model)
     if described is not None:
         texts["model.toml"] = described
-    texts["README.md"] = _readme(interface, with_model=described is not None, embedded=embedded)
+    texts["README.md"] = _readme(
+        interface, with_model=described is not None, embedded=embedded, controlled=ADVANCE_TO in source.header
+    )
     if not embedded:
         texts["__init__.py"] = _template("__init__.py")
     return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
 
 
-def _example(model: Model) -> ExampleRun:
+def _example(model: Model, *, controlled: bool) -> ExampleRun:
     """The whole run of the model in at most about twenty lines of output."""
     from scvi_codegen.rendering.text import ExampleRun
 
-    steps = max(1, model.step_count)
+    if model.h is None and not controlled:
+        raise MethodError(f"{model.method.name} has no steps that choose their length (tolerance): give a step h")
+    steps = OUTPUTS if model.h is None else max(1, model.step_count)
     every = max(1, steps // OUTPUTS)
     return ExampleRun(
         q=model.q,
         p=model.p if model.p is not None else _momenta(model),
         parameters=model.system.defaults,
         t=model.t,
-        h=model.step,
+        h=model.h,
+        span=model.covered,
+        tolerance=COMPARED if model.tolerance is None else model.tolerance,
+        controlled=controlled,
         every=every,
         outputs=steps // every,
     )
@@ -208,7 +228,18 @@ def _model_text(model: Model) -> str | None:
         return None
 
 
-def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None) -> str:
+CONTROL = """By steps that choose their length, each with a relative error of `tolerance` (0: round-off), to `t_end`:
+
+```c
+static ${prefix}_run run;
+${prefix}_start(&run, t, 0.0, q0, p0);
+int status = ${prefix}_advance_to(&run, t_end, tolerance, most_steps, most_steps, parameters, NULL, &t, q, p,
+    &iterations, &report, workspace); /* there, if run.t == t_end: the state is in run.q and run.p */
+```
+"""
+
+
+def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None, controlled: bool) -> str:
     defaults = zip(interface.parameters, interface.defaults, strict=True)
     listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
     return (
@@ -221,6 +252,8 @@ def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None
             notes=", ".join(interface.notes),
             coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
             parameters=f"Parameters, with default values: {listed}." if listed else "There are no parameters.",
+            control=Template(CONTROL).substitute(prefix=interface.prefix) if controlled else "",
+            integrate=f"\ntrajectory = {interface.prefix}.stepper.integrate(q0, p0, t_end=t_end)" if controlled else "",
             origin="`model.toml` is what it was generated from." if with_model else "",
         )
         .rstrip("\n")

@@ -1,22 +1,29 @@
-"""Steps that choose their own length as C: the ladder's tables before ``support/control.h``."""
+"""Steps that choose their own length as C: the header with the ladder's tables."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.control import Ladder
 from scvi_codegen.ir.sweeps import LaneTable
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import print_number
 
-__all__ = ["ladder_tables"]
+__all__ = ["ladder_text"]
+
+HEAD = "/* From what is kept of former steps to a guess of the next: by changes of rung. Before it: vectors.h. */\n"
 
 
-def ladder_tables(control: Control, lanes: int) -> Iterator[str]:
+def ladder_text(ladder: Ladder, lanes: int) -> str:
+    """The header."""
+    return HEAD + "".join(f"{table}\n" for table in _tables(ladder, lanes))
+
+
+def _tables(ladder: Ladder, lanes: int) -> Iterator[str]:
     """From what is kept of former steps to the next: of the last one, and of each of the last two."""
-    changes = len(control.alone)
-    yield table(f"static const lanes LADDER_ALONE[{changes}][{lanes}]", [_columns(each) for each in control.alone])
-    for name, lines in (("LAST", control.last), ("BEFORE", control.before)):
+    changes = len(ladder.alone)
+    yield table(f"static const lanes LADDER_ALONE[{changes}][{lanes}]", [_columns(each) for each in ladder.alone])
+    for name, lines in (("LAST", ladder.last), ("BEFORE", ladder.before)):
         rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
         yield table(f"static const lanes LADDER_{name}[{changes}][{changes}][{lanes}]", rows)
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.parts import parts
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
-from scvi_codegen.rendering.control import ladder_tables
+from scvi_codegen.rendering.control import ladder_text
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
@@ -60,13 +60,23 @@ LARGEST_INLINED = 150
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExampleRun:
-    """What the generated ``main.c`` runs: initial state, step, and how often it prints."""
+    """What the generated ``main.c`` runs: initial state, step, and how often it prints.
+
+    Attributes:
+        h: of steps of one length, ``None`` where they choose theirs.
+        span: of time.
+        tolerance: of steps that choose their length.
+        controlled: whether the integrator has these.
+    """
 
     q: tuple[float, ...]
     p: tuple[float, ...]
     parameters: tuple[float, ...]
     t: float
-    h: float
+    h: float | None
+    span: float
+    tolerance: float
+    controlled: bool
     every: int
     outputs: int
 
@@ -102,11 +112,10 @@ class EventSearch:
 
 def render(program: Program, control: Control | None = None) -> Source:
     """Header and source of a program; with control, steps that choose their length. Equal programs give equal bytes."""
-    ladder = tuple(ladder_tables(control, program.sweep.lanes)) if control and program.sweep else ()
-    return _render(program.prefix, _context(program, DOUBLE) | {"control": control, "ladder": ladder})
+    return _render(program.prefix, _context(program, DOUBLE) | _control_context(program, control))
 
 
-def render_embedded(program: Program, precision: Embedded) -> Source:
+def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
     """The same for a microcontroller: one file, iterations bounded when it is compiled, the scalars of its registers.
 
     Raises:
@@ -116,19 +125,30 @@ def render_embedded(program: Program, precision: Embedded) -> Source:
     target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
     bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
-    return _render(program.prefix, _context(program, target) | bounded).amalgamated()
+    return _render(
+        program.prefix, _context(program, target) | _control_context(program, control) | bounded
+    ).amalgamated()
 
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
     environment = template_environment()
     code = environment.get_template(f"{entry}.c.jinja").render(context)
+    own = cast("Mapping[str, str]", context.get("own_headers", {}))
     return Source(
         prefix=prefix,
         header=environment.get_template(f"{entry}.h.jinja").render(context),
         code=code,
         declarations=environment.get_template(DECLARATIONS[entry]).render(context),
-        support=tuple((name, support_text(name)) for name in included(code)),
+        support=tuple((name, own.get(name) or support_text(name)) for name in included(code)),
     )
+
+
+def _control_context(program: Program, control: Control | None) -> dict[str, object]:
+    """What the templates of steps that choose their length need; the ladder's tables are a header of their own."""
+    name = f"support/{program.prefix}_ladder.h"
+    if not (control and control.ladder and program.sweep):
+        return {"control": control, "own_headers": {}}
+    return {"control": control, "own_headers": {name: ladder_text(control.ladder, program.sweep.lanes)}}
 
 
 def render_ensemble(program: Program) -> Source | None:
@@ -175,7 +195,7 @@ def render_events(search: EventSearch) -> Source:
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
     """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     target = TARGETS[precision]
-    target.check((*start.q, *start.p, *start.parameters, start.t, start.h))
+    target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
     context = {
         "interface": interface,
         "prefix": interface.prefix,

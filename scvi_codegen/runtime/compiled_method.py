@@ -129,8 +129,8 @@ class CompiledMethod:
         source = self._controlled()
         if source is None:
             raise MethodError(
-                f"{self.interface.method} has no steps that choose their length for this system: they need a "
-                "fixed-point iteration (solver 'auto' or 'fixed-point') of two points or more; give h and steps"
+                f"{self.interface.method} has no steps that choose their length for this system: they need a curve "
+                "of velocities or forces at two points or more, which tells the error of a step; give h and steps"
             )
         if source == self._plain:
             return self

@@ -1,49 +1,43 @@
-/* Steps that choose their own length. Before it: run.h, and the ladder: MANTISSA, GROWTH, LADDER_ALONE, LADDER_LAST,
- * LADDER_BEFORE.
- *
- * Steps are roots of 2 to the power of a rung, so that a guess continues the curve of former steps by one of few
- * tables: from the last step, for each change of rung into the next; from the last two, for each pair of changes. */
+/* Steps that choose their own length, roots of 2 to the power of a rung. Before it: attempt of a solver, which tries a
+ * step, MANTISSA, and GROWTH, what a rung up multiplies the error of a curve by. */
 enum {
   OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
-  CHANGES = sizeof LADDER_ALONE / sizeof *LADDER_ALONE,
-  REACH = CHANGES / 2,
   MOST_UP = 4 * OCTAVE, /* rungs, while the first step is looked for */
   MOST_DOWN = 2 * OCTAVE /* after a step that failed */
 };
 
-#define USED_PART 0.5 /* of the error allowed, what a longer step may be expected to use */
-#define LITTLE 0.5 /* of the error that lets a step be two rungs longer: less is not measured */
-#define LAST_STEP 1e-6 /* a step that ends so near the end, as a part of it, ends there */
-#define FIRST_STEP DBL_EPSILON /* of the whole span: the first step tried */
-#define VANISHING 1e-22 /* beside the time, which has two doubles: a motion with such steps ends in a singularity */
-#define LEAST_ERROR (0.03125 * DBL_EPSILON) /* allowed to a step: a million of them add up to what rounding leaves */
-#define ITERATION_PART (1.0 / 256) /* of the error allowed to a step: that of its stage equations */
+#define USED_PART REAL(0.5) /* of the error allowed, what a longer step may be expected to use */
+#define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
+#define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
+#define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
+#define LEAST_ERROR (REAL(0.03125) * REAL_EPSILON) /* allowed to a step: a million add up to what rounding leaves */
+#define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
 
 /* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
  * `few`, two below `fewer`. */
 typedef struct {
-  double most, few, fewer;
+  real most, few, fewer;
 } error_limits;
 
-static error_limits limits_of(double tolerance)
+static error_limits limits_of(real tolerance)
 {
-  const double most = pow(tolerance, 1.0 / ERROR_POWER);
+  const real most = MATH(pow)(tolerance, 1 / ERROR_POWER);
   const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH)};
   return limits;
 }
 
-static double length_of(long long rung)
+static real length_of(long long rung)
 {
   const long long octave = rung >= 0 ? rung / OCTAVE : -((OCTAVE - 1 - rung) / OCTAVE);
-  return ldexp(MANTISSA[rung - octave * OCTAVE], (int)octave);
+  return MATH(ldexp)(MANTISSA[rung - octave * OCTAVE], (int)octave);
 }
 
 /* The longest rung that is not longer than h > 0. */
-static long long rung_below(double h)
+static long long rung_below(real h)
 {
   int exponent;
   long long rung;
-  frexp(h, &exponent);
+  MATH(frexp)(h, &exponent);
   for (rung = (long long)exponent * OCTAVE; length_of(rung) > h; rung--)
     ;
   return rung;
@@ -51,27 +45,13 @@ static long long rung_below(double h)
 
 /* By how many rungs the next step is longer. The error is expected to go on growing as it did; where it fell, much of
  * that may have been luck. */
-static int next_change(double error, double before, const error_limits *limits)
+static int next_change(real error, real before, const error_limits *limits)
 {
-  const double expected = before > 0.0 && error > before ? error * smaller(error / before, GROWTH * GROWTH)
-                                                         : larger(error, before / (GROWTH * GROWTH));
+  const real expected = before > 0 && error > before ? error * smaller(error / before, GROWTH * GROWTH)
+                                                     : larger(error, before / (GROWTH * GROWTH));
   if (expected > limits->most)
     return expected > limits->most * GROWTH ? -2 : -1;
   return expected < limits->fewer ? 2 : expected < limits->few;
-}
-
-/* The tables that continue the steps before into the next; whether there are any. */
-static inline int choose_tables(const run_memory *run, struct guess_tables *tables)
-{
-  const long long last = run->change_before + REACH, next = run->change + REACH;
-  if (next < 0 || next >= CHANGES || (run->guess == 2 && (last < 0 || last >= CHANGES)))
-    return 0;
-  tables->alone = LADDER_ALONE[next];
-  if (run->guess == 2) {
-    tables->last = LADDER_LAST[last][next];
-    tables->before = LADDER_BEFORE[last][next];
-  }
-  return 1;
 }
 
 /* What the trials of a step share. */
@@ -79,37 +59,30 @@ typedef struct {
   state at;
   step_data step;
   solver_data data;
-  struct guess_tables tables;
   error_limits limits;
-  double t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low parts */
+  real t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low parts */
   long long guess;
   int last; /* whether the step ends at t_end */
 } trial;
 
 /* One trial of the step that the run is at: increments, and what their curve leaves unresolved, if more than `least`;
  * infinity where there is none. */
-HOT void try_step(run_memory *run, trial *now, double least, const solver_options *options, solver_report *report)
+HOT void try_step(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
 {
-  const double rest = (now->t_end - now->at.t) - now->at.t_low, length = length_of(run->rung);
-  int status;
-  now->last = length * (1.0 + LAST_STEP) >= fabs(rest);
+  const real rest = (now->t_end - now->at.t) - now->at.t_low, length = length_of(run->rung);
+  now->last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);
   report->t = now->step.t = now->at.t;
-  if (now->last || fabs(now->step.h) != length) {
-    now->step.h = now->last ? rest : copysign(length, rest);
+  if (now->last || MATH(fabs)(now->step.h) != length) {
+    now->step.h = now->last ? rest : MATH(copysign)(length, rest);
     prepare(&now->step, &now->data);
   }
-  now->guess = now->last || !choose_tables(run, &now->tables) ? 0 : run->guess;
-  status = sweep(&now->step, &now->data, run->memory, &now->guess, now->dq, now->dp, options, report);
-  if (status == OK && reaches(now->at.q, now->dq) && reaches(now->at.p, now->dp))
-    now->error = curve_error(&now->step, &now->data, run->memory, now->dq, least);
-  else
-    now->error = INFINITY;
+  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, least, options, report);
 }
 
 /* By how many rungs the first step may be longer at once. */
 static int rungs_up(const trial *now)
 {
-  double error = now->error;
+  real error = now->error;
   int up = 0;
   if (error < now->limits.fewer)
     for (; up < MOST_UP && error * GROWTH <= now->limits.most; up++)
@@ -121,37 +94,37 @@ static int rungs_up(const trial *now)
  * where some velocities are zero, rounding leaves nothing of what they become. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const double span = fabs(now->t_end - now->at.t);
+  const real span = MATH(fabs)(now->t_end - now->at.t);
   int found = 0, up = 1;
-  run->rung = rung_below(run->h != 0.0 ? fabs(run->h) : span * FIRST_STEP);
-  try_step(run, now, 0.0, options, report);
+  run->rung = rung_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
+  try_step(run, now, 0, options, report);
   while (!now->last && up > 0) {
     found = found || now->error < INFINITY;
     up = found ? rungs_up(now) : MOST_UP;
     run->rung += up;
     if (up > 0)
-      try_step(run, now, 0.0, options, report);
+      try_step(run, now, 0, options, report);
   }
 }
 
 /* Shortens the step after a trial that failed, or whose error was too large; 0 if it is as good as nothing. */
 static int shorten(run_memory *run, const trial *now)
 {
-  double error = now->error;
+  real error = now->error;
   int down = 0;
   for (; down < MOST_DOWN && !(error <= now->limits.most); down++)
     error /= GROWTH;
   run->rung -= down > 1 ? down : 2;
   run->guess = 0;
   run->rejected++;
-  return length_of(run->rung) > VANISHING * (fabs(now->at.t) + DBL_EPSILON * fabs(now->t_end - now->at.t));
+  return length_of(run->rung) > VANISHING * (MATH(fabs)(now->at.t) + REAL_EPSILON * MATH(fabs)(now->t_end - now->at.t));
 }
 
 /* The step that the run is at, tried shorter and shorter until its error is allowed; 0 if it vanishes. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const double least = LITTLE * now->limits.fewer;
-  if (run->error_before > 0.0)
+  const real least = LITTLE * now->limits.fewer;
+  if (run->error_before > 0)
     try_step(run, now, least, options, report);
   else
     try_first_step(run, now, options, report);
@@ -190,7 +163,7 @@ static inline void take_step(run_memory *run, trial *now)
   }
   if (now->last) {
     now->at.t = now->t_end;
-    now->at.t_low = 0.0;
+    now->at.t_low = 0;
     run->guess = 0;
   } else {
     add_to_time(&now->at.t, &now->at.t_low, now->step.h);
@@ -199,22 +172,22 @@ static inline void take_step(run_memory *run, trial *now)
   run->step++;
 }
 
-int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long steps, long long every,
-    const double *parameters, const solver_options *options, double *t, double *q, double *p, int *iterations,
-    solver_report *report, double *workspace)
+int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
+    const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
+    solver_report *report, real *workspace)
 {
   solver_options standard = NAME(default_options)();
   solver_report unread;
   trial now = {.limits = limits_of(larger(tolerance, LEAST_ERROR)), .t_end = t_end};
-  const step_data step = {run->t, 0.0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
-      &now.tables};
-  standard.tolerance = larger(DBL_EPSILON, ITERATION_PART * tolerance);
+  const step_data step = {run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
+      NULL};
+  standard.tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);
   options = options ? options : &standard;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   memcpy(&now.step, &step, sizeof step);
   load_state(run, &now.at);
-  if ((double)run->direction * (t_end - run->t) < 0.0)
+  if ((real)run->direction * (t_end - run->t) < 0)
     run->guess = 0;
   run->direction = t_end < run->t ? -1 : 1;
   while (report->steps < steps && now.at.t != t_end) {
@@ -229,8 +202,8 @@ int NAME(advance_to)(run_memory *run, double t_end, double tolerance, long long 
     if (run->step % every == 0 || now.at.t == t_end) {
       const long long stored = report->stored++;
       t[stored] = now.at.t;
-      memcpy(q + stored * M, now.at.q, sizeof(double) * M);
-      memcpy(p + stored * M, now.at.p, sizeof(double) * M);
+      memcpy(q + stored * M, now.at.q, sizeof(real) * M);
+      memcpy(p + stored * M, now.at.p, sizeof(real) * M);
       iterations[stored] = (int)run->iterations;
       run->iterations = 0;
     }

@@ -1,6 +1,6 @@
 /* The largest error of the curves that Newton's iteration found. Before it: stage_error.h. */
-static double largest_error(const run_memory *run, const step_data *step, const solver_data *data, const double *dq,
-    double *workspace)
+static real largest_error(const run_memory *run, const step_data *step, const solver_data *data, const real *dq,
+    real *workspace)
 {
   (void)data, (void)workspace;
   return stage_error(step, run->memory, dq, run->error);

@@ -7,7 +7,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.compiler import program_of
-from scvi_codegen.lowering.solvers.ladder import control_of
+from scvi_codegen.lowering.solvers.ladder import ladder_of
 from scvi_codegen.tables.basis import legendre_functional
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
@@ -38,11 +38,11 @@ def test_coefficients_have_106_bits(method):
 @pytest.mark.parametrize("degree", [2, 8])
 def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree):
     sweep = program_of(system, sc.SVI(degree)).sweep
-    control, same = control_of(sweep), control_of(sweep).reach
+    ladder, same = ladder_of(sweep), ladder_of(sweep).reach
     for found, wanted in (
-        (control.alone[same], sweep.guess.last_alone),
-        (control.last[same][same], sweep.guess.last),
-        (control.before[same][same], sweep.guess.before),
+        (ladder.alone[same], sweep.guess.last_alone),
+        (ladder.last[same][same], sweep.guess.last),
+        (ladder.before[same][same], sweep.guess.before),
     ):
         assert np.allclose(found, wanted, rtol=0.0, atol=1e-13 * np.abs(wanted).max())
 
@@ -51,7 +51,7 @@ def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree)
 def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
     system = sc.problem("double-pendulum").system
     sweep = program_of(system, method).sweep
-    control, points = control_of(sweep), np.array(sweep.guess.abscissae)
+    ladder, points = ladder_of(sweep), np.array(sweep.guess.abscissae)
     accelerations = sweep.kind == "collocation"  # z = h a is kept
 
     def curve(t):
@@ -63,7 +63,7 @@ def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
             scales = (h_before, h_last, h_next) if accelerations else (1.0, 1.0, 1.0)
             before, last = scales[0] * curve(points - 1.0), scales[1] * curve(h_last * points)
             wanted = scales[2] * curve(h_last + h_next * points)
-            tables = [np.array(each[into_last + 2][into_next + 2]) for each in (control.last, control.before)]
+            tables = [np.array(each[into_last + 2][into_next + 2]) for each in (ladder.last, ladder.before)]
             padded = [np.pad(values, (0, sweep.lanes - len(points))) for values in (last, before)]
             found = sum(table @ values for table, values in zip(tables, padded, strict=True))
             assert np.allclose(found[: len(points)], wanted, rtol=1e-8, atol=1e-8)

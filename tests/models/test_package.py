@@ -99,6 +99,7 @@ def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compil
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (result.returncode, "warning" in result.stderr) == (0, False)
     header, *lines = result.stdout.splitlines()
+    lines = [line for line in lines if not line.startswith("#")]
     names = [coordinate.name for coordinate in model.system.coordinates]
     assert header.split() == ["#", "t", *names, *(f"p_{name}" for name in names), "energy_error"]
     table = np.array([line.split() for line in lines], dtype=float)

@@ -243,10 +243,44 @@ def test_a_wrong_argument_is_named(kepler, arguments, words):
         kepler.integrate([1.0, 0.0], [0.0, 1.0], **arguments)
 
 
-def test_methods_without_sweeps_say_so():
+def test_methods_without_a_curve_say_so():
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
-    with pytest.raises(MethodError, match="fixed-point"):
+    with pytest.raises(MethodError, match="tells the error of a step"):
         stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
+
+
+@pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, space="trigonometric:0.5")])
+def test_newtons_iteration_has_them(method):
+    stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")
+    assert "sweep(" not in stepper.source.code
+    for e in (0.2, 0.9):
+        q, p = orbit(e)
+        run = stepper.integrate(q, p, t_end=20.0)
+        assert run.t[-1] == 20.0
+        assert np.abs(run.q[-1] - exact_position(q, p, 20.0)).max() < 5e-11
+        assert run.rejected <= 0.05 * run.steps
+        assert np.abs(np.diff(run.energy())).max() < 3e-14
+    saved = stepper.start(q, p, t_end=20.0)
+    first = saved.record(31)
+    rest = stepper.restore(saved.save(), t_end=20.0).record()
+    assert np.array_equal(np.concatenate([first.q, rest.q[1:]]), run.q)
+
+
+def test_stiff_systems_take_steps_as_long_as_their_motion_by_newtons_iteration():
+    system = sc.LagrangianSystem.from_text(
+        name="penalty pendulum",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y - k*(x**2 + y**2 - 1)**2/8",
+        parameters={"k": 1e10},
+    )
+    start, rest = [math.sin(1.0), -math.cos(1.0)], [0.0, 0.0]
+    stiff = sc.compile_stepper(system, sc.SVI(6), solver="newton")
+    run = stiff.integrate(start, rest, t_end=2.0, tolerance=1e-9)
+    rigid = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(6))
+    angle = rigid.integrate([1.0], [0.0], t_end=2.0, parameters={"g": 1.0, "l": 1.0, "m": 1.0}).q[-1, 0]
+    assert run.steps < 100  # of the vibration there are 30,000 in this time
+    assert np.abs(run.q[-1] - [math.sin(angle), -math.cos(angle)]).max() < 1e-8
+    assert np.ptp(run.energy()) < 1e-6
 
 
 def test_solve_motion_takes_the_tolerance_of_steps(kepler):

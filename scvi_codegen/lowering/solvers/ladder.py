@@ -11,17 +11,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.control import Control, Ladder
+from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweeps import CurveSweep, LaneTable, SeparableSweep, Sweep
 from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 
-__all__ = ["control_of"]
+__all__ = ["control_of", "ladder_of"]
 
 RUNGS, REACH = 4, 2
 """Rungs an octave, and how many of them a step may be from the one before for its guess to be continued."""
 
 
-def control_of(sweep: Sweep) -> Control:
+def control_of(program: Program) -> Control | None:
+    """How the steps of a program choose their length; ``None`` where its curves tell no error."""
+    if not program.error_power or program.integrals:
+        return None
+    return Control(
+        mantissas=tuple(2.0 ** (k / RUNGS) for k in range(RUNGS)),
+        ladder=ladder_of(program.sweep) if program.sweep else None,
+        stage_growth=2.0 ** (program.stage_error_power / RUNGS) if program.stage_highest else 0.0,
+    )
+
+
+def ladder_of(sweep: Sweep) -> Ladder:
     """The ladder of a fixed-point iteration."""
     points, ratios = sweep.guess.abscissae, [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
     alone = _tables(sweep, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
@@ -30,8 +42,7 @@ def control_of(sweep: Sweep) -> Control:
         sources = (*points, *((x - 1.0) / ratio for x in points))
         most = min(len(set(sources)) - 1, max(2 * len(points) - 2, INTERPOLATED), DEGREE_OF_TWO)
         pairs.append(_tables(sweep, ratios, sources, most, (1.0, ratio)))
-    return Control(
-        mantissas=tuple(2.0 ** (k / RUNGS) for k in range(RUNGS)),
+    return Ladder(
         reach=REACH,
         alone=tuple(table for (table,) in alone),
         last=tuple(tuple(last for last, _ in line) for line in pairs),

@@ -1,0 +1,21 @@
+/* Trials of steps that choose their length, by Newton's iteration. Before it: run.h, newton_solver.h, stage_error.h. */
+#define HOT static
+
+static inline real smaller(real a, real b)
+{
+  return a < b ? a : b;
+}
+
+/* Increments, and what their curve leaves unresolved, if more than `least`; infinity where there are none. Afresh:
+ * without a guess, which only a step as long as the one before has. */
+static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess, real *dq,
+    real *dp, real least, const solver_options *options, solver_report *report)
+{
+  *guess = !afresh && run->change == 0 && run->guess > 0;
+  if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
+    return INFINITY;
+  *guess = 1;
+  if (!reaches(step->q0, dq) || !reaches(step->p0, dp))
+    return INFINITY;
+  return stage_error(step, run->memory, dq, least);
+}

@@ -1,0 +1,76 @@
+"""Generated folders with steps that choose their length: from C, from Python, on a microcontroller."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError
+from scvi_codegen.models.package import generate_package, load_package
+
+STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
+SPAN = 10.0
+
+
+@pytest.fixture(scope="module")
+def model() -> sc.Model:
+    found = sc.Model.from_problem(sc.problem("kepler"), sc.SVI(4))
+    return replace(found, h=None, tolerance=1e-9, span=SPAN)
+
+
+def output(folder: Path, flags: str = STRICT) -> list[str]:
+    done = subprocess.run(
+        ["make", "-s", "-C", str(folder), "run", f"CFLAGS={flags}"], capture_output=True, text=True, check=True
+    )
+    return done.stdout.splitlines()
+
+
+def exact_end(model: sc.Model) -> np.ndarray:
+    stepper = sc.compile_stepper(model.system, sc.SVI(8))
+    return stepper.integrate(model.q, velocity=model.velocity, t_end=SPAN).q[-1]
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_the_example_goes_to_the_end_by_them(model, tmp_path, solver):
+    lines = output(generate_package(model, tmp_path / "controlled", solver=solver))
+    states = np.array([[float(word) for word in line.split()] for line in lines if not line.startswith("#")])
+    assert np.allclose(states[:, 0], np.linspace(0.0, SPAN, 21), rtol=1e-15)
+    assert np.abs(states[-1, 1:3] - exact_end(model)).max() < 1e-6
+    assert np.abs(states[:, -1]).max() < 1e-7
+    assert lines[-1].startswith("# ")
+    assert int(lines[-1].split()[1]) > 20
+
+
+def test_the_example_of_a_step_compares_them_with_it(model, tmp_path):
+    lines = output(generate_package(replace(model, h=0.01, tolerance=None), tmp_path / "fixed"))
+    assert "steps of their own lengths" in lines[-1]
+    assert max(abs(float(word)) for word in lines[-1].split()[-2:]) < 1e-5
+
+
+def test_the_folder_has_them_in_python_too(model, tmp_path):
+    stepper = load_package(generate_package(model, tmp_path / "controlled"))
+    run = stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=2.0 * np.pi)
+    assert np.abs(run.q[-1] - [1.0, 0.0]).max() < 1e-13
+    assert "_advance_to" in (tmp_path / "controlled" / "README.md").read_text()
+
+
+@pytest.mark.parametrize(("precision", "error"), [("double", 1e-6), ("single", 1e-2)])
+def test_a_microcontroller_has_them_where_the_model_asks(model, tmp_path, precision, error):
+    folder = generate_package(replace(model, tolerance=1e-5), tmp_path / "board", embedded=precision)
+    flags = f"{STRICT} -Wdouble-promotion" if precision == "single" else STRICT
+    subprocess.run(["cc", "-c", *flags.split(), "-ffreestanding", "board.c"], cwd=folder, check=True)
+    end = np.array([float(word) for word in output(folder)[-2].split()])
+    assert np.abs(end[1:3] - exact_end(model)).max() < 100.0 * error
+    fixed = generate_package(replace(model, h=0.1, tolerance=None), tmp_path / "fixed", embedded=precision)
+    assert "advance_to" not in (fixed / "fixed.c").read_text()
+
+
+def test_a_method_that_has_none_says_so(model, tmp_path):
+    with pytest.raises(MethodError, match="give a step h"):
+        generate_package(replace(model, method=sc.StoermerVerlet()), tmp_path / "verlet")
+    assert not (tmp_path / "verlet").exists()
