@@ -9,18 +9,21 @@ and complete enough that no separate search for common subexpressions is needed:
 * every negative power of x is built from 1/x and every half-integer power from sqrt(x); x^(-k/2) for k = 1, 3, 5, 7,
   frequent in mechanics, are functions of their own, for which vectors have something faster.
 
-Nothing here changes a value but by rounding; ``tests/lowering/test_lowering.py`` reads kernels back and compares.
+Nothing here changes a value: constants are exact and rounded when they are printed.
+``tests/lowering/test_lowering.py`` reads kernels back and compares.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.ir.numbers import exact_number
 
 __all__ = ["lower_kernel"]
 
@@ -47,9 +50,6 @@ INVERSE_ROOTS = {-k: f"inverse_root_{k}" for k in (1, 3, 5, 7)}
 
 
 LARGEST_UNROLLED_POWER = 64
-
-
-CONSTANT_DIGITS = 30
 
 
 DEEPEST_EXPRESSION = 24
@@ -96,7 +96,7 @@ class _Graph:
         if isinstance(expression, sympy.Symbol):
             return self.node(self.loads[expression])
         if self.is_constant(expression):
-            return self.node(Constant(_double(expression)))
+            return self.node(Constant(exact_number(expression)))
         if isinstance(expression, sympy.Add):
             return self._sum(expression)
         if isinstance(expression, sympy.Mul):
@@ -124,7 +124,7 @@ class _Graph:
 
     def _scaled(self, coefficient: sympy.Rational, rest: sympy.Expr) -> int:
         if rest == 1:
-            return self.node(Constant(_double(coefficient)))
+            return self.node(Constant(exact_number(coefficient)))
         factors = sympy.Mul.make_args(rest)
         if coefficient == 1:
             return self.read(rest)
@@ -137,7 +137,7 @@ class _Graph:
             return node
         if coefficient == -1:
             return self.node(("neg", (node,)))
-        return self.node(("*", (self.node(Constant(_double(coefficient))), node)))
+        return self.node(("*", (self.node(Constant(exact_number(coefficient))), node)))
 
     def _product(self, expression: sympy.Mul) -> int:
         coefficient, rest = expression.as_coeff_Mul()
@@ -147,7 +147,7 @@ class _Graph:
         ordered = sorted(factors, key=self._rank)
         negative = coefficient < 0
         magnitude = abs(coefficient)
-        nodes = [] if magnitude == 1 else [self.node(Constant(_double(magnitude)))]
+        nodes = [] if magnitude == 1 else [self.node(Constant(exact_number(magnitude)))]
         for factor in ordered:
             node = self.read(factor)
             content = self.nodes[node]
@@ -176,7 +176,7 @@ class _Graph:
         return self.node(("*", (power, root)))
 
     def _inverse(self, x: int) -> int:
-        return self.node(("/", (self.node(Constant(1.0)), x)))
+        return self.node(("/", (self.node(Constant(Fraction(1))), x)))
 
     def _whole(self, x: int, n: int) -> int:
         """x^n by halving, n >= 1."""
@@ -193,19 +193,6 @@ class _Graph:
         if isinstance(factor, sympy.Symbol):
             return (1 if self.loads[factor].source == "parameters" else 3, self.read(factor))
         return (2, self.read(factor))
-
-
-def _double(number: sympy.Expr) -> float:
-    """The nearest binary64 number to a constant expression."""
-    if isinstance(number, sympy.Rational):
-        try:
-            return int(number.p) / int(number.q)
-        except OverflowError:
-            raise SystemDefinitionError(f"the constant {number} does not fit a double") from None
-    value = complex(number.evalf(CONSTANT_DIGITS))
-    if value.imag or value.real != value.real or value.real in (float("inf"), -float("inf")):
-        raise SystemDefinitionError(f"the constant {number} is not a finite real number")
-    return value.real
 
 
 def lower_kernel(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.ir.sweeps import LaneTable
+from scvi_codegen.ir.numbers import NumberTable
 
 __all__ = ["Control"]
 
@@ -36,7 +36,7 @@ class Ladder:
     """
 
     reach: int
-    alone: tuple[LaneTable, ...]
-    last: tuple[tuple[LaneTable, ...], ...]
-    before: tuple[tuple[LaneTable, ...], ...]
+    alone: tuple[NumberTable, ...]
+    last: tuple[tuple[NumberTable, ...], ...]
+    before: tuple[tuple[NumberTable, ...], ...]
     growth: float

@@ -7,11 +7,9 @@ loop is over so many ``sites`` from the ``first`` on.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    pass
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
 
 __all__ = ["Family", "GatherLoop", "ScatterLoop", "SlopeBlock"]
 
@@ -26,7 +24,7 @@ class GatherLoop:
     offset: int
     from_state: bool
     power: int
-    table: tuple[tuple[float, ...], ...]
+    table: NumberTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +36,7 @@ class ScatterLoop:
     sites: int
     offset: int
     power: int
-    table: tuple[tuple[float, ...], ...]
+    table: NumberTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,8 +61,8 @@ class Family:
 
     name: str
     arguments: tuple[str, ...]
-    abscissae: tuple[float, ...]
-    weights: tuple[float, ...]
+    abscissae: tuple[Number, ...]
+    weights: tuple[Number, ...]
     gathers: tuple[GatherLoop, ...]
     scatters: tuple[ScatterLoop, ...]
     value: Kernel

@@ -2,7 +2,7 @@
 
 ``u[i]`` are its arguments, ``t`` the time and ``parameters[i]`` the parameters: temporaries, each used more than once,
 then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary functions on
-binary64 numbers; there are no branches, loops or integers.
+numbers of the target's scalar type; there are no branches, loops or integers.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
+
+from scvi_codegen.ir.numbers import Number
 
 if TYPE_CHECKING:
     import sympy
@@ -19,9 +21,9 @@ __all__ = ["Constant", "Expression", "Kernel", "Load", "Operation", "loads", "op
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A binary64 number."""
+    """An exact number, or 60 digits of one."""
 
-    value: float
+    value: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +149,7 @@ def _count(expression: Expression, counts: dict[str, int]) -> None:
 
 def _text(expression: Expression) -> str:
     if isinstance(expression, Constant):
-        return repr(expression.value)
+        return str(expression.value)
     if isinstance(expression, Load):
         return "t" if expression.source == "t" else f"{expression.source}{expression.index}"
     return f"({expression.operator} {' '.join(_text(operand) for operand in expression.operands)})"

@@ -2,24 +2,22 @@
 
 A kernel is straight-line arithmetic over ``u[i]`` (its arguments), ``t`` and ``parameters[i]``: temporaries, each used
 more than once, then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary
-functions on binary64 numbers; there are no branches, loops or integers. Everything around the kernels (gather, scatter,
-Newton, sweeps, the run) is a loop over tables, the same for every method and system, and stands in the templates.
+functions; there are no branches, loops or integers. Numbers are exact and rounded when they are printed. Everything
+around the kernels (gather, scatter, Newton, sweeps, the run) is a loop over tables, the same for every method and
+system, and stands in the templates.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.sweeps import (
     Splitting,
     Sweep,
 )
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["FEW_UNKNOWNS", "Integrals", "MomentumMap", "Program"]
 
@@ -50,7 +48,7 @@ class Integrals:
     """
 
     kernel: Kernel
-    weights: tuple[float, ...]
+    weights: tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,12 +99,12 @@ class Program:
     families: tuple[Family, ...]
     places: tuple[int, ...]
     bandwidth: int
-    momentum_rows: tuple[float, ...]
-    end_position: tuple[float, ...]
+    momentum_rows: tuple[Number, ...]
+    end_position: tuple[Number, ...]
     straight: tuple[int, ...]
     momentum_blocks: tuple[int, ...]
     moving_blocks: tuple[int, ...]
-    extrapolation: tuple[tuple[float, ...], ...]
+    extrapolation: NumberTable
     legendre: Kernel
     mass_entries: tuple[tuple[int, int], ...]
     energy: Kernel
@@ -117,7 +115,7 @@ class Program:
     splitting: Splitting | None
     newton: bool
     order: int
-    stage_highest: tuple[float, ...]
+    stage_highest: tuple[Number, ...]
     numbers: tuple[str, str, str]
     integrals: Integrals | None = None
 

@@ -3,47 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
-if TYPE_CHECKING:
-    pass
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
 
 __all__ = [
     "CollocationSweep",
     "CoupledSweep",
     "GuessTables",
     "HamiltonianSweep",
-    "LaneTable",
     "NodeTables",
     "PointSweep",
     "PointTables",
     "PrintedEnds",
     "SeparableSweep",
     "ShootingSweep",
-    "SplitMatrix",
-    "SplitVector",
     "Splitting",
     "Sweep",
 ]
-
-LaneTable: TypeAlias = tuple[tuple[float, ...], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class SplitVector:
-    """Numbers in twice the precision of a double: ``high + low``."""
-
-    high: tuple[float, ...]
-    low: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class SplitMatrix:
-    """The same for a table."""
-
-    high: LaneTable
-    low: LaneTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,12 +33,12 @@ class GuessTables:
         degree, highest: (lanes,) what gives the highest Legendre coefficient of the curve through them.
     """
 
-    abscissae: tuple[float, ...]
+    abscissae: tuple[Number, ...]
     degree: int
-    highest: tuple[float, ...]
-    last_alone: LaneTable
-    last: LaneTable
-    before: LaneTable
+    highest: tuple[Number, ...]
+    last_alone: NumberTable
+    last: NumberTable
+    before: NumberTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +48,8 @@ class SeparableSweep:
         q_n = q0 + h drift[n] v0 + h^2 sum_j product[n][j] F_j / m,     v0 = p0 / m,
         q1 = q0 + h v0 + h^2 sum_j end_position[j] F_j / m,             p1 = p0 + h sum_j end_momentum[j] F_j.
 
-    All tables are padded to ``lanes`` rows and columns, and split, so that what their rounding does to the map is
-    2^-53 times less than what one rounding of a sum does: the energy of a variational method does not drift.
+    All tables are padded to ``lanes`` rows and columns, and printed in two parts, so that what their rounding does to
+    the map is 2^-53 times less than what one rounding of a sum does: the energy of a variational method does not drift.
 
     Attributes:
         points: real points; lanes beyond repeat the last one and have weight 0.
@@ -85,11 +63,11 @@ class SeparableSweep:
 
     points: int
     lanes: int
-    abscissae: tuple[float, ...]
-    drift: SplitVector
-    product: SplitMatrix
-    end_position: SplitVector
-    end_momentum: SplitVector
+    abscissae: tuple[Number, ...]
+    drift: tuple[Number, ...]
+    product: NumberTable
+    end_position: tuple[Number, ...]
+    end_momentum: tuple[Number, ...]
     guess: GuessTables
     force: Kernel
     mass: Kernel
@@ -136,13 +114,13 @@ class PointSweep:
 
     points: int
     lanes: int
-    abscissae: tuple[float, ...]
-    position: LaneTable
-    position_weights: tuple[float, ...]
-    momentum: LaneTable
-    momentum_weights: tuple[float, ...]
-    end_position: tuple[float, ...]
-    end_momentum: tuple[float, ...]
+    abscissae: tuple[Number, ...]
+    position: NumberTable
+    position_weights: tuple[Number, ...]
+    momentum: NumberTable
+    momentum_weights: tuple[Number, ...]
+    end_position: tuple[Number, ...]
+    end_momentum: tuple[Number, ...]
     guess: GuessTables
     kernel: Kernel
     force: Kernel
@@ -178,8 +156,8 @@ class CoupledSweep(PointSweep):
     """
 
     blocks: int
-    velocity: LaneTable
-    projection: LaneTable
+    velocity: NumberTable
+    projection: NumberTable
     mass_entries: tuple[tuple[int, int], ...]
 
     kind: ClassVar[str] = "coupled"
@@ -232,10 +210,10 @@ class NodeTables:
     """
 
     count: int
-    abscissae: tuple[float, ...]
-    collocation: LaneTable
-    end: tuple[float, ...]
-    mask: tuple[float, ...]
+    abscissae: tuple[Number, ...]
+    collocation: NumberTable
+    end: tuple[Number, ...]
+    mask: tuple[Number, ...]
     guess: GuessTables
 
 
@@ -249,9 +227,9 @@ class PointTables:
         action: L_q and L_v at (q, v, t).
     """
 
-    abscissae: tuple[float, ...]
-    position: LaneTable
-    velocity: LaneTable
+    abscissae: tuple[Number, ...]
+    position: NumberTable
+    velocity: NumberTable
     action: Kernel
 
 
@@ -310,11 +288,11 @@ class ShootingSweep(CurveSweep):
         weights: (lanes,) w; consistency: (lanes,) l^T w.
     """
 
-    collocation_transposed: LaneTable
-    position_transposed: LaneTable
-    velocity_transposed: LaneTable
-    weights: tuple[float, ...]
-    consistency: tuple[float, ...]
+    collocation_transposed: NumberTable
+    position_transposed: NumberTable
+    velocity_transposed: NumberTable
+    weights: tuple[Number, ...]
+    consistency: tuple[Number, ...]
 
     kind: ClassVar[str] = "shooting"
     sweeps_after: ClassVar[int] = 0
@@ -335,10 +313,10 @@ class PrintedEnds:
         end_force, end_momentum: w (l_0 + l_s) and w (l_0' + l_s').
     """
 
-    start_force: tuple[float, ...]
-    start_momentum: tuple[float, ...]
-    end_force: tuple[float, ...]
-    end_momentum: tuple[float, ...]
+    start_force: tuple[Number, ...]
+    start_momentum: tuple[Number, ...]
+    end_force: tuple[Number, ...]
+    end_momentum: tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -381,9 +359,9 @@ class Splitting:
         mass: constant diagonal (no arguments).
     """
 
-    kicks: tuple[float, ...]
-    drifts: tuple[float, ...]
-    abscissae: tuple[float, ...]
+    kicks: tuple[Number, ...]
+    drifts: tuple[Number, ...]
+    abscissae: tuple[Number, ...]
     force: Kernel
     mass: Kernel
 

@@ -7,7 +7,7 @@ import sympy
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.ir.families import Family, GatherLoop, ScatterLoop, SlopeBlock
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.rounding import lower_matrix, lower_vector
+from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.sites import Sites
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers

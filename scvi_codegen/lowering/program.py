@@ -1,4 +1,4 @@
-"""Symbolic to program: expressions become straight-line arithmetic, tables are rounded, loops are listed.
+"""Symbolic to program: expressions become straight-line arithmetic, tables and loops are listed.
 
 A kernel's expressions are read into one graph in which equal nodes are the same node. Three rules make sharing cheap
 and complete enough that no separate search for common subexpressions is needed:
@@ -21,8 +21,8 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, lower_matrix, lower_vector
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program
-from scvi_codegen.ir.rounding import lower_matrix, lower_vector
 from scvi_codegen.ir.sweeps import Splitting, Sweep
 from scvi_codegen.lowering.families import lowered_family
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
@@ -114,7 +114,7 @@ def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str,
     return rows, q1, p1
 
 
-def _stage_highest(stages: StageSystem) -> tuple[float, ...]:
+def _stage_highest(stages: StageSystem) -> tuple[Number, ...]:
     """Where the unknowns are two or more velocities along the curve."""
     shape = stages.shape
     if not isinstance(shape, Velocities) or not 1 < len(shape.blocks) == len(set(shape.blocks)) == len(stages.blocks):

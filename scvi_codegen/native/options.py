@@ -8,7 +8,7 @@ from typing import Any
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.rendering.target import MAX_ITERATIONS, TOLERANCE
+from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from scvi_codegen.ir.control import Ladder
-from scvi_codegen.ir.sweeps import LaneTable
+from scvi_codegen.ir.numbers import NumberTable
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import print_number
 
@@ -28,6 +28,6 @@ def _tables(ladder: Ladder, lanes: int) -> Iterator[str]:
         yield table(f"static const lanes LADDER_{name}[{changes}][{changes}][{lanes}]", rows)
 
 
-def _columns(rows: LaneTable) -> list[str]:
+def _columns(rows: NumberTable) -> list[str]:
     """Vectors, of which column j is what point j gives to all."""
     return [f"{{{', '.join(map(print_number, column))}}}" for column in zip(*rows, strict=True)]

@@ -11,13 +11,14 @@ from jinja2.runtime import Context
 
 from scvi_codegen.files.templates import template_folder
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number
 from scvi_codegen.rendering.functions import kernel_text, lane_kernel_text, lane_mass_text
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototypes
 from scvi_codegen.rendering.printer import print_number
 
 __all__ = ["support_text", "template_environment"]
 
-Rows: TypeAlias = Sequence[Sequence[float]]
+Rows: TypeAlias = Sequence[Sequence[Number]]
 
 
 def _power_of_h(k: int) -> str:
@@ -29,16 +30,16 @@ def _power_of_h(k: int) -> str:
 
 
 @pass_context
-def _number(context: Context, value: float) -> str:
+def _number(context: Context, value: Number) -> str:
     return print_number(value, context["target"])
 
 
-def _numbers(context: Context, values: Sequence[float]) -> list[str]:
+def _numbers(context: Context, values: Sequence[Number]) -> list[str]:
     return [_number(context, value) for value in values]
 
 
 @pass_context
-def _vector(context: Context, name: str, values: Sequence[float]) -> str:
+def _vector(context: Context, name: str, values: Sequence[Number]) -> str:
     """A table of numbers."""
     return table(f"static const {context['target'].scalar} {name}[{len(values)}]", _numbers(context, values))
 

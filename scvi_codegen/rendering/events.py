@@ -30,7 +30,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.rounding import lower_matrix, lower_vector
+from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import EventSearch, render_events
 from scvi_codegen.tables.nodes import chebyshev_lobatto, to_unit

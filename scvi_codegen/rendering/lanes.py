@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.sweeps import (
     CollocationSweep,
     CoupledSweep,
     CurveSweep,
     GuessTables,
     HamiltonianSweep,
-    LaneTable,
     PointSweep,
     SeparableSweep,
     ShootingSweep,
@@ -25,6 +25,7 @@ from scvi_codegen.ir.sweeps import (
 )
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
+from scvi_codegen.rendering.target import DOUBLE
 
 __all__ = ["POINTS", "TRAJECTORIES", "Lanes", "SweepText", "sweep_text"]
 
@@ -33,7 +34,7 @@ LIBRARY = ("sin", "cos", "exp", "log", "pow")
 
 OF_TWO = ("pow", "atan2")
 
-Values: TypeAlias = tuple[float, ...]
+Values: TypeAlias = tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +201,7 @@ def _tables(sweep: Sweep, meaning: Lanes) -> Iterator[str]:
 
 
 PrintVector: TypeAlias = Callable[[str, Values], str]
-PrintMatrix: TypeAlias = Callable[[str, LaneTable], str]
+PrintMatrix: TypeAlias = Callable[[str, NumberTable], str]
 
 
 def _printers(meaning: Lanes, points: int) -> tuple[PrintVector, PrintMatrix]:
@@ -212,13 +213,13 @@ def _printers(meaning: Lanes, points: int) -> tuple[PrintVector, PrintMatrix]:
     def vector(name: str, values: Values) -> str:
         return table(f"static const double {name}{size}", _numbers(values[:points]))
 
-    def matrix(name: str, rows: LaneTable) -> str:
+    def matrix(name: str, rows: NumberTable) -> str:
         return table(f"static const double {name}{size}{size}", [_numbers(row[:points]) for row in rows[:points]])
 
     return vector, matrix
 
 
-def _numbers(values: Sequence[float]) -> list[str]:
+def _numbers(values: Sequence[Number]) -> list[str]:
     return [print_number(value) for value in values]
 
 
@@ -226,7 +227,7 @@ def _lanes(name: str, rows: Sequence[Values]) -> str:
     return table(f"static const lanes {name}", [_numbers(row) for row in rows])
 
 
-def _columns(name: str, rows: LaneTable) -> str:
+def _columns(name: str, rows: NumberTable) -> str:
     """A table whose column j is a vector, what point j gives to all."""
     return _lanes(f"{name}[{len(rows[0])}]", tuple(zip(*rows, strict=True)))
 
@@ -237,15 +238,24 @@ def _vector(name: str, values: Values) -> str:
 
 def _separable_tables(sweep: SeparableSweep, vector: PrintVector, matrix: PrintMatrix) -> Iterator[str]:
     yield vector("ABSCISSA", sweep.abscissae)
-    yield vector("DRIFT", sweep.drift.high)
-    yield vector("DRIFT_LOW", sweep.drift.low)
-    yield matrix("PRODUCT", sweep.product.high)
-    yield matrix("PRODUCT_LOW", sweep.product.low)
-    yield vector("POINT_END_POSITION", sweep.end_position.high)
-    yield vector("POINT_END_POSITION_LOW", sweep.end_position.low)
-    yield vector("POINT_END_MOMENTUM", sweep.end_momentum.high)
-    yield vector("POINT_END_MOMENTUM_LOW", sweep.end_momentum.low)
+    yield vector("DRIFT", sweep.drift)
+    yield vector("DRIFT_LOW", _rest(sweep.drift))
+    yield matrix("PRODUCT", sweep.product)
+    yield matrix("PRODUCT_LOW", _rests(sweep.product))
+    yield vector("POINT_END_POSITION", sweep.end_position)
+    yield vector("POINT_END_POSITION_LOW", _rest(sweep.end_position))
+    yield vector("POINT_END_MOMENTUM", sweep.end_momentum)
+    yield vector("POINT_END_MOMENTUM_LOW", _rest(sweep.end_momentum))
     yield from _guess_tables(sweep.guess, matrix)
+
+
+def _rest(values: Values) -> Values:
+    """What rounding cuts off the numbers of a table."""
+    return tuple(map(DOUBLE.rest, values))
+
+
+def _rests(rows: NumberTable) -> NumberTable:
+    return tuple(map(_rest, rows))
 
 
 def _point_tables(sweep: PointSweep, vector: PrintVector, matrix: PrintMatrix) -> Iterator[str]:

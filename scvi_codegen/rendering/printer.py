@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.parts import Part, kept_numbers, parts
 from scvi_codegen.ir.sweeps import Sweep
 from scvi_codegen.rendering.target import DOUBLE, Target
@@ -35,8 +36,8 @@ OWN_FUNCTIONS = (INVERSE_ROOT, "lanes_")
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
 
 
-def print_number(value: float, target: Target = DOUBLE) -> str:
-    """A C literal that reads back as the same number of the target."""
+def print_number(value: Number, target: Target = DOUBLE) -> str:
+    """A C literal that reads back as the number of the target nearest to it."""
     return target.number(value)
 
 
@@ -84,7 +85,7 @@ def scalar_functions(kernel: Kernel) -> set[str]:
     return set().union(*(_functions(part, lambda expression: True) for part in parts(kernel)))
 
 
-def constants(kernel: Kernel) -> Iterator[float]:
+def constants(kernel: Kernel) -> Iterator[Number]:
     """The numbers written in a kernel."""
     every = (expression for part in parts(kernel) for expression in _expressions(part))
     return (expression.value for expression in every if isinstance(expression, Constant))

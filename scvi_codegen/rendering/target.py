@@ -1,24 +1,20 @@
 """What the C is written for: the scalar type, and all that follows from it.
 
-Arithmetic is lowered to numbers of Python; how they are spelled, which functions of libm take them and how exact they
-are belongs to a target. The support headers know it by the header of its name.
+The numbers of a program are exact. How they are rounded and spelled, and which functions of libm take them, belongs to
+a target. The support headers know it by the header of its name.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.ir.numbers import Number
+from scvi_codegen.rendering.stopping import TOLERANCE
+from scvi_codegen.tables.precision import mp, settled
 
-__all__ = ["DOUBLE", "MAX_ITERATIONS", "SINGLE", "TOLERANCE", "Target"]
-
-TOLERANCE = 2.0**-52
-"""Relative update below which an iteration has converged, if nothing else is said: the round-off unit of binary64."""
-
-MAX_ITERATIONS = 50
-"""After which a step fails, if nothing else is said: Newton's iteration takes 3 to 6 and sweeps 5 to 20."""
+__all__ = ["DOUBLE", "SINGLE", "Target"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +26,7 @@ class Target:
         scalar: the type, and the name of its support header.
         suffix: of the functions of libm and of literals.
         digits: of a literal that reads back as the same number; 0: the shortest that does.
-        tolerance: see :data:`TOLERANCE`.
+        tolerance: see :data:`scvi_codegen.rendering.stopping.TOLERANCE`.
         halvings: of 1 to the round-off unit.
         smallest, largest: numbers with all digits.
     """
@@ -44,11 +40,21 @@ class Target:
     smallest: float
     largest: float
 
-    def number(self, value: float) -> str:
+    def rounded(self, value: Number) -> float:
+        """The number of the target nearest to ``value``."""
+        digits = mp.convert(value)  # all 60 of them: it is rounded once
+        with mp.workprec(self.halvings + 1):
+            return float(+digits)
+
+    def rest(self, value: Number) -> Number:
+        """What rounding cuts off: a number is twice as exact in two parts."""
+        return settled(mp.convert(value) - self.rounded(value))
+
+    def number(self, value: Number) -> str:
         """A literal that reads back as the number of the target nearest to ``value``."""
+        nearest = self.rounded(value)
         if not self.digits:
-            return repr(float(value))
-        (nearest,) = struct.unpack("f", struct.pack("f", float(value)))
+            return repr(nearest)
         text = f"{nearest:.{self.digits}g}"
         return f"{text}{self.suffix}" if "." in text or "e" in text else f"{text}.0{self.suffix}"
 
@@ -56,12 +62,12 @@ class Target:
         """The name of a function of libm."""
         return f"{name}{self.suffix}"
 
-    def check(self, values: Iterable[float]) -> None:
+    def check(self, values: Iterable[Number]) -> None:
         """Raise :class:`MethodError` for numbers of a model that the target cannot hold."""
         for value in values:
             if value != 0.0 and not self.smallest <= abs(value) <= self.largest:
                 raise MethodError(
-                    f"{self.name} precision cannot hold the number {value!r}: choose other units, or 'double'"
+                    f"{self.name} precision cannot hold the number {float(value)!r}: choose other units, or 'double'"
                 )
 
 

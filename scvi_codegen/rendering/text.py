@@ -22,7 +22,8 @@ from scvi_codegen.rendering.environment import support_text, template_environmen
 from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
 from scvi_codegen.rendering.source import Interface, Source, included
-from scvi_codegen.rendering.target import DOUBLE, MAX_ITERATIONS, SINGLE, Target
+from scvi_codegen.rendering.stopping import MAX_ITERATIONS
+from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
 from scvi_codegen.rendering.written_out import written_out
 
 __all__ = [

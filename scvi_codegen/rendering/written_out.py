@@ -12,6 +12,7 @@ from itertools import accumulate
 from typing import TypeAlias
 
 from scvi_codegen.ir.families import Family
+from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Program
 from scvi_codegen.rendering.layout import wrapped
 from scvi_codegen.rendering.printer import print_number
@@ -22,7 +23,7 @@ __all__ = ["WrittenFamily", "WrittenOut", "written_out"]
 MOST_TERMS = 16
 """Of the Jacobian: beyond, the tables are shorter."""
 
-Term: TypeAlias = tuple[float, str]
+Term: TypeAlias = tuple[Number, str]
 """A number and what it multiplies."""
 
 
@@ -165,7 +166,7 @@ class _Statements:
                                 entries.setdefault((i, r, j, b), []).append(terms)
         return entries
 
-    def _slope_factor(self, k: int, n: int, e: int, power: int, coefficient: float) -> str:
+    def _slope_factor(self, k: int, n: int, e: int, power: int, coefficient: Number) -> str:
         """The product of weight, h^power, slope and coefficient; nothing if that is 0."""
         if not coefficient:
             return ""
@@ -173,13 +174,13 @@ class _Statements:
         product = self._product(self.program.families[k].weights[n], power, slope)
         return product if coefficient == 1 else f"{product} * {self._signed(coefficient)}"
 
-    def _product(self, weight: float, power: int, factor: str, *, first: bool = False) -> str:
+    def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:
         """The product of weight, h^power and factor from the left; h before the weight if it is ``first``."""
         scale = [] if power == 0 else ["h" if power == 1 else f"({_power(power)})"]
         numbers = [] if weight == 1 else [self._signed(weight)]
         return " * ".join([*scale, *numbers, factor] if first else [*numbers, *scale, factor])
 
-    def _signed(self, number: float) -> str:
+    def _signed(self, number: Number) -> str:
         text = print_number(number, self.target)
         return f"({text})" if number < 0 else text
 
@@ -192,7 +193,7 @@ class _Statements:
                 text += sign + self._times(abs(coefficient), factor)
         return text or "0"
 
-    def _times(self, coefficient: float, factor: str) -> str:
+    def _times(self, coefficient: Number, factor: str) -> str:
         if coefficient == 1:
             return factor
         inner = f"({factor})" if " * " in factor else factor

@@ -59,8 +59,8 @@ def eight_digits(x: Any) -> Any:
     return type(x)(mp.nstr(mp.mpf(x), 8))
 
 
-def eight_digits_text(x: float, target: object = None) -> str:
-    return f"{x:.7e}"
+def eight_digits_text(x: Any, target: object = None) -> str:
+    return f"{float(x):.7e}"
 
 
 def scaled_first(factor: Any) -> Make:

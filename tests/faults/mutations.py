@@ -33,7 +33,7 @@ from faults import (
 from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import derivatives
-from scvi_codegen.ir import arithmetic, rounding
+from scvi_codegen.ir import arithmetic, numbers
 from scvi_codegen.lowering import families
 from scvi_codegen.lowering.solvers import collocation as collocation_sweep
 from scvi_codegen.lowering.solvers import separable
@@ -60,11 +60,11 @@ MUTATIONS = (
         "numbers printed with 8 digits", case("pendulum/svi"), c_printer, "print_number", lambda _: eight_digits_text
     ),
     function("minus signs lost", case("double/svi"), c_printer, "_print", without_negation),
-    function("tables rounded to 8 digits", case("double/svi"), rounding, "lower_matrix", of_entries(eight_digits)),
+    function("tables rounded to 8 digits", case("double/svi"), numbers, "lower_matrix", of_entries(eight_digits)),
     function(
         "weights rounded to 8 digits",
         case("cart/svi"),
-        rounding,
+        numbers,
         "lower_vector",
         changed_result(lambda found: tuple(map(eight_digits, found))),
     ),

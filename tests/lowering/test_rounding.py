@@ -1,13 +1,18 @@
-"""What a table says is zero stands as zero in C: no 6.8e-63 where the 60th digit of the points was cut."""
+"""Numbers are exact until they are printed; what a table says is zero stands as zero in C, no 6.8e-63."""
 
 import re
+from fractions import Fraction
 
+import numpy as np
 import pytest
+import sympy
 
-from scvi_codegen.compiler import generate_source
-from scvi_codegen.ir.rounding import lower_matrix, lower_vector
+from scvi_codegen.compiler import generate_source, program_of
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.ir.numbers import exact_number, lower_matrix, lower_vector
 from scvi_codegen.methods import SCVI, SVI, RadauIIA, SpectralCollocation
 from scvi_codegen.models.systems import double_pendulum, kepler
+from scvi_codegen.rendering.target import DOUBLE, SINGLE
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_slopes, next_step
 from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_gauss
 from scvi_codegen.tables.precision import mp
@@ -15,9 +20,47 @@ from scvi_codegen.tables.precision import mp
 METHODS = (SCVI(3), SCVI(2, "gauss-lobatto:3"), SVI(4, "clenshaw-curtis:5"), SpectralCollocation(3), RadauIIA(3))
 
 
-def test_small_numbers_are_zero_and_others_the_nearest_double():
-    assert lower_vector((mp.mpf(10) ** -41, mp.one / 3, mp.mpf(10) ** -39)) == (0.0, 1 / 3, 1e-39)
-    assert lower_matrix(((-(mp.mpf(10) ** -60),), (mp.mpf(-2),))) == ((0.0,), (-2.0,))
+def test_tables_have_their_promised_digits_and_exact_zeros_and_ones():
+    third, small = mp.one / 3, mp.mpf(10) ** -39
+    zero, near_third, near_small, one = lower_vector((mp.mpf(10) ** -41, third, small, 1 - mp.mpf(10) ** -58))
+    assert (zero, one) == (0, 1)
+    assert abs(near_third - third) < mp.mpf(10) ** -50
+    assert abs(near_small / small - 1) < mp.mpf(10) ** -49
+    assert lower_matrix(((-(mp.mpf(10) ** -60),), (mp.mpf(-2),))) == ((0,), (-2,))
+
+
+def test_constants_are_exact_until_a_target_rounds_them():
+    assert exact_number(sympy.Rational(2, 3)) == Fraction(2, 3)
+    assert abs(exact_number(sympy.sqrt(2) * sympy.pi) - mp.sqrt(2) * mp.pi) < mp.mpf(10) ** -57
+    for wrong in (sympy.I, sympy.Integer(10) ** 400, sympy.zoo):
+        with pytest.raises(SystemDefinitionError):
+            exact_number(wrong)
+
+
+def test_targets_round_to_the_nearest_number_once():
+    generator = np.random.default_rng(7)
+    numerators, denominators = (generator.integers(1, 10**9, 500) for _ in range(2))
+    for p, q in zip(numerators.tolist(), denominators.tolist(), strict=True):
+        assert DOUBLE.rounded(Fraction(p, q)) == p / q
+        assert DOUBLE.rounded(mp.mpf(p) / q) == p / q
+        single, exact = Fraction(SINGLE.rounded(-Fraction(p, q))), -Fraction(p, q)
+        assert float(np.float32(single)) == single
+        assert all(
+            abs(single - exact) <= abs(Fraction(float(np.nextafter(np.float32(single), np.float32(end)))) - exact)
+            for end in (-np.inf, np.inf)
+        )
+        high = DOUBLE.rounded(Fraction(p, q))
+        assert (
+            abs(high + mp.mpf(DOUBLE.rounded(DOUBLE.rest(Fraction(p, q)))) - mp.mpf(p) / q) <= mp.mpf(2) ** -105 * p / q
+        )
+    halfway = 1 + Fraction(1, 2**24) + Fraction(1, 2**60)  # rounded to a double first it would be even, 1
+    assert SINGLE.rounded(halfway) == 1 + 2.0**-23
+
+
+def test_a_program_knows_more_digits_than_a_double():
+    sweep = program_of(kepler(), SVI(3)).sweep
+    product = [x for row in sweep.product for x in row[: sweep.points]]
+    assert all(mp.mpf(DOUBLE.rounded(x)) != x for x in product)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)

@@ -5,8 +5,8 @@ A solver is a file in this folder with such a function, a line in ``FIXED_POINTS
 which :mod:`scvi_codegen.rendering.lanes` and the support header of that kind make C. Solvers share nothing but the
 problem. What they may rely on:
 
-* the tables of a shape are numbers of the method in 60 digits; a solver rounds them, so that it decides what their
-  rounding does to the map;
+* the tables of a shape are numbers of the method in 60 digits, and stay so in the sweep; they are rounded when they are
+  printed, in two parts where what rounding does to the map is to be less;
 * the numbers of a sweep are padded to its lanes (:mod:`scvi_codegen.lowering.solvers.padding`);
 * a sweep that does not converge costs time, not correctness: Newton's iteration follows it.
 """

@@ -69,7 +69,7 @@ def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds
     nodes = (0, *tableau.c)
     values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_slopes))
 
-    def weighted(numbers: Iterable[Number]) -> tuple[float, ...]:
+    def weighted(numbers: Iterable[Number]) -> tuple[Number, ...]:
         return pad_vector(tuple(w * x for w, x in zip(rule.unit_weights, numbers, strict=True)), lanes)
 
     return PrintedEnds(

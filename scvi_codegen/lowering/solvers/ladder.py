@@ -12,8 +12,9 @@ import math
 from collections.abc import Sequence
 
 from scvi_codegen.ir.control import Control, Ladder
+from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweeps import CurveSweep, LaneTable, SeparableSweep, Sweep
+from scvi_codegen.ir.sweeps import CurveSweep, SeparableSweep, Sweep
 from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 
 __all__ = ["control_of", "ladder_of"]
@@ -35,7 +36,7 @@ def control_of(program: Program) -> Control | None:
 
 def ladder_of(sweep: Sweep) -> Ladder:
     """The ladder of a fixed-point iteration."""
-    points, ratios = sweep.guess.abscissae, [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
+    points, ratios = _doubles(sweep.guess.abscissae), [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
     alone = _tables(sweep, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
     pairs = []
     for ratio in ratios:
@@ -53,12 +54,13 @@ def ladder_of(sweep: Sweep) -> Ladder:
 
 def _tables(
     sweep: Sweep, ratios: Sequence[float], sources: Sequence[float], degree: int, ages: Sequence[float]
-) -> list[list[LaneTable]]:
+) -> list[list[NumberTable]]:
     """For each ratio of the next step to the last a table for each step that the sources are of.
 
     ``ages``: the ratio of the last step to each of these, by which h a, where that is kept, is longer.
     """
-    points, through = sweep.guess.abscissae, sweep.product.high if isinstance(sweep, SeparableSweep) else ()
+    points = _doubles(sweep.guess.abscissae)
+    through = tuple(map(_doubles, sweep.product)) if isinstance(sweep, SeparableSweep) else ()
     count = len(points)
     rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree)
     tables = []
@@ -72,6 +74,10 @@ def _tables(
             ]
         )
     return tables
+
+
+def _doubles(numbers: Sequence[Number]) -> tuple[float, ...]:
+    return tuple(map(float, numbers))
 
 
 def least_squares(sources: Sequence[float], targets: Sequence[float], degree: int) -> list[list[float]]:
@@ -93,7 +99,7 @@ def least_squares(sources: Sequence[float], targets: Sequence[float], degree: in
     return rows
 
 
-def _padded(rows: list[list[float]], through: LaneTable, lanes: int) -> LaneTable:
+def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> NumberTable:
     """A square table, through another if there is one, with whole vectors as columns; rows beyond repeat the last."""
     count = len(rows)
     if through:

@@ -6,12 +6,12 @@ Lagrangian, they are inside, and they never delay convergence.
 
 from __future__ import annotations
 
-from scvi_codegen.ir.rounding import lower_matrix, lower_vector
-from scvi_codegen.ir.sweeps import GuessTables, LaneTable, SplitMatrix, SplitVector
+from scvi_codegen.ir.numbers import Number, NumberTable, lower_matrix, lower_vector
+from scvi_codegen.ir.sweeps import GuessTables
 from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["MOST_LANES", "guess_tables", "lane_count", "pad_matrix", "pad_split", "pad_split_matrix", "pad_vector"]
+__all__ = ["MOST_LANES", "guess_tables", "lane_count", "pad_matrix", "pad_vector"]
 
 MOST_LANES = 32
 DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
@@ -26,28 +26,14 @@ def lane_count(points: int) -> int:
     return max(2, 1 << (points - 1).bit_length())
 
 
-def pad_matrix(entries: Matrix, lanes: int) -> LaneTable:
+def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:
     """Rows beyond the last repeat it, columns beyond are zero: a lane too many is the last point again."""
     return lower_matrix(_wide(entries, lanes))
 
 
-def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[float, ...]:
+def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Number, ...]:
     """The rest is zero, or the last entry again."""
     return lower_vector(_longer(entries, lanes, repeat=repeat))
-
-
-def pad_split_matrix(entries: Matrix, lanes: int) -> SplitMatrix:
-    """A padded matrix in twice the precision."""
-    wide = _wide(entries, lanes)
-    high = lower_matrix(wide)
-    return SplitMatrix(high, lower_matrix(tuple(map(_difference, wide, high))))
-
-
-def pad_split(entries: Vector, lanes: int, *, repeat: bool = False) -> SplitVector:
-    """A padded vector in twice the precision."""
-    long = _longer(entries, lanes, repeat=repeat)
-    high = lower_vector(long)
-    return SplitVector(high, lower_vector(_difference(long, high)))
 
 
 def guess_tables(
@@ -83,7 +69,3 @@ def _wide(entries: Matrix, lanes: int) -> Matrix:
 
 def _longer(entries: Vector, lanes: int, *, repeat: bool = False) -> Vector:
     return (*entries, *((entries[-1] if repeat else mp.zero),) * (lanes - len(entries)))
-
-
-def _difference(numbers: Vector, doubles: Vector) -> Vector:
-    return tuple(x - y for x, y in zip(numbers, doubles, strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.rounding import lower_vector
+from scvi_codegen.ir.numbers import lower_vector
 from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.forms import forms_of
