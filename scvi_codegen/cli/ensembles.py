@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
 
@@ -59,26 +62,16 @@ def integrate_states(
     model, began = states.model, time.perf_counter()
     check_memory(model, len(states))
     stepper = compile_stepper(model.system, model.method, solver=solver)
-    work = Ensemble(
-        stepper,
-        states.q,
-        states.momenta(stepper),
-        h=model.step,
-        steps=model.step_count,
-        every=model.every,
-        t=model.t,
-        parameters=states.parameters,
-        options=options,
-    )
-    work.blocks()  # compiles, while Ctrl-C still ends it
+    work = _work(model, stepper, states, options)
     started, shown, interrupted = time.perf_counter(), 0, False
-    with interruptions() as caught, progress_bar(model.step_count) as advance:
+    length = len(states) if model.h is None else model.step_count
+    with interruptions() as caught, progress_bar(length) as advance:
 
         def look(done: int) -> None:
             nonlocal shown
             advance(done - shown)
             shown = done
-            if caught and done < model.step_count:
+            if caught and done < length:
                 raise _Stop
 
         try:
@@ -93,6 +86,19 @@ def integrate_states(
     )
 
 
+def _work(
+    model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None
+) -> Ensemble | EnsembleToEnds:
+    """What is to be done, compiled while Ctrl-C still ends it."""
+    start = stepper, states.q, states.momenta(stepper)
+    common: dict[str, Any] = {"every": model.every, "t": model.t, "parameters": states.parameters, "options": options}
+    if model.h is None:
+        return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance or None, **common)
+    work = Ensemble(*start, h=model.h, steps=model.step_count, **common)
+    work.blocks()
+    return work
+
+
 def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
     """The ensemble in a few lines."""
     result = outcome.result
@@ -101,13 +107,20 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         model.system.name,
         model.method.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
-        f"{counted(model.step_count, 'step')} of {model.step:g} from t = {model.t:g}; "
-        f"{counted(len(result.t), 'state')} kept of each",
+        f"{_way(model, result)} kept of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} a step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
         ", ".join(f"{number} {status}" for status, number in _statuses(result)),
     ]
     return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])
+
+
+def _way(model: Model, result: EnsembleTrajectory) -> str:
+    if model.h is None:
+        steps = f"{int(result.steps.min())} to {int(result.steps.max())} steps of their own lengths"
+        return f"{steps} from t = {model.t:g} to t = {model.t + model.covered:g}; up to {len(result.t)} states"
+    steps = f"{counted(model.step_count, 'step')} of {model.h:g}"
+    return f"{steps} from t = {model.t:g}; {counted(len(result.t), 'state')}"
 
 
 def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
@@ -119,7 +132,7 @@ def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
 def _failures(result: EnsembleTrajectory) -> Iterator[str]:
     lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
     for j in lost[:SHOWN_FAILURES]:
-        t = result.t[0] + result.steps[j] * result.h
+        t = result.ends[0][j] if result.goals else result.t[0] + result.steps[j] * result.h
         yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {result.status[j]}"
     if len(lost) > SHOWN_FAILURES:
         yield f"  and {len(lost) - SHOWN_FAILURES} more"

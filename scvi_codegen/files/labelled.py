@@ -29,6 +29,7 @@ CHUNK_BYTES = 2**24
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 LONG_NAMES = {
+    "time": "time of each state of each trajectory",
     "t": "time",
     "q": "position",
     "p": "momentum",

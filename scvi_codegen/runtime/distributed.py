@@ -12,11 +12,11 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 
 if TYPE_CHECKING:
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["integrate_ensemble"]
 
-Part = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.str_], NDArray[np.int64]]
+ARRAYS = ("t", "times", "q", "p", "status", "steps")
+"""Of a result, that travel."""
 
 LANES = 8
 BLOCKS_A_THREAD = 4
@@ -39,10 +40,13 @@ def integrate_ensemble(
     q: ArrayLike,
     p: ArrayLike,
     *,
-    h: float,
-    steps: int,
+    h: float | None = None,
+    steps: int | None = None,
+    t_end: ArrayLike | None = None,
+    tolerance: float | None = None,
     every: int = 1,
     t: float = 0.0,
+    t_eval: ArrayLike | None = None,
     parameters: EnsembleParameters = None,
     options: SolverOptions | None = None,
     progress: Callable[[int], None] | None = None,
@@ -54,7 +58,7 @@ def integrate_ensemble(
     Args:
         stepper: compiled here; its source is compiled again by each worker, which needs this package and a C compiler.
         q, p: (k, m) initial positions and momenta.
-        h, steps, every, t, parameters, options: as of ``stepper.integrate_ensemble``.
+        h, steps, t_end, tolerance, every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
         progress: called now and then with the number of trajectories done.
         address: of a scheduler, as in ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
         blocks: number of parts that the trajectories are divided into, by default four for each thread of the cluster.
@@ -67,11 +71,17 @@ def integrate_ensemble(
         StateError: on wrong shapes, names or numbers, before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
-    work = Ensemble(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
+    common: dict[str, Any] = {"every": every, "t": t, "parameters": parameters, "options": options}
+    work: Ensemble | EnsembleToEnds
+    if h is None and steps is None and t_end is not None:
+        work = EnsembleToEnds(stepper, q, p, t_end=t_end, tolerance=tolerance, t_eval=t_eval, **common)
+    else:
+        h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
+        work = Ensemble(stepper, q, p, h=h, steps=steps, **common)
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())
-        _gather(client, work, list(_slices(work.count, count)), progress)
+        _gather(client, work, list(_slices(len(work), count)), progress)
     return work.result()
 
 
@@ -103,23 +113,21 @@ def _slices(count: int, blocks: int) -> Iterator[slice]:
         yield slice(first, min(first + size, count))
 
 
-def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[[int], None] | None) -> None:
+def _gather(
+    client: Any, work: Ensemble | EnsembleToEnds, parts: list[slice], progress: Callable[[int], None] | None
+) -> None:
     """Send the parts out and put what comes back into its place."""
     from distributed import as_completed
 
     pickled = pickle.dumps(work.stepper)
-    settings = {"h": work.h, "steps": work.steps, "every": work.every, "t": work.t0, "options": work.options}
-    futures = {
-        client.submit(
-            _integrate, pickled, work.q[0, part], work.p[0, part], work.parameters[part], settings, pure=False
-        ): part
-        for part in parts
-    }
+    futures = {client.submit(_integrate, pickled, work.part(part), pure=False): part for part in parts}
     done = 0
     try:
-        for future, (q, p, status, steps) in as_completed(futures, with_results=True):
+        for future, found in as_completed(futures, with_results=True):
             part = futures[future]
-            work.q[:, part], work.p[:, part], work.status[part], work.done[part] = q, p, status, steps
+            arrays = dict(zip(ARRAYS, found, strict=True))
+            parameters = work.parameters[part]
+            work.keep(part, EnsembleTrajectory(**arrays, h=0.0, parameters=parameters, stepper=work.stepper))
             future.release()
             done += part.stop - part.start
             if progress is not None:
@@ -128,16 +136,10 @@ def _gather(client: Any, work: Ensemble, parts: list[slice], progress: Callable[
         client.cancel(list(futures))
 
 
-def _integrate(
-    pickled: bytes,
-    q: NDArray[np.float64],
-    p: NDArray[np.float64],
-    parameters: NDArray[np.float64],
-    settings: dict[str, Any],
-) -> Part:
-    """One part, by one thread of a worker."""
-    result = _stepper(pickled).integrate_ensemble(q, p, parameters=parameters, threads=1, **settings)
-    return result.q, result.p, result.status, result.steps
+def _integrate(pickled: bytes, arguments: dict[str, Any]) -> tuple[Any, ...]:
+    """The arrays of one part, by one thread of a worker."""
+    result = _stepper(pickled).integrate_ensemble(threads=1, **arguments)
+    return tuple(getattr(result, name) for name in ARRAYS)
 
 
 @lru_cache(maxsize=16)

@@ -33,7 +33,7 @@ from scvi_codegen.runtime.portions import record_states
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Ensemble", "integrate_ensemble"]
+__all__ = ["Ensemble", "EnsembleParameters", "checked_ensemble", "integrate_ensemble", "parameters_of_each"]
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
@@ -84,11 +84,9 @@ class Ensemble:
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
         self.steps = checked_count(steps, "steps", least=0)
         self.every = checked_count(every, "every", least=1)
-        start_q, start_p = _states(stepper, q, "q"), _states(stepper, p, "p")
-        if start_q.shape != start_p.shape:
-            raise StateError(f"q has shape {start_q.shape}, p {start_p.shape}")
+        start_q, start_p = checked_ensemble(stepper, q, p)
         self.count = len(start_q)
-        self.parameters = _parameters(stepper, parameters, self.count)
+        self.parameters = parameters_of_each(stepper, parameters, self.count)
         if not stepper.has_energy(parameters):
             for j in range(self.count):
                 level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
@@ -103,6 +101,33 @@ class Ensemble:
             self.times[0] = self.t0
         self.status = np.full(self.count, OK, dtype="<U16")
         self.done = np.zeros(self.count, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def part(self, part: slice) -> dict[str, object]:
+        """Arguments by name that make the ensemble of a part of the trajectories."""
+        return {
+            "q": self.q[0, part],
+            "p": self.p[0, part],
+            "h": self.h,
+            "steps": self.steps,
+            "every": self.every,
+            "t": self.t0,
+            "parameters": self.parameters[part],
+            "options": self.options,
+        }
+
+    def keep(self, part: slice, found: EnsembleTrajectory) -> None:
+        """Take over what was integrated of a part elsewhere."""
+        self.q[:, part], self.p[:, part], self.status[part], self.done[part] = (
+            found.q,
+            found.p,
+            found.status,
+            found.steps,
+        )
+        if self.times is not None:
+            self.times[:, part] = found.times
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """All blocks, by ``threads`` workers; what ``progress`` raises stops them within moments.
@@ -286,6 +311,14 @@ class _Alone:
             work.times[rows, j] = trajectory.t[1:]
 
 
+def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[Array, Array]:
+    """Initial positions and momenta, (k, m) each."""
+    positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
+    if positions.shape != momenta.shape:
+        raise StateError(f"q has shape {positions.shape}, p {momenta.shape}")
+    return positions, momenta
+
+
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
     """(k, m) finite numbers."""
     array = real_array(value, name)
@@ -299,7 +332,7 @@ def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
     return array
 
 
-def _parameters(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
+def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
     """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))

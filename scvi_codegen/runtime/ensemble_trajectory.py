@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled import Labelled, checked_units, to_dataset
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.quantities import quantities
@@ -33,15 +34,17 @@ class EnsembleTrajectory:
     """States of k trajectories at common times, the initial one first.
 
     Attributes:
-        t: (n,) times; where time is transformed tau, from 0.
-        q, p: (n, k, m) positions and momenta; NaN after a failure.
+        t: (n,) times; where time is transformed tau, from 0; where each trajectory keeps the states at its own steps
+            their numbers.
+        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a trajectory of fewer states.
         status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
-            ``"interrupted"``).
+            ``"vanished"``, ``"interrupted"``).
         steps: (k,) steps completed.
-        h: step size.
+        h: step size, 0 where steps choose their length.
+        goals: of each trajectory whose steps choose their length, else none.
         parameters: (k, number of parameters).
         stepper: the compiled integrator.
-        times: (n, k) where time is transformed, else ``None``: every trajectory has its own.
+        times: (n, k) where every trajectory has its own (transformed time, steps of their own lengths), else ``None``.
     """
 
     t: Array
@@ -53,6 +56,7 @@ class EnsembleTrajectory:
     parameters: Array
     stepper: Integrator = field(repr=False)
     times: Array | None = None
+    goals: tuple[Goal, ...] = ()
 
     def __len__(self) -> int:
         return len(self.status)
@@ -63,6 +67,24 @@ class EnsembleTrajectory:
         reached: NDArray[np.bool_] = self.status == OK
         return reached
 
+    @property
+    def ends(self) -> tuple[Array, Array, Array]:
+        """Time, positions and momenta of the last state of each trajectory: (k,), (k, m), (k, m)."""
+        last = [each[0].size - 1 for each in self.each()]
+        j = np.arange(len(self))
+        return self._times()[last, j], self.q[last, j], self.p[last, j]
+
+    def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
+        """Of each trajectory the times, positions and momenta of its states, why it ended, and its steps."""
+        times = self._times()
+        for j, (status, steps) in enumerate(zip(self.status.tolist(), self.steps.tolist(), strict=True)):
+            good = self._reached(j)
+            yield times[good, j], self.q[good, j], self.p[good, j], status, steps
+
+    def _times(self) -> Array:
+        """(n, k)."""
+        return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times
+
     def energy(self) -> Array:
         """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
         energies = np.full(self.q.shape[:2], np.nan)
@@ -70,7 +92,7 @@ class EnsembleTrajectory:
             good = self._reached(j)
             try:
                 energies[good, j] = self.stepper.energy(
-                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                    self.q[good, j], self.p[good, j], self._times()[good, j], self.parameters[j]
                 )
             except StateError:
                 continue
@@ -90,7 +112,7 @@ class EnsembleTrajectory:
             good = self._reached(j)
             try:
                 values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
-                    self.q[good, j], self.p[good, j], self.t[good], self.parameters[j]
+                    self.q[good, j], self.p[good, j], self._times()[good, j], self.parameters[j]
                 )
             except StateError:
                 continue
@@ -133,7 +155,7 @@ class EnsembleTrajectory:
         return to_dataset(self._labelled(checked_units(units)))
 
     def _check_common_times(self) -> None:
-        if self.times is not None:
+        if self.stepper.interface.energy_parameter:
             raise StateError("in transformed time trajectories have no common times: files of ensembles need them")
 
     def _labelled(self, units: Mapping[str, str]) -> Labelled:
@@ -153,9 +175,12 @@ class EnsembleTrajectory:
         if interface.map_names:
             dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*each, "symmetry")}
             whole["symmetry"] = np.array(interface.map_names)
+        states = {"t": self.t, "q": self.q, "p": self.p}
+        if self.times is not None:
+            dimensions["time"], states["time"] = each, self.times
         return Labelled(
             dimensions=dimensions,
-            pieces=lambda: iter([{"t": self.t, "q": self.q, "p": self.p, **self._quantities()}]),
+            pieces=lambda: iter([states | self._quantities()]),
             whole=whole,
             count=len(self.t),
             units={name: unit for name, unit in units.items() if name in dimensions},
@@ -163,8 +188,10 @@ class EnsembleTrajectory:
         )
 
     def _quantities(self) -> dict[str, Array]:
+        times = np.nan_to_num(self._times())
         found = [
-            quantities(self.stepper, self.parameters[j], self.t, self.q[:, j], self.p[:, j]) for j in range(len(self))
+            quantities(self.stepper, self.parameters[j], times[:, j], self.q[:, j], self.p[:, j])
+            for j in range(len(self))
         ]
         return {name: np.stack([part[name] for part in found], axis=1) for name in found[0]}
 
@@ -173,6 +200,7 @@ class EnsembleTrajectory:
         return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
 
     def _write_npz(self, file: IO[bytes]) -> None:
+        times: dict[str, Any] = {} if self.times is None else {"times": self.times}
         np.savez(
             file,
             t=self.t,
@@ -185,6 +213,7 @@ class EnsembleTrajectory:
             coordinates=np.array(self.stepper.coordinates),
             parameter_names=np.array(self.stepper.parameters, dtype=str),
             title=self.stepper.title,
+            **times,
         )
 
     def _write_csv(self, file: IO[bytes]) -> None:
@@ -196,5 +225,5 @@ class EnsembleTrajectory:
         for j in range(len(self)):
             good = self._reached(j)
             label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
-            table = np.column_stack([label, self.t[good], self.q[good, j], self.p[good, j]])
+            table = np.column_stack([label, self._times()[good, j], self.q[good, j], self.p[good, j]])
             np.savetxt(file, table, delimiter=",", fmt=formats)

@@ -20,6 +20,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.ensemble import integrate_ensemble
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
 from scvi_codegen.runtime.goal import Goal
@@ -118,20 +119,28 @@ class Stepper(Integrator):
         q: ArrayLike,
         p: ArrayLike,
         *,
-        h: float,
-        steps: int,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: ArrayLike | None = None,
+        tolerance: float | None = None,
         every: int = 1,
         t: float = 0.0,
+        t_eval: ArrayLike | None = None,
         parameters: Mapping[str, ArrayLike] | Sequence[Any] | Array | None = None,
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
     ) -> EnsembleTrajectory:
-        """Run k trajectories with common times, eight at a time as vector lanes, over all cores.
+        """Run k trajectories over all cores: with common steps, eight at a time as vector lanes, or each by its own.
 
         Args:
             q, p: (k, m) initial positions and momenta.
             h, steps, every, t, options, progress: as in :meth:`integrate`.
+            t_end: instead of h and steps: one time or (k,) times to go to, by steps that choose their length in each
+                trajectory. Every ``every``-th state of each is kept, and the last: ``times`` says when. ``progress`` is
+                then called with the number of trajectories done.
+            tolerance: relative error of the end of such a step; by default round-off.
+            t_eval: (n,) times: keep the states of all trajectories at these instead; NaN beyond their ends.
             parameters: by name, one number or k each; or (k, number of parameters).
             threads: workers, by default one a core.
 
@@ -142,6 +151,22 @@ class Stepper(Integrator):
         Raises:
             StateError: on wrong shapes, names or numbers.
         """
+        if h is None and steps is None and t_end is not None:
+            work = EnsembleToEnds(
+                self,
+                q,
+                p,
+                t_end=t_end,
+                tolerance=tolerance,
+                every=every,
+                t=t,
+                t_eval=t_eval,
+                parameters=parameters,
+                options=options,
+            )
+            work.run(progress=progress, threads=threads)
+            return work.result()
+        h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
         return integrate_ensemble(
             self,
             q,

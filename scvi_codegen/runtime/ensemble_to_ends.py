@@ -1,0 +1,217 @@
+"""Many trajectories whose steps choose their length: each its own steps and its own end, shared between the cores.
+
+Trajectories are the single integrator's, which has a table for each change of length, so that results are those of
+:meth:`Stepper.integrate`, bit for bit, for any number of threads. C runs without Python's lock.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.dense_output import times_of_run
+from scvi_codegen.runtime.ensemble import PROGRESS_SECONDS, EnsembleParameters, checked_ensemble, parameters_of_each
+from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.observation import Observation
+from scvi_codegen.runtime.portions import record
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["EnsembleToEnds", "steps_of_ensemble"]
+
+
+def steps_of_ensemble(h: float | None, steps: int | None, **others: object) -> tuple[float, int]:
+    """The step and number of steps of an ensemble that does not go to its ends by steps of their own lengths."""
+    given = [name for name, value in others.items() if value is not None]
+    if h is None or steps is None:
+        raise StateError("give h and steps, for steps of one length, or t_end, for steps that choose theirs")
+    if given:
+        raise StateError(f"{given[0]} is for steps that choose their length: give t_end, and neither h nor steps")
+    return h, steps
+
+
+class Kept(NamedTuple):
+    """What is kept of a trajectory: its states, why it ended, and the steps that were taken."""
+
+    t: Array
+    q: Array
+    p: Array
+    status: str
+    steps: int
+
+
+class _Stopped(Exception):  # noqa: N818  (a wish, not an error)
+    """Another trajectory was interrupted, and so is this one."""
+
+
+class EnsembleToEnds:
+    """An ensemble to be integrated, each trajectory by steps of its own; arguments as of ``integrate_ensemble``."""
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        t_end: ArrayLike,
+        tolerance: float | None = None,
+        every: int = 1,
+        t: float = 0.0,
+        t_eval: ArrayLike | None = None,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+    ) -> None:
+        if stepper.interface.energy_parameter:
+            raise StateError("in transformed time steps of tau have one length: give h and steps")
+        self.stepper, self.options = stepper.controlled(), checked_options(options)
+        self.q, self.p = checked_ensemble(stepper, q, p)
+        self.parameters = parameters_of_each(stepper, parameters, len(self.q))
+        self.t0, self.every = checked_number(t, "the time t"), checked_count(every, "every", least=1)
+        self.goals = self._goals(t_end, tolerance)
+        self.t_eval = None
+        if t_eval is not None:
+            if self.every != 1:
+                raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
+            farthest = max((goal.t_end for goal in self.goals), key=lambda end: abs(end - self.t0))
+            self.t_eval = times_of_run(t_eval, self.t0, farthest)
+        self.kept: dict[int, Kept] = {}
+
+    def _goals(self, t_end: ArrayLike, tolerance: float | None) -> list[Goal]:
+        """One for each trajectory, all forward or all back."""
+        ends = real_array(t_end, "t_end")
+        if ends.shape not in ((), (len(self.q),)):
+            raise StateError(f"t_end must be one time or {len(self.q)}, not of shape {ends.shape}")
+        goals = [Goal.checked(float(end), tolerance) for end in np.broadcast_to(ends, len(self.q))]
+        signs = {np.sign(goal.t_end - self.t0) for goal in goals} - {0.0}
+        if len(signs) > 1:
+            raise StateError(f"some t_end are before t = {self.t0:g} and some after it: make two ensembles of it")
+        return goals
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def part(self, part: slice) -> dict[str, object]:
+        """Arguments by name that make the ensemble of a part of the trajectories."""
+        return {
+            "q": self.q[part],
+            "p": self.p[part],
+            "t_end": [goal.t_end for goal in self.goals[part]],
+            "tolerance": self.goals[0].tolerance or None,
+            "every": self.every,
+            "t": self.t0,
+            "t_eval": self.t_eval,
+            "parameters": self.parameters[part],
+            "options": self.options,
+        }
+
+    def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
+        """All trajectories, by ``threads`` workers; what ``progress`` raises stops them within moments.
+
+        Afterwards, also after an exception, :meth:`result` holds the trajectories that were done.
+
+        Args:
+            progress: called now and then with the number of trajectories done.
+            threads: workers, by default one a core.
+        """
+        workers, stop = checked_count(threads or os.cpu_count() or 1, "threads", least=1), threading.Event()
+
+        def heed(done: int) -> None:
+            if stop.is_set():
+                raise _Stopped
+
+        def drive(j: int) -> None:
+            heed(0)
+            self.kept[j] = self._trajectory(j, heed)
+
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                pending = {pool.submit(drive, j) for j in range(len(self))}
+                while pending:
+                    finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
+                    for future in finished:
+                        future.result()
+                    if progress is not None:
+                        progress(len(self.kept))
+            finally:
+                stop.set()
+                pool.shutdown(cancel_futures=True)
+
+    def _trajectory(self, j: int, heed: Callable[[int], None]) -> Kept:
+        goal, status = self.goals[j], OK
+        try:
+            run = Memory.started(
+                self.stepper,
+                self.q[j],
+                self.p[j],
+                h=goal,
+                t=self.t0,
+                parameters=self.parameters[j],
+                options=self.options,
+            )
+            found = self._states(run, goal, heed)
+        except StateError:  # a sum of finite terms that overflowed
+            return Kept(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
+        except StepFailedError as failure:
+            status, found = failure.status, Trajectory.before(failure)
+        return Kept(found.t, found.q, found.p, status, run.steps)
+
+    def _states(self, run: Memory, goal: Goal, heed: Callable[[int], None]) -> Trajectory:
+        if self.t_eval is None:
+            return record(run, None, every=self.every, progress=heed)
+        reached = np.abs(self.t_eval - self.t0) <= abs(goal.t_end - self.t0)
+        return Observation(run, times=self.t_eval[reached]).advance(None, heed)
+
+    def result(self) -> EnsembleTrajectory:
+        """The arrays; trajectories that were not done are ``"interrupted"`` after their initial state."""
+        found = [self.kept.get(j) or self._unfinished(j) for j in range(len(self))]
+        if self.t_eval is None:
+            t, times, rows = self._by_number(found)
+        else:
+            t, times = self.t_eval, None
+            rows = [slice(0, len(each.t)) for each in found]
+        q, p = np.full((2, len(t), len(self), self.stepper.dimension), np.nan)
+        for j, (each, row) in enumerate(zip(found, rows, strict=True)):
+            q[row, j], p[row, j] = each.q, each.p
+        return EnsembleTrajectory(
+            t=t,
+            times=times,
+            q=q,
+            p=p,
+            status=np.array([each.status for each in found], dtype="<U16"),
+            steps=np.array([each.steps for each in found], dtype=np.int64),
+            h=0.0,
+            goals=tuple(self.goals),
+            parameters=self.parameters,
+            stepper=self.stepper,
+        )
+
+    def _by_number(self, found: list[Kept]) -> tuple[Array, Array, list[slice]]:
+        """Numbers of the states, and the time of each; a trajectory with fewer states ends before the last row."""
+        rows = [slice(0, len(each.t)) for each in found]
+        count = max(row.stop for row in rows)
+        times = np.full((count, len(found)), np.nan)
+        for j, (each, row) in enumerate(zip(found, rows, strict=True)):
+            times[row, j] = each.t
+        return np.arange(count, dtype=float), times, rows
+
+    def _unfinished(self, j: int) -> Kept:
+        first = slice(0, 1 if self.t_eval is None else 0)
+        return Kept(np.array([self.t0])[first], self.q[[j]][first], self.p[[j]][first], INTERRUPTED, 0)
+
+    def keep(self, part: slice, found: EnsembleTrajectory) -> None:
+        """Take over what was integrated of a part elsewhere."""
+        for j, each in zip(range(part.start, part.stop), found.each(), strict=True):
+            self.kept[j] = Kept(*each)
