@@ -77,11 +77,17 @@ class ExactMotion:
         return Tape([entry for row in self._curvature for entry in row[:m]], self.symbols)
 
     @cached_property
+    def _by_position(self) -> list[sympy.Expr]:
+        """DL/dq + f, or dH/dq - f."""
+        slopes = [self.system.formula.diff(q) for q in self.system.coordinates]
+        sign = -1 if self.hamiltonian else 1
+        return [x + sign * f for x, f in zip(slopes, self.system.forces, strict=True)] if self.system.forces else slopes
+
+    @cached_property
     def _right_hand_side(self) -> Tape:
-        """DL/dq and the derivatives of dL/dv; dH/dp and dH/dq."""
-        by_position = [self.system.formula.diff(q) for q in self.system.coordinates]
+        """DL/dq + f and the derivatives of dL/dv; dH/dq - f and dH/dp."""
         others = self._slopes if self.hamiltonian else [entry for row in self._curvature for entry in row]
-        return Tape([*by_position, *others], self.symbols)
+        return Tape([*self._by_position, *others], self.symbols)
 
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
@@ -142,7 +148,7 @@ class ExactMotion:
         return self._rates(np.concatenate([q, v]), t)[len(q) :]
 
     def residual(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Numbers:
-        """(m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq."""
+        """(m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq - f."""
         m, found = len(q), self._values(self._right_hand_side, q, v, t)
         slopes = found[m:].reshape(m, 2 * m + 1)
         residual: Numbers = slopes[:, :m] @ a + slopes[:, m : 2 * m] @ v + slopes[:, 2 * m] - found[:m]
@@ -161,8 +167,8 @@ class ExactMotion:
         q, v, t = self.system.coordinates, self.second, self.system.time
         a = tuple(sympy.Dummy(real=True) for _ in q)
         residual = [
-            sympy.Add(*(x * y for x, y in zip(row, (*a, *v, 1), strict=True)), -self.system.formula.diff(position))
-            for row, position in zip(self._curvature, q, strict=True)
+            sympy.Add(*(x * y for x, y in zip(row, (*a, *v, 1), strict=True)), -force)
+            for row, force in zip(self._curvature, self._by_position, strict=True)
         ]
         entries = jacobian(residual, (*q, *v, *a))
         rows, columns = ([place[k] for place in entries] for k in range(2))

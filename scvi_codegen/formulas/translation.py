@@ -18,6 +18,14 @@ __all__ = ["Translation"]
 class Translation:
     """The map from a user's symbols, functions of time and derivatives to canonical symbols.
 
+    Args:
+        expression: what is translated; its symbols get their names from this.
+        coordinates: symbols or functions of time.
+        others: what is translated, too.
+        velocities, momenta: parallel to the coordinates.
+        time: the symbol for it.
+        parameters: names.
+
     Attributes:
         coordinates, momenta, parameters: canonical symbols.
         rules: from what the user writes to symbols.
@@ -27,6 +35,7 @@ class Translation:
         self,
         expression: Expr,
         coordinates: Sequence[Expr],
+        others: Sequence[Expr] = (),
         *,
         velocities: Sequence[Expr] | None = None,
         momenta: Sequence[Expr] = (),
@@ -34,7 +43,8 @@ class Translation:
         parameters: tuple[str, ...],
     ) -> None:
         self.rules: dict[Expr, Expr] = {}
-        self.free = sorted(expression.free_symbols, key=lambda free: str(free.name))
+        free = expression.free_symbols.union(*(other.free_symbols for other in others))
+        self.free = sorted(free, key=lambda given: str(given.name))
         self.user_time = self._time(coordinates, time, parameters)
         if self.user_time is not None:
             self._add(self.user_time, TIME)

@@ -64,7 +64,10 @@ def _results(family: PointFamily, names: tuple[str, ...]) -> str:
         return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
     if family.scalar_power:
         return f"Derivatives of d^{family.scalar_power}L/dt^{family.scalar_power}"
-    return " and ".join(f"L_{name}" for name in names) if len(family.scatters) == len(names) else "L_v"
+    slopes = [f"L_{name}" for name in names]
+    if family.forced:
+        slopes[0] += " + f"
+    return " and ".join(slopes) if len(family.scatters) == len(names) else "L_v"
 
 
 def _action(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel:
@@ -117,7 +120,7 @@ def _slope_blocks(family: PointFamily, sites: Sites) -> tuple[tuple[sympy.Expr, 
 def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
     """Non-zero derivatives of results by arguments; where the results are a gradient, one for both of a pair."""
     entries = jacobian(family.results, family.arguments)
-    if family.scalar is None:
+    if family.scalar is None or family.forced:
         return entries
     return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
 

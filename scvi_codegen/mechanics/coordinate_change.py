@@ -60,7 +60,19 @@ def change_coordinates(
         defaults=system.defaults,
         lagrangian=system.lagrangian.xreplace(replaced),
         clock=clock,
+        forces=_projected(system, positions, replaced, variables),
     )
+
+
+def _projected(
+    system: LagrangianSystem, positions: Mapping[Symbol, Expr], replaced: Mapping[Expr, Expr], new: tuple[Symbol, ...]
+) -> tuple[Expr, ...]:
+    """The forces on the new coordinates, f_u = q_u^T f_q: work is the same."""
+    forces = [sympy.S.Zero] * len(new) if system.forces else []
+    for q, force in zip(system.coordinates, system.forces, strict=False):
+        for i, slope in gradient(positions.get(q, q), new).items():
+            forces[i] += slope * force.xreplace(replaced)
+    return tuple(forces)
 
 
 def _rate(position: Expr, variables: tuple[Symbol, ...], time: Symbol) -> Expr:

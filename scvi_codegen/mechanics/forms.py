@@ -61,8 +61,9 @@ class Forms:
 
     @cached_property
     def force(self) -> tuple[Expr, ...]:
-        """L_q, m expressions."""
-        return self._slopes(self.system.lagrangian, self.system.coordinates)
+        """L_q, m expressions, and the forces beside it."""
+        slopes = self._slopes(self.system.lagrangian, self.system.coordinates)
+        return tuple(map(sympy.Add, slopes, self.system.forces)) if self.system.forces else slopes
 
     @cached_property
     def mass(self) -> Entries:
@@ -114,8 +115,8 @@ class Forms:
         variables = (*system.velocities, *system.coordinates, system.time, *system.auxiliaries)
         rates = (*accelerations(system), *system.velocities, sympy.S.One, *self.force)
         if system.auxiliaries:
-            return _rate(self.constitutive, variables, rates)
-        return tuple(rate - f for rate, f in zip(_rate(self.momentum, variables, rates), self.force, strict=True))
+            return _along(self.constitutive, variables, rates)
+        return tuple(rate - f for rate, f in zip(_along(self.momentum, variables, rates), self.force, strict=True))
 
     @cached_property
     def applied_force(self) -> tuple[Expr, ...]:
@@ -127,13 +128,41 @@ class Forms:
     def multiplied_residual(self) -> Expr:
         """Lambda . E: the scalar whose stationarity makes a collocation residual vanish, with its multipliers.
 
-        Of a Hamiltonian also the product of ``constitutive`` with its multipliers.
+        Of a Hamiltonian also the product of ``constitutive`` with its multipliers. Forces are left out of E: they stand
+        in :attr:`multiplied_forces`.
         """
         terms: list[Expr] = []
         factors = (*multipliers(self.system), *auxiliary_multipliers(self.system))
-        for factor, residual in zip(factors, (*self.euler_lagrange, *self.constitutive), strict=True):
+        forces = self.system.forces or (sympy.S.Zero,) * self.system.dimension
+        unforced = tuple(map(sympy.Add, self.euler_lagrange, forces))
+        for factor, residual in zip(factors, (*unforced, *self.constitutive), strict=True):
             terms.extend(factor * term for term in sympy.Add.make_args(residual))
         return sympy.Add(*terms)
+
+    @cached_property
+    def multiplied_forces(self) -> tuple[tuple[Expr, ...], ...]:
+        """What forces add to the slopes of ``multiplied_residual`` by q, v, a and lambda, m expressions each; or none.
+
+        The variations of a curve that a multiplier rules follow the adjoint of the linearised equations of motion:
+        only then is the error of the curve felt in second order, and the order of the method kept. The adjoint of
+        -f_q x - f_v x' is -f_q^T x + (f_v^T x)', and E of L alone is its own.
+        """
+        system, m = self.system, self.system.dimension
+        if not system.forces:
+            return ()
+        factors = multipliers(system)
+        by_position = _along(system.forces, system.coordinates, factors)
+        by_velocity = _along(system.forces, system.velocities, factors)
+        variables = (*system.velocities, *system.coordinates, system.time)
+        rates = (*accelerations(system), *system.velocities, sympy.S.One)
+        swept = _along(by_velocity, variables, rates)
+        still = (sympy.S.Zero,) * m
+        return (
+            tuple(x - y for x, y in zip(swept, by_position, strict=True)),
+            by_velocity,
+            still,
+            tuple(-f for f in system.forces),
+        )
 
     @cached_property
     def separable(self) -> bool:
@@ -155,7 +184,7 @@ class Forms:
         rates = (*(symbol for group in curve[1:] for symbol in group), sympy.S.One)
         found = [system.lagrangian]
         for _ in range(count):
-            found.append(_rate(found[-1:], variables, rates)[0])
+            found.append(_along(found[-1:], variables, rates)[0])
         return tuple(found[1:])
 
     @staticmethod
@@ -170,9 +199,9 @@ def forms_of(system: MechanicalSystem) -> Forms:
     return Forms(system)
 
 
-def _rate(expressions: Sequence[Expr], variables: Sequence[Symbol], rates: Sequence[Expr]) -> tuple[Expr, ...]:
-    """Time derivatives by the chain rule."""
+def _along(expressions: Sequence[Expr], variables: Sequence[Symbol], direction: Sequence[Expr]) -> tuple[Expr, ...]:
+    """Derivatives along a direction; the time derivatives, along the rates of the variables."""
     terms: list[list[Expr]] = [[] for _ in expressions]
     for (i, j), slope in jacobian(expressions, variables).items():
-        terms[i].append(slope * rates[j])
+        terms[i].append(slope * direction[j])
     return tuple(sympy.Add(*row) for row in terms)

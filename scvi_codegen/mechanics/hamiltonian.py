@@ -21,6 +21,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation
+from scvi_codegen.mechanics.forces import forces_by_coordinate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -68,6 +69,7 @@ class HamiltonianSystem(MechanicalSystem):
         hamiltonian: str,
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
+        forces: Mapping[str, str] | None = None,
     ) -> HamiltonianSystem:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -77,6 +79,7 @@ class HamiltonianSystem(MechanicalSystem):
             hamiltonian: the formula; it may span several lines.
             momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
             parameters: default value by name.
+            forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
@@ -90,14 +93,16 @@ class HamiltonianSystem(MechanicalSystem):
         values = dict(parameters or {})
         check_names(coordinates, tuple(values), names)
         symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values]}
+        variables = tuple(symbols[given] for given in coordinates)
         return cls(
             name=name,
-            coordinates=tuple(symbols[given] for given in coordinates),
+            coordinates=variables,
             momenta=tuple(symbols[given] for given in names),
             time=symbols[TIME],
             parameters=tuple(symbols[given] for given in values),
             defaults=tuple(number(given, value) for given, value in values.items()),
             hamiltonian=parse_expression(hamiltonian, symbols),
+            forces=forces_by_coordinate(variables, forces or {}, lambda text: parse_expression(text, symbols)),
         )
 
     @classmethod
@@ -110,6 +115,7 @@ class HamiltonianSystem(MechanicalSystem):
         momenta: Sequence[Expr],
         time: Symbol | None = None,
         parameters: Mapping[Symbol | str, float] | None = None,
+        forces: Mapping[Expr | str, Expr] | None = None,
     ) -> HamiltonianSystem:
         """Take H from a SymPy expression, in plain symbols or in functions of time.
 
@@ -122,13 +128,15 @@ class HamiltonianSystem(MechanicalSystem):
             coordinates, momenta: symbols or functions of time, parallel to each other.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
+            forces: expression by coordinate, in coordinates, momenta and time.
         """
         if not isinstance(hamiltonian, Expr):
             raise SystemDefinitionError(
                 f"the Hamiltonian is a {type(hamiltonian).__name__}, not a SymPy expression (text goes to from_text)"
             )
         given = named_parameters(parameters)
-        translation = Translation(hamiltonian, coordinates, momenta=momenta, time=time, parameters=tuple(given))
+        beside = tuple(sympy.sympify(f) for f in (forces or {}).values())
+        translation = Translation(hamiltonian, coordinates, beside, momenta=momenta, time=time, parameters=tuple(given))
         return cls(
             name=name,
             coordinates=translation.coordinates,
@@ -137,6 +145,11 @@ class HamiltonianSystem(MechanicalSystem):
             parameters=translation.parameters,
             defaults=tuple(number(parameter, value) for parameter, value in given.items()),
             hamiltonian=translation.apply(hamiltonian, "Hamiltonian"),
+            forces=forces_by_coordinate(
+                translation.coordinates,
+                {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
+                lambda given: translation.apply(sympy.sympify(given), "forces"),
+            ),
         )
 
     @property
@@ -181,6 +194,8 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     """
     names = _default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
     symbols = tuple(symbol(name) for name in names)
+    hamiltonian = _legendre_dual(system, system.velocities, symbols)
+    velocities = dict(zip(system.velocities, _slopes(hamiltonian, symbols), strict=True))
     return HamiltonianSystem(
         name=system.name,
         coordinates=system.coordinates,
@@ -188,8 +203,9 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         time=system.time,
         parameters=system.parameters,
         defaults=system.defaults,
-        hamiltonian=_legendre_dual(system, system.velocities, symbols),
+        hamiltonian=hamiltonian,
         clock=system.clock,
+        forces=tuple(f.xreplace(velocities) for f in system.forces),
     )
 
 
@@ -206,14 +222,17 @@ def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
         )
     if system.clock and system.clock.rate.free_symbols & set(system.momenta):
         raise SystemDefinitionError(f"the clock of '{system.name}' contains momenta, that of a Lagrangian may not")
+    lagrangian = _legendre_dual(system, system.momenta, system.velocities)
+    momenta = dict(zip(system.momenta, _slopes(lagrangian, system.velocities), strict=True))
     return LagrangianSystem(
         name=system.name,
         coordinates=system.coordinates,
         time=system.time,
         parameters=system.parameters,
         defaults=system.defaults,
-        lagrangian=_legendre_dual(system, system.momenta, system.velocities),
+        lagrangian=lagrangian,
         clock=system.clock,
+        forces=tuple(f.xreplace(momenta) for f in system.forces),
     )
 
 
@@ -240,6 +259,11 @@ def _is_regular(system: HamiltonianSystem) -> bool:
 
 def _default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"p_{name}" for name in coordinates)
+
+
+def _slopes(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
+    slopes = gradient(f, variables)
+    return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(variables)))
 
 
 def _legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: Sequence[Symbol]) -> Expr:

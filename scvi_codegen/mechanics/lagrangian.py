@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -13,6 +13,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.formulas.translation import Translation
+from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate, generalised_forces
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -62,7 +63,14 @@ class LagrangianSystem(MechanicalSystem):
 
     @classmethod
     def from_text(
-        cls, *, name: str, coordinates: Sequence[str], lagrangian: str, parameters: Mapping[str, float] | None = None
+        cls,
+        *,
+        name: str,
+        coordinates: Sequence[str],
+        lagrangian: str,
+        parameters: Mapping[str, float] | None = None,
+        forces: Mapping[str, str] | None = None,
+        dissipation: str | None = None,
     ) -> LagrangianSystem:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -71,11 +79,14 @@ class LagrangianSystem(MechanicalSystem):
             coordinates: names of the coordinates; the velocity of ``q`` is written ``q_dot``, time ``t``.
             lagrangian: the formula; it may span several lines.
             parameters: default value by name.
+            forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
+            dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
 
-        >>> LagrangianSystem.from_text(
-        ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2", parameters={"m": 1, "k": 2}
-        ... ).lagrangian
-        -k*x**2/2 + m*x_dot**2/2
+        >>> oscillator = LagrangianSystem.from_text(
+        ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",
+        ...     parameters={"m": 1, "k": 2, "c": 0.1}, forces={"x": "cos(t)"}, dissipation="c*x_dot**2/2")
+        >>> oscillator.lagrangian, oscillator.forces
+        (-k*x**2/2 + m*x_dot**2/2, (-c*x_dot + cos(t),))
         """
         if isinstance(coordinates, str):
             raise SystemDefinitionError(f"coordinates is a sequence of names: write ['{coordinates}']")
@@ -83,13 +94,15 @@ class LagrangianSystem(MechanicalSystem):
         check_names(coordinates, tuple(values))
         velocities = [coordinate + DOT for coordinate in coordinates]
         symbols = {symbol_name: symbol(symbol_name) for symbol_name in [*coordinates, *velocities, TIME, *values]}
+        variables = tuple(symbols[coordinate] for coordinate in coordinates)
         return cls(
             name=name,
-            coordinates=tuple(symbols[coordinate] for coordinate in coordinates),
+            coordinates=variables,
             time=symbols[TIME],
             parameters=tuple(symbols[parameter] for parameter in values),
             defaults=tuple(number(parameter, value) for parameter, value in values.items()),
             lagrangian=parse_expression(lagrangian, symbols),
+            forces=_forces(variables, forces, dissipation, lambda text: parse_expression(text, symbols)),
         )
 
     @classmethod
@@ -102,6 +115,8 @@ class LagrangianSystem(MechanicalSystem):
         velocities: Sequence[Expr] | None = None,
         time: Symbol | None = None,
         parameters: Mapping[Symbol | str, float] | None = None,
+        forces: Mapping[Expr | str, Expr] | None = None,
+        dissipation: Expr | None = None,
     ) -> LagrangianSystem:
         """Take L from a SymPy expression, in plain symbols or in functions of time.
 
@@ -116,13 +131,18 @@ class LagrangianSystem(MechanicalSystem):
                 symbol called ``q_dot`` for a symbol ``q``.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
+            forces: expression by coordinate, as the coordinate is given or by its name.
+            dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
         """
         if not isinstance(lagrangian, Expr):
             raise SystemDefinitionError(
                 f"the Lagrangian is a {type(lagrangian).__name__}, not a SymPy expression (text goes to from_text)"
             )
         given = named_parameters(parameters)
-        translation = Translation(lagrangian, coordinates, velocities=velocities, time=time, parameters=tuple(given))
+        beside = tuple(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0))
+        translation = Translation(
+            lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given)
+        )
         return cls(
             name=name,
             coordinates=translation.coordinates,
@@ -130,29 +150,39 @@ class LagrangianSystem(MechanicalSystem):
             parameters=translation.parameters,
             defaults=tuple(number(parameter, value) for parameter, value in given.items()),
             lagrangian=translation.apply(lagrangian),
+            forces=_forces(
+                translation.coordinates,
+                {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
+                dissipation,
+                lambda given: translation.apply(sympy.sympify(given), "forces"),
+            ),
         )
 
     @classmethod
     def from_lagranges_method(
         cls, method: LagrangesMethod, *, name: str, parameters: Mapping[Symbol | str, float] | None = None
     ) -> LagrangianSystem:
-        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` without forces and constraints.
+        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces, without constraints.
+
+        Forces and torques of its ``forcelist`` act through the velocities of their points, the angular velocities of
+        their frames, projected on the coordinates: f_i = sum F . dv/dq_dot_i.
 
         Raises:
-            SystemDefinitionError: if it has a force list or constraints; they are refused, never dropped.
+            SystemDefinitionError: if it has constraints; they are refused, never dropped.
         """
-        if len(method.forcelist):
-            raise SystemDefinitionError(
-                "this LagrangesMethod has a forcelist: a variational integrator of L alone would drop the forces. "
-                "Put conservative forces into the potential; nonconservative ones are not supported"
-            )
         if len(method.coneqs):
             raise SystemDefinitionError(
                 "this LagrangesMethod has constraints (hol_coneqs or nonhol_coneqs), which are not supported: use as "
                 "many independent coordinates as there are degrees of freedom"
             )
         lagrangian = method._L[0]  # LagrangesMethod has no public name for it
-        return cls.from_sympy(name=name, lagrangian=lagrangian, coordinates=list(method.q), parameters=parameters)
+        return cls.from_sympy(
+            name=name,
+            lagrangian=lagrangian,
+            coordinates=list(method.q),
+            parameters=parameters,
+            forces=generalised_forces(method),
+        )
 
     def _repr_latex_(self) -> str:
         dotted = {
@@ -160,6 +190,20 @@ class LagrangianSystem(MechanicalSystem):
             for coordinate, velocity in zip(self.coordinates, self.velocities, strict=True)
         }
         return rf"$\displaystyle L = {sympy.latex(self.lagrangian, symbol_names=dotted)}$"
+
+
+def _forces(
+    coordinates: tuple[Symbol, ...],
+    given: Mapping[Any, Any] | None,
+    dissipation: Any,
+    read: Callable[[Any], Expr],
+) -> tuple[Expr, ...]:
+    """The forces of a system and those of its dissipation."""
+    forces = forces_by_coordinate(coordinates, given or {}, read)
+    if dissipation is None:
+        return forces
+    friction = dissipative_forces(read(dissipation), tuple(symbol(q.name + DOT) for q in coordinates))
+    return tuple(map(sympy.Add, forces, friction)) if forces else friction
 
 
 def _check_velocities(system: LagrangianSystem) -> None:

@@ -62,6 +62,11 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or the "
             "reversible controller"
         )
+    if system.forces:
+        raise SystemDefinitionError(
+            f"forces act on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
+            "controlled steps (t_end=...)"
+        )
     level = _free_symbol(system)
     rate = monitor_function(system, monitor)
     named = replace(

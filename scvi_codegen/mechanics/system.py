@@ -19,7 +19,7 @@ without a matrix ask whether a Lagrangian with the same motion is known
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -64,6 +64,8 @@ class MechanicalSystem(ABC):
         parameters: the symbols that stay adjustable in the compiled integrator; one may be absent from the function.
         defaults: their default values, parallel to ``parameters``.
         clock: how time runs, if not evenly.
+        forces: m forces beside those of the function (:mod:`scvi_codegen.mechanics.forces`), in (q, v, t) of a
+            Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
     """
 
     name: str
@@ -72,6 +74,7 @@ class MechanicalSystem(ABC):
     parameters: tuple[Symbol, ...]
     defaults: tuple[float, ...]
     clock: Clock | None = None
+    forces: tuple[Expr, ...] = ()
 
     @property
     @abstractmethod
@@ -116,8 +119,8 @@ class MechanicalSystem(ABC):
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether time occurs in the function: energy is then not conserved."""
-        return self.time in self.formula.free_symbols
+        """Whether time occurs in the function or a force: energy is then not conserved."""
+        return any(self.time in formula.free_symbols for formula in (self.formula, *self.forces))
 
     def key(self) -> tuple[str, ...]:
         """All that tells this system from others: equal for systems of which equal texts are generated."""
@@ -128,6 +131,7 @@ class MechanicalSystem(ABC):
             " ".join(symbol.name for symbol in symbols),
             repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
             sympy.srepr(self.clock.rate) if self.clock else "",
+            *map(sympy.srepr, self.forces),
         )
 
     def to_text(self) -> str:
@@ -157,9 +161,16 @@ class MechanicalSystem(ABC):
                 ("coordinates", listed([q.name for q in self.coordinates])),
                 *([("momenta", listed([p.name for p in self.auxiliaries]))] if self.auxiliaries else []),
                 ("parameters", listed(parameters)),
+                *self._force_facts(),
             ),
             Html(f"<div>{written}</div>"),
         )
+
+    def _force_facts(self) -> Iterator[tuple[str, Html]]:
+        """The forces, one on each line of a notebook's card."""
+        for q, force in zip(self.coordinates, self.forces, strict=False):
+            if force != 0:
+                yield f"force on {q.name}", plain(format_expression(force))
 
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""
@@ -186,17 +197,22 @@ class MechanicalSystem(ABC):
         self._check_symbols_of_formula(what, arguments, kinds)
 
     def _check_symbols_of_formula(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
-        problem = unsupported_part(self.formula)
-        if problem:
-            raise SystemDefinitionError(f"in the {what} of '{self.name}': {problem}")
+        if self.forces and len(self.forces) != self.dimension:
+            raise SystemDefinitionError(f"{self.dimension} coordinates, but {len(self.forces)} forces: give one each")
         known = [*self.coordinates, *arguments, self.time, *self.parameters]
-        unknown = sorted(free.name for free in self.formula.free_symbols.difference(known))
-        if unknown:
-            hint = closest(unknown[0], [given.name for given in known])
-            raise SystemDefinitionError(
-                f"'{unknown[0]}' in the {what} is neither a coordinate, {kinds}, time nor a parameter{hint} "
-                "Give it a default value among the parameters, or list it as a coordinate"
-            )
+        named = zip(self.coordinates, self.forces, strict=False)
+        formulas = {what: self.formula, **{f"force on {q.name}": force for q, force in named}}
+        for where, formula in formulas.items():
+            problem = unsupported_part(formula)
+            if problem:
+                raise SystemDefinitionError(f"in the {where} of '{self.name}': {problem}")
+            unknown = sorted(free.name for free in formula.free_symbols.difference(known))
+            if unknown:
+                hint = closest(unknown[0], [given.name for given in known])
+                raise SystemDefinitionError(
+                    f"'{unknown[0]}' in the {where} is neither a coordinate, {kinds}, time nor a parameter{hint} "
+                    "Give it a default value among the parameters, or list it as a coordinate"
+                )
 
 
 def _free(name: str, taken: set[str]) -> str:

@@ -108,6 +108,11 @@ def action_families(
             "this quadrature differentiates L along the curve of positions, which a Hamiltonian does not have: give L "
             "(lagrangian_of), or use a quadrature without derivatives"
         )
+    if len(weights) > 1 and system.forces:
+        raise MethodError(
+            "this quadrature differentiates L along the curve, and would have to differentiate the work of the forces "
+            f"of '{system.name}', too: use a quadrature without derivatives"
+        )
     scalars = (system.lagrangian, *forms_of(system).rates(len(weights) - 1))
     return tuple(
         ScalarFamily(
@@ -118,6 +123,7 @@ def action_families(
             gathers=gathers[: k + 2],
             scalar=scalar,
             power=k,
+            forces=(system.forces,) if system.forces else (),
         )
         for k, (own, scalar) in enumerate(zip(weights, scalars, strict=True))
     )
@@ -162,6 +168,7 @@ def nodal_quadrature_family(
         ),
         scalar=system.lagrangian,
         scale=Fraction(1, 2),
+        forces=(system.forces,) if system.forces else (),
     )
 
 

@@ -105,6 +105,7 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau, *, rounded: b
         scalar=forms_of(system).multiplied_residual,
         power=1,
         in_action=False,
+        forces=forms_of(system).multiplied_forces,
     )
 
 
@@ -207,6 +208,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
         scalar=forms_of(system).multiplied_residual,
         power=-1,
         in_action=False,
+        forces=forms_of(system).multiplied_forces,
     )
     return stationary_nodal(
         families=(nodal_quadrature_family(system, nodes, rule, other_blocks=1 + size), node),

@@ -163,8 +163,8 @@ class PointFamily:
     """Points c_n in [0, 1] with weights, evaluated by one kernel.
 
     Where the kernel is the gradient of a ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
-    function, and of the discrete Lagrangian if ``in_action``. ``computes`` says what the kernel gives, where its name
-    does not.
+    function, and of the discrete Lagrangian if ``in_action``; where it is ``forced``, forces stand beside the gradient.
+    ``computes`` says what the kernel gives, where its name does not.
     """
 
     name: str
@@ -176,6 +176,7 @@ class PointFamily:
     scalar: sympy.Expr | None = None
     scalar_power: int = 0
     in_action: bool = False
+    forced: bool = False
     computes: str = ""
 
     @property
@@ -230,7 +231,11 @@ class StageSystem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScalarFamily:
-    """Points whose weighted sum sum_n scale w_n h^(1 + power) s(u_n) is part of a generating function."""
+    """Points whose weighted sum sum_n scale w_n h^(1 + power) s(u_n) is part of a generating function.
+
+    ``forces`` f_g, for the first gathers, stand beside its slopes, as in the principle of Lagrange and d'Alembert: the
+    variation is ds + sum_g f_g . du_g.
+    """
 
     name: str
     abscissae: Vector
@@ -241,13 +246,15 @@ class ScalarFamily:
     power: int = 0
     scale: Fraction = Fraction(1)
     in_action: bool = True
+    forces: tuple[tuple[sympy.Expr, ...], ...] = ()
 
     def slopes(self) -> list[tuple[Gather, tuple[sympy.Expr, ...]]]:
-        """The derivatives of the scalar, one tuple of m a gather."""
+        """The derivatives of the scalar and the forces, one tuple of m a gather."""
         slopes = []
-        for gather in self.gathers:
+        for g, gather in enumerate(self.gathers):
             entries = gradient(self.scalar, gather.arguments)
-            slopes.append((gather, tuple(entries.get(i, sympy.S.Zero) for i in range(len(gather.arguments)))))
+            own = tuple(entries.get(i, sympy.S.Zero) for i in range(len(gather.arguments)))
+            slopes.append((gather, tuple(map(sympy.Add, own, self.forces[g])) if g < len(self.forces) else own))
         return slopes
 
     def point_family(self, tables: Sequence[Table]) -> PointFamily:
@@ -271,6 +278,7 @@ class ScalarFamily:
             scalar=self.scalar,
             scalar_power=self.power,
             in_action=self.in_action,
+            forced=bool(self.forces),
         )
 
 

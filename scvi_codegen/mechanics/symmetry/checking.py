@@ -166,10 +166,11 @@ def _cut(change: Expr) -> str:
 
 
 def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
-    """L_q . xi + L_v . dxi/dt; of a Hamiltonian the rate of p . xi."""
+    """L_q . xi + L_v . dxi/dt, and the work of forces; of a Hamiltonian the rate of p . xi."""
     p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
     terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
+    terms += [force * component for force, component in zip(system.forces, xi, strict=False)]
     return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
 
 

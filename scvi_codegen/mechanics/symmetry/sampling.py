@@ -18,7 +18,6 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.tape import Tape, evaluate
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -125,11 +124,7 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
 def rates_of(system: MechanicalSystem) -> Rates:
     """The motion of a system, long numbers replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
-    if system.auxiliaries:
-        slopes = gradient(system.formula, system.coordinates)
-        forces = tuple(-slopes.get(i, sympy.S.Zero) for i in range(system.dimension))
-    else:
-        forces = forms_of(system).force
+    forces = forms_of(system).force
     numbers = _long_numbers((*transformed, *forces))
     if numbers:
         replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}

@@ -183,7 +183,9 @@ def _spanned(system: MechanicalSystem, motion: Rates, *, curved: bool) -> list[T
 def _energy(system: MechanicalSystem) -> list[Terms]:
     """H, if it is a conserved polynomial: no symmetry but time's."""
     places = {x: i for i, x in enumerate((*system.coordinates, *system.momentum_symbols))}
-    found = None if system.formula.has(system.time) else _monomials(sympy.expand(system.formula), places)
+    found = (
+        None if system.forces or system.formula.has(system.time) else _monomials(sympy.expand(system.formula), places)
+    )
     if found is None:
         return []
     factors = [(x, tuple(i for i, power in powers.items() for _ in range(power))) for x, powers in found]

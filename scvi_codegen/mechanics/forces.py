@@ -1,0 +1,75 @@
+"""Forces beside the potential: friction, drives, motors; given by coordinate, or friction by Rayleigh's function.
+
+With forces f the motion follows the principle of Lagrange and d'Alembert,
+
+    delta int L dt + int f . delta q dt = 0,      that is      d/dt L_v = L_q + f.
+
+Every method discretises the second integral as it does the first, by the same quadrature along the same curve: at each
+point L_q becomes L_q + f, and nothing else changes. Orders stay; momentum maps whose directions do no work are kept as
+before. Of a Hamiltonian they are forces on momenta, p' = -H_q + f(q, p, t).
+
+Sources: C. Kane, J. E. Marsden, M. Ortiz, M. West, Int. J. Numer. Meth. Eng. 49 (2000); J. E. Marsden, M. West, Acta
+Numerica 10 (2001), part 3; C. M. Campos, S. Ober-Bloebaum, Math. Model. Numer. Anal. 49 (2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.symbols import given_name
+
+if TYPE_CHECKING:
+    from sympy.physics.mechanics import LagrangesMethod
+
+__all__ = ["dissipative_forces", "forces_by_coordinate", "generalised_forces"]
+
+
+def forces_by_coordinate(
+    coordinates: Sequence[Symbol], given: Mapping[Any, Any], read: Callable[[Any], Expr]
+) -> tuple[Expr, ...]:
+    """The m forces, 0 where none is given; none at all if all are 0.
+
+    Args:
+        coordinates: of the system.
+        given: force by coordinate, a symbol or its name.
+        read: from what stands there to an expression in canonical symbols.
+
+    Raises:
+        SystemDefinitionError: for what is no coordinate.
+    """
+    if not isinstance(given, Mapping):
+        raise SystemDefinitionError(f"forces are a mapping from coordinates to formulas, not {given!r}")
+    names = [q.name for q in coordinates]
+    forces = {given_name(key): value for key, value in given.items()}
+    for name in forces:
+        if name not in names:
+            raise SystemDefinitionError(f"there is a force on '{name}', which is no coordinate{closest(name, names)}")
+    found = tuple(read(forces[name]) if name in forces else sympy.S.Zero for name in names)
+    return found if any(f != 0 for f in found) else ()
+
+
+def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple[Expr, ...]:
+    """The forces -dD/dv of Rayleigh's function D(q, v, t)."""
+    slopes = gradient(dissipation, velocities)
+    if not slopes:
+        raise SystemDefinitionError(
+            f"no velocity occurs in the dissipation {dissipation}: Rayleigh's function D(q, v) gives the forces -dD/dv"
+        )
+    return tuple(-slopes.get(i, sympy.S.Zero) for i in range(len(velocities)))
+
+
+def generalised_forces(method: LagrangesMethod) -> dict[Expr, Expr]:
+    """The forces of a ``forcelist`` by coordinate: f_i = sum F . dv/dq_dot_i over points, of torques over frames."""
+    forces: dict[Expr, Expr] = {}
+    for place, vector in method.forcelist or ():
+        velocity = place.vel(method.inertial) if hasattr(place, "vel") else place.ang_vel_in(method.inertial)
+        for q in method.q:
+            partial = velocity.diff(q.diff(sympy.physics.vector.dynamicsymbols._t), method.inertial, var_in_dcm=False)
+            forces[q] = forces.get(q, sympy.S.Zero) + vector.dot(partial)
+    return {q: f for q, f in forces.items() if f != 0}
