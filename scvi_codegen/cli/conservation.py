@@ -28,8 +28,8 @@ def energy_report(system: MechanicalSystem, trajectory: Trajectory) -> str:
     scale = abs(float(energy[0]))
     error = (energy - energy[0]) / (scale or 1.0)
     what = "relative energy error" if scale else "energy error"
-    if system.depends_on_time:
-        return f"energy: L depends on time, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
+    if why := system.changes_energy:
+        return f"energy: {why}, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
     largest = np.abs(error).max()
     drift = f"drift {_drift(trajectory.t, error):+.1e} over the run"
     return f"{what}: {largest:.2e} at most, {drift}{_verdict(largest) if scale else ''}"

@@ -147,9 +147,7 @@ def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
     if not np.isfinite(changes).any():
         return "energy: no state has one"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
-    if model.system.depends_on_time:
-        return (
-            f"energy: L depends on time, it changed by {abs(energies[state, worst] - energies[0, worst]):.3g} at most"
-        )
+    if why := model.system.changes_energy:
+        return f"energy: {why}, it changed by {abs(energies[state, worst] - energies[0, worst]):.3g} at most"
     what = "relative energy error" if relative else "energy error"
     return f"{what}: {changes[state, worst]:.2e} at most, of trajectory {worst}"

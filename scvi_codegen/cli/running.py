@@ -15,6 +15,7 @@ from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.portions import first_length
@@ -113,7 +114,7 @@ def summary(model: Model, outcome: RunOutcome) -> str:
     order = "no order claimed" if method.order is None else f"order {method.order}"
     lines = [
         model.system.name,
-        f"{method.title}; {order}, {'' if method.symplectic else 'not '}symplectic, "
+        f"{method.title}; {order}, {'' if is_symplectic(method, model.system) else 'not '}symplectic, "
         f"{'' if method.symmetric else 'not '}symmetric",
         f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {run.t:g}; "
         f"{counted(len(trajectory), 'state')} kept",

@@ -88,6 +88,8 @@ def exact_discrete_lagrangian(
         StateError: on numbers that are none, wrong shapes or names; if no solution is found; if q1 is conjugate to q0,
             where the solution is not unique.
     """
+    if system.forces:
+        raise StateError(f"forces act on '{system.name}': there is no action whose slopes the momenta are")
     problem = _Problem(system, h, t, parameters, digits)
     start, end = problem.vector(q0, "q0"), problem.vector(q1, "q1")
     velocity = None if guess is None else problem.vector(guess, "guess")

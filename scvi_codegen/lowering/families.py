@@ -18,8 +18,13 @@ from scvi_codegen.methods.stage_system import Gather, PointFamily
 __all__ = ["argument_name", "lowered_family"]
 
 
-def _is_regular(system: MechanicalSystem) -> bool:
-    """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist."""
+def _has_action(system: MechanicalSystem) -> bool:
+    """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist.
+
+    Nor does it where forces act: momenta are not its slopes.
+    """
+    if system.forces:
+        return False
     return not isinstance(system, HamiltonianSystem) or system.is_regular
 
 
@@ -51,7 +56,7 @@ def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) 
             purpose=f"The same, and the non-zero derivatives with respect to {u}.",
         ),
         blocks=blocks,
-        action=_action(system, family, u) if family.in_action and _is_regular(system) else None,
+        action=_action(system, family, u) if family.in_action and _has_action(system) else None,
         action_power=family.scalar_power,
     )
 

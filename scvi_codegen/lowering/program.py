@@ -31,7 +31,7 @@ from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.method import Method, is_symplectic
 from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import legendre_functional
@@ -71,7 +71,7 @@ def lower(
     return Program(
         prefix=prefix,
         title=_comment(f"{system.name}: {method.title}"),
-        notes=_notes(method),
+        notes=_notes(method, system),
         coordinate_names=tuple(q.name for q in system.coordinates),
         parameter_names=tuple(parameter.name for parameter in system.parameters),
         parameter_defaults=system.defaults,
@@ -181,11 +181,11 @@ def _comment(text: str) -> str:
     return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")
 
 
-def _notes(method: Method) -> tuple[str, ...]:
+def _notes(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
     order = "no order claimed" if method.order is None else f"order {method.order}"
     return (
         order,
-        "symplectic" if method.symplectic else "not symplectic",
+        "symplectic" if is_symplectic(method, system) else "not symplectic",
         "symmetric" if method.symmetric else "not symmetric",
     )
 

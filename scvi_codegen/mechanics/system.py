@@ -122,6 +122,13 @@ class MechanicalSystem(ABC):
         """Whether time occurs in the function or a force: energy is then not conserved."""
         return any(self.time in formula.free_symbols for formula in (self.formula, *self.forces))
 
+    @property
+    def changes_energy(self) -> str:
+        """Why energy is not conserved; nothing where it is."""
+        if self.forces:
+            return "forces act"
+        return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.depends_on_time else ""
+
     def key(self) -> tuple[str, ...]:
         """All that tells this system from others: equal for systems of which equal texts are generated."""
         symbols = (*self.coordinates, *self.auxiliaries, *self.parameters, self.time)

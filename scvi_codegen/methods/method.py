@@ -27,7 +27,15 @@ from scvi_codegen.methods.stage_system import PointFamily, Scatter, StageSystem,
 from scvi_codegen.tables.precision import Number, Vector, mp
 from scvi_codegen.tables.tableau import MOST_STAGES
 
-__all__ = ["Method", "Specification", "check_regular", "degree_count", "lagrangian_scatters", "unit_sum"]
+__all__ = [
+    "Method",
+    "Specification",
+    "check_regular",
+    "degree_count",
+    "is_symplectic",
+    "lagrangian_scatters",
+    "unit_sum",
+]
 
 degree_count = partial(checked_count, least=1, most=MOST_STAGES, error=MethodError)
 """A degree, or a number of stages."""
@@ -137,6 +145,11 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
             "is singular: use an SVI with as many quadrature points as its degree, or a Runge-Kutta or collocation "
             "method in phase-space form"
         )
+
+
+def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
+    """Whether the steps preserve dq ^ dp: of a symplectic method, where no forces act."""
+    return method.symplectic and not system.forces
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.forms import curve_rates, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import (
@@ -52,6 +53,10 @@ def shooting_increments(
     A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve. Not
     ``rounded``, all tables have all their digits.
     """
+    if system.forces and system.auxiliaries:
+        raise MethodError(
+            f"shooting-based methods follow forces on positions: give the Lagrangian of '{system.name}' (lagrangian_of)"
+        )
     size = len(tableau.b)
     position, velocities, beta = _curve(tableau, rule)
     weights = rule.unit_weights

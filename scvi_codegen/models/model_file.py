@@ -5,10 +5,18 @@
     coordinates = ["q"]
     lagrangian = "m*l**2*q_dot**2/2 + m*g*l*cos(q)"     # several lines between """ and """
 
+    dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
+
+    [forces]                                            # on coordinates; left out: 0
+    q = "F*cos(w*t)"
+
     [parameters]                                        # default values; the section may be left out
     m = 1.0
     l = 1.0
     g = 9.81
+    c = 0.1
+    F = 0.5
+    w = 2.0
 
     [initial]
     q = [2.0]                                           # or by name: a table [initial.q] with a line theta = 2.0
@@ -49,6 +57,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
+from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -62,10 +71,10 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "catalogue")
+SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "catalogue")
 RUN_KEYS = ("step", "tolerance", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
-SECTIONS = ("system", "parameters", "initial", "method", "run")
+SECTIONS = ("system", "forces", "parameters", "initial", "method", "run")
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance"}, {"span", "steps"})
 """One of each is given."""
 NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("step", "span")}
@@ -144,6 +153,9 @@ def _document(model: Model) -> dict[str, Any]:
     document: dict[str, Any] = {
         "system": {"name": system.name, "coordinates": names, **momenta, kind: _wrapped(system.to_text())}
     }
+    forces = zip(names, system.forces, strict=False)
+    if acting := {name: _wrapped(format_expression(force)) for name, force in forces if force != 0}:
+        document["forces"] = acting
     if system.parameters:
         values = zip(system.parameters, system.defaults, strict=True)
         document["parameters"] = {parameter.name: value for parameter, value in values}
@@ -182,8 +194,8 @@ def _read_model(document: Document, given: Document) -> Model:
     document = {**_laid_over(document, given), "method": _changed_method(base, given.get("method", {}))}
     if entry is None:
         _check_complete(document)
-        _check_used(document["system"], given.get("parameters", {}))
-    system = _read_system(document["system"], document.get("parameters", {}), entry)
+        _check_used(document, given.get("parameters", {}))
+    system = _read_system(document, entry)
     state = _read_state(document["initial"], system)
     return Model(system=system, method=_read_method(document["method"]), **state, **_read_run(document["run"]))
 
@@ -226,9 +238,11 @@ def _check_complete(document: Document) -> None:
         raise ModelFileError(f"there is no {', no '.join(missing)}")
 
 
-def _check_used(section: Section, parameters: Section) -> None:
+def _check_used(document: Document, parameters: Section) -> None:
     """Refuse a parameter laid over a system that knows none of that name."""
-    formula = str(section.get("lagrangian", section.get("hamiltonian")))
+    section = document["system"]
+    formulas = [section.get(key, "") for key in ("lagrangian", "hamiltonian", "dissipation")]
+    formula = " ".join(map(str, (*formulas, *document.get("forces", {}).values())))
     for name in parameters:
         if name not in re.findall(r"\w+", formula):
             raise ModelFileError(f"the system has no parameter '{name}'")
@@ -242,20 +256,27 @@ def _read_catalogue(section: Section) -> Problem | None:
     return _in_section("[system]", lambda: problem(name))
 
 
-def _read_system(section: Section, parameters: Section, entry: Problem | None) -> MechanicalSystem:
-    values = {key: real(value, f"[parameters] {key}") for key, value in parameters.items()}
+def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
+    section, forces = document["system"], document.get("forces", {})
+    values = {key: real(value, f"[parameters] {key}") for key, value in document.get("parameters", {}).items()}
     if entry is not None:
+        if forces:
+            raise ModelFileError("[forces] act on a system that is written out, not on one of the catalogue")
         return _in_section("[parameters]", lambda: entry.system.with_parameters(**values))
     _check_one(section, "system", "lagrangian", "hamiltonian")
     name, coordinates = _text(section, "name", "[system]"), _names(section, "coordinates")
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
+    common["forces"] = {key: _text(forces, key, "[forces]") for key in forces}
     if "hamiltonian" in section:
+        if "dissipation" in section:
+            raise ModelFileError("[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]")
         common["hamiltonian"] = _text(section, "hamiltonian", "[system]")
         common["momenta"] = _names(section, "momenta") if "momenta" in section else None
         return _in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
     if "momenta" in section:
         raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
     common["lagrangian"] = _text(section, "lagrangian", "[system]")
+    common["dissipation"] = _text(section, "dissipation", "[system]") if "dissipation" in section else None
     return _in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 

@@ -251,7 +251,10 @@ class Integrator(CompiledMethod):
         options: SolverOptions | None,
     ) -> tuple[Array, Array, float]:
         if not self.interface.has_action:
-            raise MethodError(f"{self.interface.method} has no discrete Lagrangian; SVI, SCVI and Gauss methods have")
+            raise MethodError(
+                f"{self.interface.method} has no discrete Lagrangian for {self.interface.system}; "
+                "SVI, SCVI and Gauss methods have, where no forces act"
+            )
         start, end = self._vector(q0, "q0"), self._vector(q1, "q1")
         p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
         report = self.binding.new("report *")

@@ -161,7 +161,8 @@ def _legendre_twin(subject: Subject) -> Finding | None:
     """The step of the Hamiltonian of a Lagrangian, or the other way round."""
     system, method = subject.moved, subject.method
     singular = isinstance(system, HamiltonianSystem) and not system.is_regular
-    if singular or method.needs_lagrangian:
+    shot = isinstance(method, SCVI) and bool(system.forces)
+    if singular or shot or method.needs_lagrangian:
         return None
     if system.dimension > LARGEST_TWIN:
         raise StateError(f"Legendre's transform is taken for {LARGEST_TWIN} coordinates at most")

@@ -175,6 +175,8 @@ def _run_of(subject: Subject, stepper: Stepper) -> float:
 
 def _action(subject: Subject) -> Finding | None:
     """The action S by evaluation of L alone, its slopes by differences: dS = p1 dq1 - p0 dq0 at the solution."""
+    if subject.system.forces:
+        return None
     state, equations, solved = subject.states[0], subject.derived(), subject.solved(0)
     slopes = equations.action_slopes(solved, state.q, state.p, state.h, state.t)
     if slopes is None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.verification.linearisation import Linearised
@@ -29,7 +30,7 @@ TRIED = 3
 
 def structure_checks(subject: Subject) -> Iterator[Check]:
     """All of this room that is promised."""
-    if subject.method.symplectic:
+    if is_symplectic(subject.method, subject.system):
         promise = "J^T Omega J = Omega, J by finite differences of the compiled step"
         yield from checked("symplecticity", promise, partial(_symplecticity, subject))
     if subject.method.symmetric:

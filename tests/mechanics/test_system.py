@@ -170,21 +170,14 @@ def test_lagranges_method_of_a_particle() -> None:
     assert system == from_text("q1", "m*q1_dot**2/2 - g*q1**2", m=1, g=1)
 
 
-def force_options() -> dict[str, Any]:
-    frame, point = ReferenceFrame("N"), Point("P")
-    point.set_vel(frame, Q1.diff(T) * frame.x)
-    return {"forcelist": [(point, frame.x)], "frame": frame}
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (force_options(), "forcelist"),
         ({"hol_coneqs": [Q1 - Q2]}, "constraints"),
         ({"nonhol_coneqs": [Q1.diff(T) - Q2.diff(T)]}, "constraints"),
     ],
 )
-def test_forces_and_constraints_are_refused_never_dropped(options: Mapping[str, Any], message: str) -> None:
+def test_constraints_are_refused_never_dropped(options: Mapping[str, Any], message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         LagrangianSystem.from_lagranges_method(lagranges_method(**options), name="system", parameters=PHYSICS)
 

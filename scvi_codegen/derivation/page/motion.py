@@ -26,6 +26,12 @@ def system_section(system: MechanicalSystem) -> Section:
         Paragraph(f"The {what} of {count}, {names}{time}:"),
         *formulas([Formula(system.formula, Symbol(letter))], "formula"),
     ]
+    if system.forces:
+        acting = [Formula(f, Symbol(f"f_{q.name}")) for q, f in zip(system.coordinates, system.forces, strict=True)]
+        contents += [
+            Paragraph("Forces act beside it; where L_q stands below, L_q + f is meant:"),
+            *formulas(acting, "force"),
+        ]
     if system.parameters:
         rows = tuple((symbol, value) for symbol, value in system.constants.items())
         table = TableBlock(columns=("parameter", "default"), rows=rows, formats={"default": ".17g"}, name="Parameters")
@@ -55,11 +61,10 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
 
 def _hamilton(system: MechanicalSystem) -> Iterator[Content]:
     by_momenta = gradient(system.formula, system.auxiliaries)
-    by_coordinates = gradient(system.formula, system.coordinates)
     rates = [Formula(by_momenta.get(i, sympy.S.Zero), velocity, "19a") for i, velocity in enumerate(system.velocities)]
     kicks = [
-        Formula(-by_coordinates.get(i, sympy.S.Zero), Symbol(f"{p.name}_dot"), "19b")
-        for i, p in enumerate(system.auxiliaries)
+        Formula(force, Symbol(f"{p.name}_dot"), "19b")
+        for p, force in zip(system.auxiliaries, forms_of(system).force, strict=True)
     ]
     yield Paragraph("Hamilton's equations (19), dq/dt = dH/dp and dp/dt = -dH/dq:")
     yield from formulas(rates, "equation")

@@ -1,0 +1,157 @@
+"""Forces beside the potential: how they are given, and what is made of them."""
+
+from __future__ import annotations
+
+import pytest
+import sympy
+from sympy.physics.mechanics import LagrangesMethod, Point, ReferenceFrame, dynamicsymbols
+
+from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
+from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian
+from scvi_codegen.mechanics.coordinate_change import change_coordinates
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.mechanics.symmetry.symmetry import symmetries
+from scvi_codegen.methods import SCVI, SVI
+from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.models.model_file import dump_model, parse_model
+
+PARAMETERS = {"m": 1.2, "c": 0.1, "F": 0.5, "w": 2.0}
+
+
+def driven(**given):
+    return LagrangianSystem.from_text(
+        name="driven",
+        coordinates=["x", "y"],
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 - x**2*y**2",
+        parameters=PARAMETERS,
+        **given,
+    )
+
+
+def test_forces_and_dissipation_add_up():
+    system = driven(forces={"y": "F*cos(w*t) - x_dot*y"}, dissipation="c*(x_dot**2 + y_dot**2)/2")
+    assert [str(f) for f in system.forces] == ["-c*x_dot", "F*cos(t*w) - c*y_dot - x_dot*y"]
+    assert system.depends_on_time
+    assert system.changes_energy == "forces act"
+    assert driven(forces={"x": "0"}) == driven()
+
+
+def test_from_sympy_as_from_text():
+    t, c = sympy.symbols("t c")
+    x, y = dynamicsymbols("x y")
+    L = sympy.Symbol("m") * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 - x**2 * y**2
+    own = LagrangianSystem.from_sympy(
+        name="driven",
+        lagrangian=L,
+        coordinates=[x, y],
+        parameters=PARAMETERS,
+        forces={y: -c * y.diff(t) ** 3, "x": -c * x},
+    )
+    assert own == driven(forces={"x": "-c*x", "y": "-c*y_dot**3"})
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"forces": {"z": "1"}}, "force on 'z', which is no coordinate"),
+        ({"forces": {"x": "1 +"}}, "column"),
+        ({"forces": {"x": "k*x"}}, "'k'"),
+        ({"forces": "x"}, "mapping from coordinates"),
+        ({"dissipation": "c*x**2"}, "no velocity occurs in the dissipation"),
+    ],
+)
+def test_unfit_forces_are_named(given, message):
+    with pytest.raises(SystemDefinitionError, match=message):
+        driven(**given)
+
+
+def test_legendre_there_and_back():
+    system = driven(forces={"x": "-c*x_dot", "y": "F*cos(w*t)"})
+    other = hamiltonian_of(system)
+    assert str(other.forces[0]) == "-c*p_x/m"
+    assert lagrangian_of(other).forces == system.forces
+    text = HamiltonianSystem.from_text(
+        name="h", coordinates=["x"], hamiltonian="p_x**2/2", parameters={"c": 1}, forces={"x": "-c*p_x"}
+    )
+    assert [str(f) for f in text.forces] == ["-c*p_x"]
+
+
+def test_work_is_the_same_in_other_coordinates():
+    """A constant force along x, in polar coordinates."""
+    plane = LagrangianSystem.from_text(
+        name="plane", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2", forces={"x": "1"}
+    )
+    polar = change_coordinates(plane, {"x": "r*cos(a)", "y": "r*sin(a)"}, coordinates=["r", "a"])
+    assert [str(f) for f in polar.forces] == ["cos(a)", "-r*sin(a)"]
+
+
+def test_forces_of_sympys_mechanics_act_through_velocities():
+    """A pendulum of length l in the plane, pulled along x and turned by a torque."""
+    theta = dynamicsymbols("theta")
+    t, length = dynamicsymbols._t, sympy.Symbol("l")
+    ground = ReferenceFrame("N")
+    rod = ground.orientnew("A", "Axis", (theta, ground.z))
+    pivot, bob = Point("O"), Point("P")
+    pivot.set_vel(ground, 0)
+    bob.set_pos(pivot, length * rod.x)
+    bob.v2pt_theory(pivot, ground, rod)
+    acting = [(bob, 3 * ground.x - bob.vel(ground)), (rod, 5 * ground.z)]
+    method = LagrangesMethod(length**2 * theta.diff(t) ** 2 / 2, [theta], forcelist=acting, frame=ground)
+    method.form_lagranges_equations()
+    system = LagrangianSystem.from_lagranges_method(method, name="pulled", parameters={"l": 2})
+    expected = LagrangianSystem.from_text(
+        name="pulled",
+        coordinates=["theta"],
+        lagrangian="l**2*theta_dot**2/2",
+        parameters={"l": 2},
+        forces={"theta": "-3*l*sin(theta) - l**2*theta_dot + 5"},
+    )
+    assert sympy.simplify(system.forces[0] - expected.forces[0]) == 0
+
+
+def test_symmetries_are_those_of_the_forced_motion():
+    still = LagrangianSystem.from_text(name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4")
+    dragged = LagrangianSystem.from_text(
+        name="free", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y**4", forces={"x": "-x_dot/2"}
+    )
+    assert "p_x" in {str(each.momentum_map) for each in symmetries(still)}
+    assert [str(each.momentum_map) for each in symmetries(dragged)] == ["p_x + x/2"]
+
+
+def test_what_needs_an_action_refuses_forces():
+    system = driven(forces={"x": "-c*x_dot"})
+    with pytest.raises(SystemDefinitionError, match="forces act on 'driven'"):
+        reparametrise(system, "1 + x**2")
+    with pytest.raises(StateError, match="no action"):
+        exact_discrete_lagrangian(system, [0, 0], [1, 1], 0.1)
+    with pytest.raises(MethodError, match="without derivatives"):
+        discretise(system, SVI(2, "hermite:2"))
+    with pytest.raises(MethodError, match="lagrangian_of"):
+        discretise(hamiltonian_of(system), SCVI(2))
+
+
+def test_model_files_hold_forces():
+    text = """
+        [system]
+        name = "driven pendulum"
+        coordinates = ["q"]
+        lagrangian = "q_dot**2/2 + cos(q)"
+        dissipation = "c*q_dot**2/2"
+        [forces]
+        q = "F*cos(w*t)"
+        [parameters]
+        c = 0.1
+        F = 0.5
+        w = 2.0
+        [initial]
+        q = [1.0]
+        q_dot = [0.0]
+        [run]
+        step = 0.1
+        span = 1.0
+    """
+    model = parse_model(text)
+    assert str(model.system.forces[0]) == "F*cos(t*w) - c*q_dot"
+    assert parse_model(dump_model(model)) == model

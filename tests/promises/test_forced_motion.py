@@ -1,0 +1,166 @@
+"""Forced motion: the order of every method is that without forces, momentum maps that forces do not touch are kept.
+
+The reference is SciPy's DOP853 on accelerations that SymPy solves for, which shares nothing with the package.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import sympy
+from scipy.integrate import solve_ivp
+
+from scvi_codegen.mechanics.hamiltonian import hamiltonian_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import (
+    SCVI,
+    SVI,
+    ChebyshevGauss,
+    Composition,
+    Gauss,
+    LobattoIIIA,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+)
+
+SPAN = 2.0
+
+
+@cache
+def cart_pole():
+    """A motor on the cart, friction in the joint, drag by the square of the cart's speed."""
+    return LagrangianSystem.from_text(
+        name="cart and pole with a motor",
+        coordinates=["x", "theta"],
+        lagrangian="(M + m)*x_dot**2/2 + m*l*x_dot*theta_dot*cos(theta) + m*l**2*theta_dot**2/2 + m*g*l*cos(theta)",
+        parameters={"M": 2.0, "m": 1.0, "l": 0.8, "g": 3.0, "b": 0.3, "c": 0.4, "F": 1.5, "w": 1.7},
+        forces={"x": "F*sin(w*t) - b*x_dot**3 - b*x*theta_dot"},
+        dissipation="c*theta_dot**2*(1 + x**2)/2",
+    )
+
+
+@cache
+def radial():
+    """Friction along the radius, a mass that depends on place: no torque."""
+    drag = "-c*{0}*(x*x_dot + y*y_dot)*(1 + x_dot**2 + y_dot**2)/(x**2 + y**2)"
+    return LagrangianSystem.from_text(
+        name="radial friction",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)*(1 + x**2 + y**2)/2 + 1/sqrt(x**2 + y**2)",
+        parameters={"c": 0.3},
+        forces={"x": drag.format("x"), "y": drag.format("y")},
+    )
+
+
+STATES = {cart_pole: ((0.3, 1.1), (0.5, -0.4)), radial: ((1.0, 0.1), (0.3, 0.8))}
+
+
+@cache
+def reference(build):
+    system, (q, v) = build(), STATES[build]
+    L, speeds, places, t = system.lagrangian, system.velocities, system.coordinates, system.time
+    mass = sympy.Matrix([[L.diff(a, b) for a in speeds] for b in speeds])
+    right = [
+        L.diff(x) + f - sum(L.diff(u, y) * v for y, v in zip(places, speeds, strict=True)) - L.diff(u, t)
+        for x, u, f in zip(places, speeds, system.forces, strict=True)
+    ]
+    accelerations = mass.LUsolve(sympy.Matrix(right)).subs(system.constants)
+    rates = sympy.lambdify((t, *places, *speeds), list(accelerations))
+    m = len(q)
+    run = solve_ivp(
+        lambda time, z: [*z[m:], *rates(time, *z)], (0.3, 0.3 + SPAN), [*q, *v], method="DOP853", rtol=1e-13, atol=1e-14
+    )
+    return run.y[:m, -1]
+
+
+def slope(stepper, build, counts):
+    q, v = STATES[build]
+    errors = []
+    for count in counts:
+        run = stepper.integrate(q, velocity=v, h=SPAN / count, steps=count, every=count, t=0.3)
+        errors.append(float(np.linalg.norm(run.q[-1] - reference(build))))
+    return np.log2(errors[0] / errors[1]), errors
+
+
+QUICK = [
+    (SVI(3), 6, (20, 40)),
+    (SVI(2, "gauss-lobatto:3"), 4, (40, 80)),
+    (SCVI(3), 6, (20, 40)),
+    (SpectralCollocation(4), 4, (40, 80)),
+]
+FULL = [
+    (SVI(1), 2, (80, 160)),
+    (SVI(4), 8, (10, 20)),
+    (SVI(4, "gauss-legendre:6"), 8, (10, 20)),
+    (SCVI(1), 2, (80, 160)),
+    (SCVI(2), 4, (40, 80)),
+    (SCVI(4), 8, (10, 20)),
+    (SCVI(3, abscissae="gauss"), 6, (20, 40)),
+    (SCVI(3, nodes="legendre-lobatto"), 6, (20, 40)),
+    (SpectralCollocation(3, form="phase-space"), 3, (80, 160)),
+    (Gauss(2), 4, (40, 80)),
+    (Gauss(3, form="position"), 6, (20, 40)),
+    (RadauIIA(3), 5, (40, 80)),
+    (LobattoIIIA(3), 4, (40, 80)),
+    (ChebyshevGauss(3), 4, (40, 80)),
+    (StoermerVerlet(), 2, (160, 320)),
+]
+
+
+def named(case):
+    return case[0].name
+
+
+@pytest.mark.parametrize("case", QUICK, ids=named)
+def test_order_is_that_without_forces(quickly_compiled, case):
+    method, order, counts = case
+    assert method.order == order
+    found, errors = slope(quickly_compiled(cart_pole(), method), cart_pole, counts)
+    assert found == pytest.approx(order, abs=0.25), errors
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("case", FULL, ids=named)
+def test_order_of_every_method_is_that_without_forces(quickly_compiled, case):
+    method, order, counts = case
+    assert method.order == order
+    for build in (cart_pole, radial):
+        found, errors = slope(quickly_compiled(build(), method), build, counts)
+        assert found == pytest.approx(order, abs=0.3 if order < 8 else 0.7), errors
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", [SVI(3), Gauss(3), SpectralCollocation(4, form="phase-space")], ids=lambda m: m.name)
+def test_a_hamiltonian_with_forces_takes_the_same_step(quickly_compiled, method):
+    system = radial()
+    own, other = (quickly_compiled(each, method) for each in (system, hamiltonian_of(system)))
+    q, v = STATES[radial]
+    p = own.momentum(q, v)
+    for one, two in zip(own.step(q, p, 0.1), other.step(q, p, 0.1), strict=True):
+        np.testing.assert_allclose(one, two, rtol=3e-15)
+
+
+@pytest.mark.parametrize("method", [SVI(2), SCVI(2)], ids=lambda method: method.name)
+def test_forces_without_torque_keep_the_angular_momentum(quickly_compiled, method):
+    stepper = quickly_compiled(radial(), method)
+    q, v = STATES[radial]
+    run = stepper.integrate(q, velocity=v, h=0.05, steps=400)
+    energy = run.energy()
+    assert energy[-1] < energy[0] - 0.05
+    assert stepper.interface.map_exact == (True,)
+    assert np.abs(run.momentum_errors()).max() < 1e-14
+
+
+def test_compositions_take_forces_of_place_and_time(quickly_compiled):
+    """x'' = -x + sin(2 t): the solution from rest is (2 sin t - sin 2t) / 3."""
+    system = LagrangianSystem.from_text(
+        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "sin(2*t)"}
+    )
+    errors = []
+    for count in (4, 8):
+        run = quickly_compiled(system, Composition(8)).integrate([0.0], [0.0], h=SPAN / count, steps=count)
+        errors.append(abs(run.q[-1, 0] - (2 * np.sin(SPAN) - np.sin(2 * SPAN)) / 3))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(8, abs=0.4), errors
