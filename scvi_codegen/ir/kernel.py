@@ -1,8 +1,9 @@
-"""A kernel: straight-line arithmetic over its arguments, time and parameters.
+"""A kernel: straight-line arithmetic over its arguments, time and parameters, and loops that add to its values.
 
 ``u[i]`` are its arguments, ``t`` the time and ``parameters[i]`` the parameters: temporaries, each used more than once,
 then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary functions on
-numbers of the target's scalar type; there are no branches, loops or integers.
+numbers of the target's scalar type; there are no branches. Terms that differ only in what they take from ``u`` may
+stand in a loop over a table of places (:class:`IndexedSum`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scvi_codegen.ir.numbers import Number
 if TYPE_CHECKING:
     import sympy
 
-__all__ = ["Constant", "Expression", "Kernel", "Load", "Operation", "loads", "operations"]
+__all__ = ["Constant", "Expression", "IndexedSum", "Kernel", "Load", "Operation", "loads", "operations"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,7 @@ class Kernel:
         symbols: what ``u`` holds, in the symbols of the formulas.
         formulas: what the results were before their common parts were found.
         purpose: what it computes, one sentence for people.
+        sums: loops that add to the values once all results are stored, in order.
     """
 
     name: str
@@ -67,6 +69,16 @@ class Kernel:
     symbols: tuple[sympy.Symbol, ...] = field(default=(), repr=False, compare=False)
     formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
     purpose: str = field(default="", repr=False, compare=False)
+    sums: tuple[IndexedSum, ...] = ()
+
+    def __post_init__(self) -> None:
+        for each in self.sums:
+            each.check(self)
+
+    @property
+    def functions(self) -> tuple[Kernel, ...]:
+        """The kernel and the terms that its loops evaluate."""
+        return (self, *(each.term for each in self.sums))
 
     @property
     def uses_arguments(self) -> bool:
@@ -85,10 +97,12 @@ class Kernel:
 
     def uses(self, array: str) -> bool:
         """Whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``slope``."""
-        if array == "value":
+        if array == "value" or (self.sums and array == "u"):
             return True
         if array == "slope":
             return len(self.results) > self.values
+        if any(each.term.uses(array) for each in self.sums):
+            return True
         return any(load.source == array for each in (*self.temporaries, *self.results) for load in loads(each))
 
     def operation_counts(self) -> dict[str, int]:
@@ -96,6 +110,10 @@ class Kernel:
         counts: dict[str, int] = {}
         for expression in (*self.temporaries, *self.results):
             _count(expression, counts)
+        for each in self.sums:
+            added = {"+": each.term.values}
+            for operator, count in (*each.term.operation_counts().items(), *added.items()):
+                counts[operator] = counts.get(operator, 0) + count * len(each.table)
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
@@ -116,7 +134,38 @@ class Kernel:
         for kind, k, expression in self.statements():
             target = f"w{k}" if kind == "w" else f"{kind}[{k}]"
             lines.append(f"  {target} = {_text(expression)}")
-        return "\n".join(lines)
+        lines += [f"  {each}" for each in self.sums]
+        return "\n".join([*lines, *(str(each.term) for each in self.sums)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexedSum:
+    """A kernel in a loop over an index table: for every row e, value[table[e][a]] += term_a(u[table[e][0]], ...).
+
+    Rows are taken in order, the slots a of a row in order, so that a loop and the same terms written out one after the
+    other (:func:`scvi_codegen.ir.unrolled.unrolled`) round alike. A place may occur in a row twice. The length of the
+    code depends on the term, not on the number of rows; time and parameters are those of the kernel.
+
+    Attributes:
+        term: a kernel of as many values as arguments (slots), without slopes and without loops of its own.
+        table: (rows, slots) places in ``u``, which are also those in the values.
+    """
+
+    term: Kernel
+    table: tuple[tuple[int, ...], ...]
+
+    def check(self, kernel: Kernel) -> None:
+        """Raise ``ValueError`` for a term or a table that does not fit a kernel."""
+        term, places = self.term, min(kernel.arguments, kernel.values)
+        if term.sums or not term.arguments == term.values == len(term.results):
+            raise ValueError(f"the term '{term.name}' has not as many values as arguments, or has slopes or loops")
+        for row in self.table:
+            if len(row) != term.arguments or not all(0 <= place < places for place in row):
+                raise ValueError(f"'{term.name}' takes {term.arguments} places below {places}, not {row}")
+
+    def __str__(self) -> str:
+        """One line: the loop."""
+        return f"value[table[e][a]] += {self.term.name}(u[table[e]])[a], e < {len(self.table)}"
 
 
 def loads(expression: Expression) -> Iterator[Load]:

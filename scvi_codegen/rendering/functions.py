@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.parts import Part, parts
 from scvi_codegen.ir.sweeps import Sweep
 from scvi_codegen.rendering.lanes import Lanes
-from scvi_codegen.rendering.layout import wrapped, wrapped_comment
+from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
 from scvi_codegen.rendering.target import Target
 
@@ -30,8 +30,10 @@ def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
     declared |= {"u": f"const {real} *u", "t": f"{real} t", "parameters": f"const {real} *parameters"}
     declared["kept"] = f"{real} *restrict kept"
     texts = [_function(PART, part, _used(part, declared), print_statements(part, target)) for part in _parts(kernel)]
+    texts += [text for each in kernel.sums for text in (kernel_text(each.term, target), _places(kernel, each))]
     arguments = _arguments(kernel, declared, slopes=slopes)
-    return "\n\n".join([*texts, _whole("static", kernel, arguments, print_statements(kernel, target))])
+    statements = [*print_statements(kernel, target), *_loops(kernel, real)]
+    return "\n\n".join([*texts, _whole("static", kernel, arguments, statements)])
 
 
 def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
@@ -44,13 +46,45 @@ def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
         _function(PART, part, _used(part, declared), print_lane_statements(part, sweep, sources))
         for part in _parts(kernel)
     ]
-    statements = print_lane_statements(kernel, sweep, sources)
+    texts += [
+        text for each in kernel.sums for text in (lane_kernel_text(each.term, sweep, lanes), _places(kernel, each))
+    ]
+    statements = [*print_lane_statements(kernel, sweep, sources), *_loops(kernel, "lanes")]
     return "\n\n".join([*texts, _whole("static inline", kernel, _arguments(kernel, declared), statements)])
 
 
 def lane_mass_text(kernel: Kernel, sweep: Sweep, lanes: Lanes, target: Target) -> str:
     """The constant masses: numbers of one trajectory, or vectors of many."""
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, sweep, lanes)
+
+
+def _table_name(kernel: Kernel, each: IndexedSum) -> str:
+    return f"{kernel.name}_{each.term.name}".upper()
+
+
+def _places(kernel: Kernel, each: IndexedSum) -> str:
+    """The index table of a loop."""
+    rows = [list(map(str, row)) for row in each.table]
+    return table(f"static const int {_table_name(kernel, each)}[{len(rows)}][{each.term.arguments}]", rows)
+
+
+def _loops(kernel: Kernel, real: str) -> list[str]:
+    """Statements of loops: slots are gathered, the term is evaluated, what it gives is added."""
+    lines = []
+    for each in kernel.sums:
+        slots = each.term.arguments
+        lines += [
+            f"for (int e = 0; e < {len(each.table)}; e++) {{",
+            f"  const int *at = {_table_name(kernel, each)}[e];",
+            f"  {real} slot[{slots}], term[{slots}];",
+            f"  for (int a = 0; a < {slots}; a++)",
+            "    slot[a] = u[at[a]];",
+            f"  {each.term.name}(slot, t, parameters, term);",
+            f"  for (int a = 0; a < {slots}; a++)",
+            "    value[at[a]] += term[a];",
+            "}",
+        ]
+    return lines
 
 
 def _parts(kernel: Kernel) -> tuple[Part, ...]:

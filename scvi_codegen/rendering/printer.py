@@ -77,18 +77,23 @@ def _load(load: Load) -> str:
 
 def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
     """The functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
-    return set().union(*(_functions(part, _Vectors(part, sources).has) for part in parts(kernel)))
+    return set().union(*(_functions(part, _Vectors(part, sources).has) for part in _every_part(kernel)))
 
 
 def scalar_functions(kernel: Kernel) -> set[str]:
     """All functions that occur in a kernel."""
-    return set().union(*(_functions(part, lambda expression: True) for part in parts(kernel)))
+    return set().union(*(_functions(part, lambda expression: True) for part in _every_part(kernel)))
 
 
 def constants(kernel: Kernel) -> Iterator[Number]:
     """The numbers written in a kernel."""
-    every = (expression for part in parts(kernel) for expression in _expressions(part))
+    every = (expression for part in _every_part(kernel) for expression in _expressions(part))
     return (expression.value for expression in every if isinstance(expression, Constant))
+
+
+def _every_part(kernel: Kernel) -> Iterator[Part]:
+    """Those of the kernel and of the terms in its loops."""
+    return (part for each in kernel.functions for part in parts(each))
 
 
 def _functions(part: Part, wanted: Callable[[Expression], bool]) -> set[str]:

@@ -249,7 +249,7 @@ def _scalar_kernels(program: Program) -> tuple[Kernel, ...]:
 
 def _is_cut(kernels: Iterable[Kernel]) -> bool:
     """Whether one of them is several functions."""
-    return any(len(parts(kernel)) > 1 for kernel in kernels)
+    return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
 
 
 def _lane_context(program: Program) -> dict[str, object]:

@@ -341,6 +341,33 @@ def test_blocks_of_another_size_are_compiled(degree: int) -> None:
     assert run.iterations[1:].max() <= 6
 
 
+def spherical(constraints: int) -> tuple[LagrangianSystem, tuple[sympy.Expr, ...]]:
+    """A mass on a rod in space; with two constraints in the plane through x + 2 y = 0: a pendulum again."""
+    system = LagrangianSystem.from_text(
+        name="mass in space", coordinates=["x", "y", "z"], lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 - z"
+    )
+    x, y, z = system.coordinates
+    return system, ((x**2 + y**2 + z**2 - 1) / 2, x + 2 * y)[:constraints]
+
+
+@pytest.mark.parametrize("constraints", [1, 2])
+@pytest.mark.parametrize("degree", [1, 2])
+def test_one_and_two_constraints_of_three_coordinates(degree: int, constraints: int) -> None:
+    system, surfaces = spherical(constraints)
+    method = ConstrainedIncrements(degree, surfaces)
+    stepper = compile_stepper(system, method, solver="newton", flags=QUICK_FLAGS)
+    plane = np.array([2.0, -1.0, 0.0]) / np.sqrt(5)  # the motion stays there by symmetry, or by the constraint
+    down = np.array([0.0, 0.0, -1.0])
+    start = np.sin(0.7) * plane + np.cos(0.7) * down, 0.4 * (np.cos(0.7) * plane - np.sin(0.7) * down)
+    run = stepper.integrate(*start, h=1 / 16, steps=16)
+    exact = DerivedStep(system, method.stage_system(system))(*map(list, start), 1 / 16)
+    np.testing.assert_allclose([*run.q[1], *run.p[1]], np.array([*exact.q, *exact.p], dtype=float), rtol=0, atol=1e-14)
+    values = sympy.lambdify(system.coordinates, surfaces)(*run.q.T)
+    assert max(np.abs(value).max() for value in values) < 1e-14
+    angle = pendulum(0.7, 0.4, 1.0)
+    assert np.abs(run.q[-1] - (angle[0] * plane - angle[1] * down)).max() < 0.02 / 16 ** (2 * degree)
+
+
 def test_two_sizes_need_blocks_and_rows_of_each() -> None:
     system, surface = rod()
     stages = ConstrainedIncrements(2, (surface,)).stage_system(system)

@@ -1,0 +1,38 @@
+"""Loops of a kernel written out: the same arithmetic in the same order, in a straight line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from scvi_codegen.ir.kernel import Expression, IndexedSum, Kernel, Load, Operation
+
+__all__ = ["unrolled"]
+
+
+def unrolled(kernel: Kernel) -> Kernel:
+    """The kernel without loops; where compilers contract nothing, both round alike."""
+    temporaries, results = list(kernel.temporaries), list(kernel.results)
+    for each in kernel.sums:
+        for row in each.table:
+            terms = _placed(each, row, temporaries)
+            for place, term in zip(row, terms, strict=True):
+                temporaries.append(Operation("+", (results[place], term)))
+                results[place] = Load("w", len(temporaries) - 1)
+    return replace(kernel, temporaries=tuple(temporaries), results=tuple(results), sums=())
+
+
+def _placed(each: IndexedSum, row: tuple[int, ...], temporaries: list[Expression]) -> list[Expression]:
+    """What a row of the table gives; the temporaries that it needs are appended."""
+    first = len(temporaries)
+
+    def placed(expression: Expression) -> Expression:
+        if isinstance(expression, Operation):
+            return Operation(expression.operator, tuple(map(placed, expression.operands)))
+        if isinstance(expression, Load) and expression.source == "u":
+            return Load("u", row[expression.index])
+        if isinstance(expression, Load) and expression.source == "w":
+            return Load("w", first + expression.index)
+        return expression
+
+    temporaries.extend(map(placed, each.term.temporaries))
+    return [placed(result) for result in each.term.results]

@@ -1,0 +1,102 @@
+"""Kernels in loops over index tables: a chain's bonds, the same to the last bit as written out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+from samples import QUICK_FLAGS
+
+from scvi_codegen.compiler import describe, program_of
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import IndexedSum, Kernel
+from scvi_codegen.ir.unrolled import unrolled
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SVI
+from scvi_codegen.models.systems import fput_chain
+from scvi_codegen.rendering.text import render, render_ensemble
+from scvi_codegen.runtime.stepper import Stepper
+
+FLAGS = (*(flag for flag in QUICK_FLAGS if "contract" not in flag), "-ffp-contract=off")
+
+
+def looped_force(system: LagrangianSystem, name: str, bonds: list[tuple[int, int]]) -> Kernel:
+    """The force of a chain: the bonds to the walls in a straight line, those between masses in a loop."""
+    q, (alpha, beta) = system.coordinates, system.parameters
+    common = {"time": system.time, "parameters": system.parameters}
+
+    def tension(d: sympy.Expr) -> sympy.Expr:
+        return d + alpha * d**2 + beta * d**3
+
+    a, b = sympy.symbols("a b", real=True)
+    pull = tension(b - a)
+    bond = lower_kernel("bond", arguments=(a, b), values=(pull, -pull), **common)
+    walls = [sympy.S.Zero] * len(q)
+    walls[0] -= tension(q[0])
+    walls[-1] += tension(-q[-1])
+    kernel = lower_kernel(name, arguments=q, values=walls, **common)
+    return replace(kernel, sums=(IndexedSum(term=bond, table=tuple(bonds)),))
+
+
+def chain(masses: int) -> tuple[LagrangianSystem, list[tuple[int, int]]]:
+    return fput_chain(masses, alpha=0.25), [(i, i + 1) for i in range(masses - 1)]
+
+
+def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, np.ndarray]:
+    """Twenty steps, of one trajectory and of an ensemble, with a force in place of the compiler's own."""
+    method = SVI(3)
+    program = program_of(system, method, solver="fixed-point", prefix="chain")
+    assert program.sweep is not None
+    if force is not None:
+        program = replace(program, sweep=replace(program.sweep, force=force))
+    stepper = Stepper(
+        render(program),
+        describe(program, system, method),
+        ensemble=lambda: render_ensemble(program),
+        controlled=lambda: None,
+        flags=FLAGS,
+    )
+    q = np.sin(np.arange(1, system.dimension + 1) / 3) / 2
+    run = stepper.integrate(q, np.zeros_like(q), h=0.1, steps=20)
+    many = stepper.integrate_ensemble(np.array([q, q / 2, -q]), np.zeros((3, len(q))), h=0.1, steps=20)
+    return np.hstack([run.q, run.p]), np.array([many.q, many.p])
+
+
+def test_a_loop_over_bonds_steps_as_its_terms_written_out() -> None:
+    system, bonds = chain(6)
+    looped = looped_force(system, "force_lanes", bonds)
+    found, expected, own = (states(system, force) for force in (looped, unrolled(looped), None))
+    assert all(np.array_equal(*pair) for pair in zip(found, expected, strict=True))
+    assert all(np.allclose(*pair, rtol=0, atol=1e-13) for pair in zip(found, own, strict=True))
+    assert not unrolled(looped).sums
+    assert looped.operation_counts() == unrolled(looped).operation_counts()
+
+
+def test_the_code_of_a_loop_does_not_grow_with_its_table() -> None:
+    sizes = []
+    for masses in (8, 64):
+        system, bonds = chain(masses)
+        program = program_of(system, SVI(2), solver="fixed-point", prefix="chain")
+        assert program.sweep is not None
+        force = looped_force(system, "force_lanes", bonds)
+        code = render(replace(program, sweep=replace(program.sweep, force=force))).code
+        start = code.index("void bond(")
+        sizes.append(code[start : code.index("void mass(", start)].count(";"))
+    assert sizes[1] - sizes[0] == 64 - 8  # a value set to 0 for each mass
+
+
+@pytest.mark.parametrize("row", [(0,), (0, 6), (-1, 0), (0, 1, 2)])
+def test_places_beyond_the_arguments_are_refused(row: tuple[int, ...]) -> None:
+    system, bonds = chain(6)
+    with pytest.raises(ValueError, match="takes 2 places below 6"):
+        looped_force(system, "force", [*bonds, row])
+
+
+def test_terms_have_a_value_for_every_slot() -> None:
+    system, bonds = chain(4)
+    looped = looped_force(system, "force", bonds)
+    bond = replace(looped.sums[0].term, results=looped.sums[0].term.results[:1], values=1)
+    with pytest.raises(ValueError, match="not as many values as arguments"):
+        replace(looped, sums=(IndexedSum(term=bond, table=tuple(bonds)),))
