@@ -33,7 +33,14 @@ from scvi_codegen.runtime.portions import record_states
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Ensemble", "EnsembleParameters", "checked_ensemble", "integrate_ensemble", "parameters_of_each"]
+__all__ = [
+    "Ensemble",
+    "EnsembleParameters",
+    "LaneBlock",
+    "checked_ensemble",
+    "integrate_ensemble",
+    "parameters_of_each",
+]
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
@@ -162,14 +169,14 @@ class Ensemble:
                 stop.set()
                 pool.shutdown(cancel_futures=True)
 
-    def blocks(self) -> tuple[Callable[[int], _LaneBlock | _SingleBlock], int]:
+    def blocks(self) -> tuple[Callable[[int], LaneBlock | _SingleBlock], int]:
         """How to make the block that begins with a trajectory, compiled, and how many trajectories it holds."""
         source = self.stepper.ensemble
         if source is None:
             return lambda first: _SingleBlock(self, first), 1
         binding = Binding(building.load(source, flags=self.stepper.flags), source.prefix)
         width = len(binding.new("block *").active)
-        return lambda first: _LaneBlock(self, first, binding), width
+        return lambda first: LaneBlock(self, first, binding), width
 
     def result(self) -> EnsembleTrajectory:
         """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
@@ -188,7 +195,7 @@ class Ensemble:
         )
 
 
-class _LaneBlock:
+class LaneBlock:
     """A few trajectories, lanes of one C block, and those of them that had to leave it."""
 
     def __init__(self, work: Ensemble, first: int, binding: Binding) -> None:
@@ -224,6 +231,11 @@ class _LaneBlock:
                 v[k] = work.stepper.velocity(work.q[0, j], work.p[0, j], work.t0, work.parameters[j])
         return v
 
+    def lanes(self, name: str) -> Array:
+        """(m, lanes) the field of the block of this name, as it is: ``q``, ``p``, ``carry_q`` or ``carry_p``."""
+        field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
+        return field.reshape(self.work.stepper.dimension, -1)
+
     def advance(self, size: int) -> None:
         """``size`` steps on."""
         work, begin, self.step = self.work, self.step, self.step + size
@@ -251,9 +263,7 @@ class _LaneBlock:
         work, j = self.work, self.first + lane
         if lane not in self.left:
             step = int(self.memory.last_step[lane])
-            q, p, *carries = (
-                np.array([row[lane] for row in getattr(self.memory, name)]) for name in ("q", "p", "carry_q", "carry_p")
-            )
+            q, p, *carries = (self.lanes(name)[:, lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
             self.left[lane] = _Alone(work, j, q, p, step, (carries[0], carries[1]))
             begin = step
         rows = slice(begin // work.every + 1, self.step // work.every + 1)

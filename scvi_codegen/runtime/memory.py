@@ -130,6 +130,11 @@ class Memory:
         """(m,) momenta."""
         return np.array(list(self._memory.p))
 
+    @property
+    def carries(self) -> tuple[Array, Array]:
+        """(m,) and (m,) what rounding cut off :attr:`q` and :attr:`p`, added to the next steps."""
+        return np.array(list(self._memory.carry_q)), np.array(list(self._memory.carry_p))
+
     def resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
         """How a run made elsewhere goes on here: after ``steps``, at a time, with what rounding cut off it, q and p."""
         self._memory.step = steps

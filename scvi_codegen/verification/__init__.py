@@ -28,6 +28,7 @@ from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.identities import identity_checks
+from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks
 from scvi_codegen.verification.subject import State, Subject
@@ -80,6 +81,7 @@ def verify(
     subject = Subject(system, method, stepper, _newton(system, method, stepper, solver, flags), given)
     checks = (
         *step_checks(subject),
+        *roundoff_checks(subject),
         *structure_checks(subject),
         *convergence_checks(subject),
         *identity_checks(subject),

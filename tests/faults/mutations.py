@@ -54,6 +54,34 @@ from scvi_codegen.tables.spaces import Splines, Trigonometric
 
 __all__ = ["MUTATIONS"]
 
+ROUNDOFF = (
+    ("carry lost", "kepler/svi-3", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
+    ("carry lost", "double/scvi", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
+    ("carry lost", "kepler/composition", "add_compensated", r"carry\[i\] = rest - .*;", "carry[i] = 0;"),
+    ("carry lost in lanes", "double/svi", "add_compensated", r"\{rest - \(\(sum", "{0.0 * ((sum"),
+    ("carry of the wrong sign", "driven/svi", "add_compensated", r"\(carry\[i\] \+", "(-carry[i] +"),
+    ("low increments lost", "kepler/svi-3", "add_compensated", r" \+ increment\[M \+ i\]", ""),
+    ("carries exchanged", "cart/svi", "place", r"step->carry_q\[i\]", "step->carry_p[i]"),
+    ("carry left out of momenta", "double/svi", "sweep", r"carry_p\[i\] (?=.* - value)", "carry_p[i] * 0.0 "),
+    (
+        "carry subtracted from momenta",
+        "kepler/composition",
+        "solve",
+        r"\(step->carry_p\[i\] \+",
+        "(-step->carry_p[i] +",
+    ),
+    (
+        "carry left out of positions",
+        "kepler/composition",
+        "solve",
+        r"\(step->carry_q\[i\] \+",
+        "(0 * step->carry_q[i] +",
+    ),
+    ("weights of 53 bits", "round/svi-8", "sweep", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
+    ("h^2 of 53 bits", "kepler/svi-3", "prepare_sweep", r"data->square_low = .*;", "data->square_low = 0.0;"),
+    ("drifts of 53 bits", "kepler/svi-3", "sweep", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
+)
+
 MUTATIONS = (
     # The printer and the lowering.
     function(
@@ -191,6 +219,11 @@ MUTATIONS = (
         collocation_sweep,
         "_printed_ends",
         changed_result(lambda ends: replace(ends, start_force=ends.end_force, end_force=ends.start_force)),
+    ),
+    # Round-off: what compensated sums and low parts of coefficients promise.
+    *(
+        text(f"{what}, {where}", case(where), pattern, replacement, within=within)
+        for what, where, within, pattern, replacement in ROUNDOFF
     ),
     # Tables of the methods.
     function(

@@ -58,11 +58,14 @@ class Sabotage:
         self.patch.setattr(home, name, make(getattr(home, name)))
 
     def edit(self, pattern: str, replacement: str) -> None:
-        """Edit the first place of the C text, of the artefact and of Newton's solver, that has the pattern."""
+        """Edit the first place of each C text, of the artefact, of Newton's solver and of lanes, with the pattern."""
 
         def make(render: Callable[[Any], Any]) -> Callable[[Any], Any]:
             def rendered(program: Any) -> Any:
-                source = render(program).amalgamated()
+                source = render(program)
+                if source is None:
+                    return None
+                source = source.amalgamated()
                 code, edits = re.subn(pattern, replacement, source.code, count=1)
                 self.edits += edits
                 return replace(source, code=code)
@@ -70,6 +73,7 @@ class Sabotage:
             return rendered
 
         self.replace(compiler, "render", make)
+        self.replace(compiler, "render_ensemble", make)
 
 
 def changed_result(change: Make) -> Make:

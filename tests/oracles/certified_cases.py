@@ -31,6 +31,7 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "pendulum": (problem("planar-pendulum").system, (0.7,), (0.9,), 0.2),
     "driven": (driven_duffing(), (0.6,), (-0.3,), 0.2),
     "kepler": (problem("kepler").system, (0.3, 0.8), (-1.1, 0.4), 0.1),
+    "round": (problem("kepler").system, (0.8, 0.1), (0.1, 1.2), 0.35),
     "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
     "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
@@ -38,6 +39,7 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
 METHODS: dict[str, Callable[[], Method]] = {
     "svi": lambda: SVI(2),
     "svi-3": lambda: SVI(3),
+    "svi-8": lambda: SVI(8),
     "lobatto-svi": lambda: SVI(2, "gauss-lobatto:3"),
     "hermite": lambda: SVI(3, "hermite:2"),
     "splines": lambda: SVI(2, space="splines:2"),
@@ -67,10 +69,11 @@ def case(name: str) -> Case:
 
 
 WHOLE = """
-    pendulum/svi driven/svi kepler/svi-3 double/svi double/lobatto-svi cart/svi pendulum/hermite pendulum/splines
-    pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss kepler/printed double/printed
-    double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss double/gauss-position kepler/radau-iia
-    double/radau-ia kepler/lobatto driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
+    pendulum/svi driven/svi kepler/svi-3 round/svi-8 double/svi double/lobatto-svi cart/svi pendulum/hermite
+    pendulum/splines pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss
+    kepler/printed double/printed double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss
+    double/gauss-position kepler/radau-iia double/radau-ia kepler/lobatto driven/chebyshev pendulum/verlet
+    double/verlet kepler/composition driven/euler
 """
 CASES = {name: case(name) for name in WHOLE.split()}
 """Everything that is sabotaged, whole."""

@@ -1,0 +1,196 @@
+"""Small faults put into the package and its templates, drawn at random: which are caught, and by what.
+
+    python tests/faults/mutate.py --count 150 --seed 1 --results results.jsonl
+
+A fault is put into a copy of the checkout, in a folder of its own. ``verify`` is asked first, of systems by methods
+whose code the faulty file is part of, then the test files nearest to the file; the first that notices ends it. Faults
+that do not compile or import are not counted. The results, a line a fault, say where to go on: those that stand there
+are not tried again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+from operators import Place, places
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables")
+NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
+"""Words for people; their tests are of words."""
+CERTIFIED = (
+    "kepler/svi-3",
+    "cart/svi",
+    "double/scvi",
+    "double/sc",
+    "vortices/svi",
+    "kepler/composition",
+    "double/verlet",
+)
+NEAR: dict[str, tuple[str, ...]] = {
+    "templates/support/events": ("runtime/test_events.py",),
+    "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
+    "templates/support/control": ("runtime/test_controlled_steps.py", "lowering/test_ladder.py"),
+    "templates/support/legendre": ("runtime/test_given_velocities.py", "runtime/test_stepper.py"),
+    "templates/support/clock": ("runtime/test_clock.py", "mechanics/test_transformed_time.py"),
+    "templates/support/newton": ("lowering/test_newton.py", "lowering/test_stiff_newton.py"),
+    "templates/support/band": ("lowering/test_newton.py", "lowering/test_ordering.py"),
+    "templates/support/crowd": ("runtime/test_ensemble.py",),
+    "templates/support/many": ("runtime/test_ensemble.py",),
+    "templates/support/trajectories": ("runtime/test_ensemble.py", "runtime/test_drift.py"),
+    "templates/": (
+        "lowering/test_contraction.py",
+        "lowering/test_counts.py",
+        "runtime/test_quantities.py",
+        "lowering/test_collocation_solver.py",
+        "runtime/test_stepper.py",
+        "runtime/test_drift.py",
+    ),
+    "scvi_codegen/ir": ("lowering/test_lowering.py", "lowering/test_rounding.py", "rendering/test_generated.py"),
+    "scvi_codegen/lowering": ("lowering", "rendering/test_generated.py"),
+    "scvi_codegen/rendering": (
+        "rendering/test_generated.py",
+        "rendering/test_written_out.py",
+        "rendering/test_c_text.py",
+    ),
+    "scvi_codegen/methods": ("methods", "promises/test_identities.py", "promises/test_order.py"),
+    "scvi_codegen/runtime": (
+        "runtime/test_quantities.py",
+        "runtime/test_stepper.py",
+        "runtime/test_times.py",
+        "runtime/test_dense_output.py",
+        "runtime/test_events.py",
+        "runtime/test_ensemble.py",
+        "runtime/test_controlled_steps.py",
+        "runtime/test_clock.py",
+        "runtime/test_distributed.py",
+    ),
+    "scvi_codegen/native": ("native",),
+    "scvi_codegen/mechanics": ("mechanics",),
+    "scvi_codegen/files": ("files", "results/test_recording.py", "results/test_ensemble_files.py"),
+    "scvi_codegen/formulas": ("formulas/test_derivatives.py", "formulas/test_expression_text.py"),
+    "scvi_codegen/tables": ("tables",),
+}
+TOO_LONG = 240
+"""Seconds after which what does not end counts as noticed."""
+
+
+def drawn(count: int, seed: int, only: str) -> list[Place]:
+    """As many faults of C as of Python, of each file about as many as it has lines."""
+    python = [path for room in PACKAGE for path in (ROOT / "scvi_codegen" / room).rglob("*.py")]
+    kinds = (list((ROOT / "templates/support").glob("*.h")), [path for path in python if path.name not in NOT_TRIED])
+    chooser, chosen = random.Random(seed), []
+    for files in kinds:
+        own = [place for path in sorted(files) for place in places(ROOT, str(path.relative_to(ROOT)))]
+        own = [place for place in own if place.path.startswith(only)]
+        chosen.append(chooser.sample(own, min(len(own), count // 2)))
+    return [place for pair in zip(*chosen, strict=False) for place in pair] if all(chosen) else chosen[0] or chosen[1]
+
+
+def near(path: str) -> tuple[str, ...]:
+    """The test files that stand next to a file; the longest beginning decides."""
+    key = max((key for key in NEAR if path.startswith(key)), key=len)
+    return tuple(f"tests/{name}" for name in NEAR[key])
+
+
+def noticed(copy: Path, place: Place) -> tuple[str, str]:
+    """What noticed a fault, and in which words; ``""`` if nothing did."""
+    cases = [case for case in CERTIFIED if not place.path.startswith("templates") or place.path in used(copy)[case]]
+    code, output = run(copy, sys.executable, "tests/faults/certify.py", *cases) if cases else (0, "")
+    if code == 3:
+        return "stillborn", output
+    if code:
+        return "certificate", output
+    existing = [name for name in near(place.path) if (copy / name).exists()]
+    for name in existing:
+        code, output = run(copy, sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", name)
+        if code:
+            return name, output
+    return "", ""
+
+
+def run(copy: Path, *command: str) -> tuple[int, str]:
+    """The exit status and the last line that says something."""
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(
+            [str(copy), *(str(copy / "tests" / name) for name in ("oracles", "tools", "faults"))]
+        ),
+        "SCVI_CODEGEN_CACHE": str(copy.parent / "cache"),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    try:
+        found = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TOO_LONG, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return 1, "it does not end"
+    lines = (found.stdout + found.stderr).strip().splitlines() or [""]
+    failed = [line for line in lines if line.startswith(("FAILED", "ERROR", "BROKEN"))] or lines
+    return found.returncode, failed[-1][:160]
+
+
+USED: dict[str, set[str]] = {}
+
+
+def used(copy: Path) -> dict[str, set[str]]:
+    """The templates that the code of each case is made from."""
+    if not USED:
+        text = subprocess.run(
+            (sys.executable, "tests/faults/certify.py", "--list", *CERTIFIED),
+            cwd=copy,
+            env=os.environ
+            | {
+                "PYTHONPATH": os.pathsep.join(
+                    [str(copy), str(copy / "tests/oracles"), str(copy / "tests/tools"), str(copy / "tests/faults")]
+                )
+            },
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        USED.update({case: {f"templates/{name}" for name in names} for case, names in json.loads(text).items()})
+    return USED
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--count", type=int, default=150)
+    options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--only", default="", help="beginning of the paths of files")
+    options.add_argument("--results", type=Path, required=True)
+    given = options.parse_args()
+    lines = given.results.read_text().splitlines() if given.results.exists() else []
+    known = {entry["fault"]: entry["caught by"] for entry in map(json.loads, lines)}
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        copy = Path(folder) / "checkout"
+        ignored = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache")
+        shutil.copytree(ROOT, copy, ignore=ignored)
+        for place in drawn(given.count, given.seed, given.only):
+            text = (ROOT / place.path).read_text()
+            fault = place.name(text)
+            if fault in known:
+                continue
+            (copy / place.path).write_text(place.applied(text))
+            by, words = noticed(copy, place)
+            (copy / place.path).write_text(text)
+            known[fault] = by
+            with given.results.open("a") as results:
+                results.write(json.dumps({"fault": fault, "caught by": by, "words": words}) + "\n")
+            print(f"{by or 'SURVIVES':30} {fault}", flush=True)
+    counts = Counter(
+        "survive" if not by else by if by in ("stillborn", "certificate") else "tests" for by in known.values()
+    )
+    print(dict(counts))
+
+
+if __name__ == "__main__":
+    main()
