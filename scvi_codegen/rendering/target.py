@@ -41,8 +41,10 @@ class Target:
     largest: float
 
     def rounded(self, value: Number) -> float:
-        """The number of the target nearest to ``value``."""
+        """The number of the target nearest to ``value``; 0 below its smallest, as of low parts of tables."""
         digits = mp.convert(value)  # all 60 of them: it is rounded once
+        if abs(digits) < self.smallest:
+            return 0.0
         with mp.workprec(self.halvings + 1):
             return float(+digits)
 

@@ -353,16 +353,16 @@ MUTATIONS = (
     function(
         "another potential, consistently", case("double/svi"), stage_system.ScalarFamily, "slopes", of_another_system
     ),
-    function("L_vq v lost", case("double/sc"), mechanics, "_rate", without_rates_of("theta1", "theta2")),
-    function("L_vt lost", case("cart/sc"), mechanics, "_rate", without_rates_of("t")),
+    function("L_vq v lost", case("double/sc"), mechanics, "_along", without_rates_of("theta1", "theta2")),
+    function("L_vt lost", case("cart/sc"), mechanics, "_along", without_rates_of("t")),
     function(
-        "L_vq v lost, as printed", case("double/printed"), mechanics, "_rate", without_rates_of("theta1", "theta2")
+        "L_vq v lost, as printed", case("double/printed"), mechanics, "_along", without_rates_of("theta1", "theta2")
     ),
     function(
         "L_vq v lost, on Gauss points",
         case("double/scvi-gauss"),
         mechanics,
-        "_rate",
+        "_along",
         without_rates_of("theta1", "theta2"),
     ),
     function("the power rule halved", case("kepler/svi-3"), derivatives, "_partial", power_rule_halved),

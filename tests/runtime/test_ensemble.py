@@ -248,7 +248,7 @@ class TestThreadsAndInterruption:
         def fail(*arguments: object) -> None:
             raise RuntimeError("out of order")
 
-        monkeypatch.setattr("scvi_codegen.runtime.ensemble._LaneBlock.advance", fail)
+        monkeypatch.setattr("scvi_codegen.runtime.ensemble.LaneBlock.advance", fail)
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 
