@@ -8,6 +8,7 @@
     racing        the above for one case, or for an ensemble of 64 trajectories
     curves        time at equal error, by interpolation
     report        table and JSON of these;  picture: the work-precision plot
+    adaptive      steps that choose their length, on adaptive_cases; step_lengths: their picture
     drift         the energy over ten million steps
     paper_tables  Tables 6 and 7 of the paper
     compositions  SVI against explicit compositions
@@ -28,6 +29,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from scvi_codegen.benchmark.adaptive import run_adaptive
+from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
 from scvi_codegen.benchmark.cases import CASES
 from scvi_codegen.benchmark.compile_times import run_compile_times
 from scvi_codegen.benchmark.compositions import run_compositions
@@ -51,6 +54,7 @@ SCHEMA = 2
 SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     **{name: partial(run_case, name) for name in CASES},
     **{f"ensemble:{name}": partial(run_ensemble, name) for name in ENSEMBLES},
+    **{f"adaptive:{name}": partial(run_adaptive, name) for name in ADAPTIVE_CASES},
     "drift": run_drift,
     "tables": run_paper_tables,
     "compositions": run_compositions,
@@ -109,7 +113,8 @@ def benchmark(
     Args:
         names: of the sections, by default all; ``kepler`` is ``kepler:0.2`` and ``kepler:0.5``.
         plan: how to measure.
-        json_path, plot_path: files to write.
+        json_path, plot_path: files to write; beside the picture of adaptive cases another, NAME-steps, of the length
+            of a step along an orbit.
         say: told what is being done.
     """
     sections = tuple(section for name in names for section in _sections(name))
@@ -124,6 +129,10 @@ def benchmark(
         from scvi_codegen.benchmark.picture import plot_curves
 
         plot_curves(report.cases, plot_path)
+        if any(result.name.startswith("adaptive:") for result in report.cases):
+            from scvi_codegen.benchmark.step_lengths import plot_step_lengths
+
+            plot_step_lengths(Path(plot_path).with_stem(f"{Path(plot_path).stem}-steps"))
     return report
 
 

@@ -20,7 +20,18 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.problems import problem
 
-__all__ = ["CASES", "STATES", "Case", "Formulation", "case"]
+__all__ = [
+    "CASES",
+    "STATES",
+    "Bodies",
+    "Case",
+    "Formulation",
+    "case",
+    "gravitation",
+    "rotated",
+    "scaled",
+    "second_order",
+]
 
 Array = NDArray[np.float64]
 Vector = Sequence[Any]
@@ -192,14 +203,14 @@ def henon_heiles(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) ->
     return [-x - 2.0 * of["coupling"] * (x * y), -y - of["coupling"] * (x * x - y * y)]
 
 
-def _scaled(state: Sequence[float], spread: float) -> Array:
+def scaled(state: Sequence[float], spread: float) -> Array:
     """(8, m) states proportional to one, within +- spread of it, at incommensurable places."""
     golden = (math.sqrt(5.0) - 1.0) / 2.0
     factors = 1.0 + spread * (2.0 * np.modf(golden * np.arange(1, STATES + 1))[0] - 1.0)
     return np.outer(factors, np.asarray(state, dtype=float))
 
 
-def _rotated(vector: Sequence[float], axes: int) -> Array:
+def rotated(vector: Sequence[float], axes: int) -> Array:
     """(8, m) states: each body's vector under eight rotations and reflections, the same in every run."""
     random = np.random.default_rng(1)
     parts = np.asarray(vector, dtype=float).reshape(-1, axes)
@@ -217,8 +228,8 @@ def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Ca
         name=name,
         system=entry.system.with_parameters(**changes),
         formulations=rates,
-        q=_scaled(q, 0.05),
-        velocity=_scaled(velocity, 0.05),
+        q=scaled(q, 0.05),
+        velocity=scaled(velocity, 0.05),
         step=step,
         **own,
     )
@@ -267,8 +278,8 @@ def _kepler_case(eccentricity: float, *, step: float, fine: float) -> Case:
         name=f"kepler:{eccentricity}",
         system=entry.system,
         formulations=_hand_solved(kepler),
-        q=_rotated((1.0 - eccentricity, 0.0), 2),
-        velocity=_rotated((0.0, speed), 2),
+        q=rotated((1.0 - eccentricity, 0.0), 2),
+        velocity=rotated((0.0, speed), 2),
         span=2000.0,
         step=step,
         fine=fine,
@@ -285,8 +296,8 @@ def _outer_solar_system() -> Case:
         name="outer-solar-system",
         system=entry.system,
         formulations=_hand_solved(gravitation),
-        q=_rotated(entry.q, 3),
-        velocity=_rotated(entry.velocity, 3),
+        q=rotated(entry.q, 3),
+        velocity=rotated(entry.velocity, 3),
         span=entry.span,
         step=500.0,
         fine=256.0,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -17,13 +18,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_curves", "plot_curves"]
+__all__ = ["draw_curves", "plot_curves", "save_figure"]
 
 COLUMNS = 3
 
 
 def plot_curves(results: Sequence[CaseResult], path: str | os.PathLike[str]) -> None:
-    """Draw all cases into one picture, .png or .svg.
+    """Draw all cases into one picture, .png or .svg. Raises as :func:`save_figure`."""
+    save_figure(partial(draw_curves, results), path)
+
+
+def save_figure(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> None:
+    """Draw in the project's style into a file.
 
     Raises:
         StateError: for another suffix.
@@ -36,7 +42,7 @@ def plot_curves(results: Sequence[CaseResult], path: str | os.PathLike[str]) -> 
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
 
     def write(file: IO[bytes]) -> None:
-        draw_curves(results).savefig(file, format=kind, dpi=150, metadata=metadata)
+        draw().savefig(file, format=kind, dpi=150, metadata=metadata)
 
     with mpl.rc_context(STYLE):
         write_atomically(path, write)

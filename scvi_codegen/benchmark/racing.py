@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import STATES, Case, case
+from scvi_codegen.benchmark.cases import STATES, Array, Case, case
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
 from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
@@ -18,7 +18,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult
 
-__all__ = ["ENSEMBLES", "run_case", "run_ensemble"]
+__all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_ensemble"]
 
 ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 """Names of the cases that are run as ensembles."""
@@ -30,13 +30,16 @@ PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeErr
 Makers = dict[str, Callable[[], Iterable[Contender]]]
 """By the name of the peer."""
 
+ReferenceOf = Callable[[Case, Array | None], Reference]
+"""Where a case ends, from its velocities or from momenta."""
+
 
 def run_case(name: str, plan: Plan, say: Say) -> CaseResult:
     """One trajectory after the other, by this project and all peers."""
     chosen = case(name)
     chosen = replace(chosen, span=chosen.span * plan.share)
     makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=plan.quick) for peer in plan.peers}
-    return _race(chosen, partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick), makers, plan, say)
+    return race(chosen, partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick), makers, plan, say)
 
 
 def run_ensemble(name: str, plan: Plan, say: Say) -> CaseResult:
@@ -49,19 +52,27 @@ def run_ensemble(name: str, plan: Plan, say: Say) -> CaseResult:
     copies = 2 if plan.quick else TRAJECTORIES // STATES
     many = replace(few, q=np.tile(few.q, (copies, 1)), velocity=np.tile(few.velocity, (copies, 1)))
     makers: Makers = {"heyoka": partial(heyoka_ensembles, many, plan.quick)} if "heyoka" in plan.peers else {}
-    return _race(few, partial(our_ensembles, many, quick=plan.quick), makers, plan, say)
+    return race(few, partial(our_ensembles, many, quick=plan.quick), makers, plan, say)
 
 
-def _race(chosen: Case, ours: Callable[[], list[Contender]], makers: Makers, plan: Plan, say: Say) -> CaseResult:
+def race(
+    chosen: Case,
+    ours: Callable[[], list[Contender]],
+    makers: Makers,
+    plan: Plan,
+    say: Say,
+    ends: ReferenceOf = reference,
+) -> CaseResult:
+    """This project's contenders and those of peers, in turn, against where the case ends."""
     say(f"{chosen.name}: reference")
-    exact = reference(chosen)
+    exact = ends(chosen, None)
     say(f"{chosen.name}: step sizes")
     skipped: dict[str, str] = {}
     contenders = [*ours(), *_peer_contenders(chosen, makers, skipped, say)]
     say(f"{chosen.name}: {len(contenders)} settings")
 
     def reference_of(contender: Contender) -> Reference:
-        return exact if contender.momenta is None else reference(chosen, contender.momenta[:STATES])
+        return exact if contender.momenta is None else ends(chosen, contender.momenta[:STATES])
 
     found = measure(contenders, reference_of, repeats=plan.rounds)
     return CaseResult(

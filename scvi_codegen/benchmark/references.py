@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,19 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native import building
 
-__all__ = ["Reference", "final_states", "gauss_tables", "reference", "rms_error"]
+__all__ = [
+    "Extended",
+    "Reference",
+    "field_of",
+    "final_states",
+    "gauss_tables",
+    "reference",
+    "remembered",
+    "rms",
+    "rms_error",
+    "states_after",
+    "two_doubles",
+]
 
 Extended = NDArray[np.longdouble]
 Field = Callable[[Extended], Extended]
@@ -54,10 +66,11 @@ class Reference:
 
 def rms_error(q: Array, reference: Reference) -> float:
     """Root mean square over the states of |q - reference|, relative to that of |reference|; (k, m) positions."""
-    return _rms((q - reference.high) - reference.low) / _rms(reference.high)
+    return rms((q - reference.high) - reference.low) / rms(reference.high)
 
 
-def _rms(positions: NDArray[Any]) -> float:
+def rms(positions: NDArray[Any]) -> float:
+    """Root of the mean over states of |position|^2; (k, m) positions."""
     return float(np.sqrt(np.mean(np.sum(np.square(positions), axis=1))))
 
 
@@ -72,21 +85,26 @@ def reference(case: Case, momenta: Array | None = None) -> Reference:
     velocity = case.velocity.astype(np.longdouble)
     if momenta is not None and case.masses is not None:
         velocity = momenta.astype(np.longdouble) / np.array(case.masses, dtype=np.longdouble)
-    path = building.cache_folder() / "references" / f"{_key(case, velocity)}.npz"
+    return remembered(case, velocity, _compute)
+
+
+def remembered(case: Case, velocity: Extended, compute: Callable[[Case, Extended], Reference]) -> Reference:
+    """What is computed from a case and (k, m) velocities, from the user's cache folder the second time."""
+    path = building.cache_folder() / "references" / f"{_key(case, velocity, compute.__qualname__)}.npz"
     found = _read(path)
     if found is None:
-        found = _compute(case, velocity)
+        found = compute(case, velocity)
         _write(path, found)
     return found
 
 
-def _key(case: Case, velocity: Extended) -> str:
+def _key(case: Case, velocity: Extended, kind: str) -> str:
     """Everything the result depends on."""
     digest = hashlib.sha256(inspect.getsource(inspect.getmodule(_key)).encode())  # type: ignore[arg-type]
     digest.update(rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension).encode())
-    for array in (case.q, *_two_doubles(velocity)):
+    for array in (case.q, *two_doubles(velocity)):
         digest.update(array.tobytes())
-    digest.update(repr((case.span, case.fine, np.finfo(np.longdouble).machep)).encode())
+    digest.update(repr((kind, case.span, case.fine, np.finfo(np.longdouble).machep)).encode())
     return digest.hexdigest()[:24]
 
 
@@ -111,21 +129,16 @@ def _write(path: Path, result: Reference) -> None:
 def _compute(case: Case, velocity: Extended) -> Reference:
     if np.finfo(np.longdouble).eps > 1e-18:
         raise StateError("references need a long double of at least 64 digits, which this machine's NumPy has not")
-    parameters = {name: np.longdouble(value) for name, value in case.parameters.items()}
-    start = np.concatenate([case.q.astype(np.longdouble), velocity], axis=1)
-
-    def field(x: Extended) -> Extended:
-        rates = case.formulations[0].rates(list(np.moveaxis(x, -1, 0)), parameters, np)
-        return np.stack(rates, axis=-1)
-
+    start, field = np.concatenate([case.q.astype(np.longdouble), velocity], axis=1), field_of(case)
     fine, finer = (final_states(field, start, case.span, case.fine * factor) for factor in (1.0, 0.75))
     m = case.dimension
-    high, low = _two_doubles(finer[:, :m])
-    accuracy = _rms((fine - finer)[:, :m]) / _rms(high)
+    high, low = two_doubles(finer[:, :m])
+    accuracy = rms((fine - finer)[:, :m]) / rms(high)
     return Reference(high=high, low=low, accuracy=accuracy)
 
 
-def _two_doubles(x: Extended) -> tuple[Array, Array]:
+def two_doubles(x: Extended) -> tuple[Array, Array]:
+    """Extended numbers as sums of two doubles."""
     high = x.astype(np.float64)
     return high, (x - high).astype(np.float64)
 
@@ -139,17 +152,35 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
         span: length of time.
         h: step size.
     """
-    a, b, guess_table = gauss_tables(STAGES)
     whole = int(span // h)
-    x, carry, stages = start.copy(), np.zeros_like(start), None
-    for size in [h] * whole + ([span - whole * h] if span > whole * h else []):
-        guess = None if stages is None or size != h else _product(guess_table, stages)
+    return states_after(field, start, [h] * whole + ([span - whole * h] if span > whole * h else []))
+
+
+def states_after(field: Field, start: Extended, steps: Sequence[float] | Extended) -> Extended:
+    """(k, d) states after these steps."""
+    a, b, guess_table = gauss_tables(STAGES)
+    x, carry, before = start.copy(), np.zeros_like(start), None
+    stages: Extended | None = None
+    for size in steps:
+        guess = None if stages is None or size != before else _product(guess_table, stages)
+        before = size
         stages = _stages(field, x + carry, np.longdouble(size), a, guess)
         change = carry + np.longdouble(size) * _product(b, stages)[0]
         new = x + change
         carry = change - (new - x)
         x = new
     return x + carry
+
+
+def field_of(case: Case) -> Field:
+    """The hand-solved equations in extended precision."""
+    parameters = {name: np.longdouble(value) for name, value in case.parameters.items()}
+
+    def field(x: Extended) -> Extended:
+        rates = case.formulations[0].rates(list(np.moveaxis(x, -1, 0)), parameters, np)
+        return np.stack(rates, axis=-1)
+
+    return field
 
 
 Table = tuple[Extended, Extended]

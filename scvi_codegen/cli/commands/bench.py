@@ -27,9 +27,10 @@ def bench(
 
     SECTION is a problem (planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system,
     double-pendulum, relativistic-particle, fput-chain:8, :64, :256), 64 trajectories of one at once
-    (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), drift (the energy over ten million
-    steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up
-    or compile (larger systems, from text to first step); by default all; kepler is both of its kind.
+    (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), adaptive (steps that choose their
+    length, beside fixed steps, transformed time, heyoka and IAS15: adaptive:kepler:0.9, ..), drift (the energy over ten
+    million steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up or compile
+    (larger systems, from text to first step); by default all; kepler is both of its kind.
     Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
 
     \b

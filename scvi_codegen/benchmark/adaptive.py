@@ -1,0 +1,164 @@
+"""Problems with close encounters: steps that choose their length beside heyoka's and IAS15's, at equal error.
+
+References: of Kepler's problem by Kepler's equation in 40 digits; of the others by Gauss's method of 16 stages in
+extended precision, on the steps that this project's own integrator chose (which a method of twice the order resolves by
+far) and on halves of them; the difference is the accuracy that is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from mpmath import mp
+
+from scvi_codegen.benchmark.adaptive_cases import adaptive_case
+from scvi_codegen.benchmark.cases import Array, Case
+from scvi_codegen.benchmark.contenders.contenders import OURS, Contender
+from scvi_codegen.benchmark.contenders.ours import compiled, momenta_of
+from scvi_codegen.benchmark.contenders.peers import peer_contenders
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.racing import Makers, race
+from scvi_codegen.benchmark.references import (
+    Extended,
+    Reference,
+    field_of,
+    remembered,
+    rms,
+    states_after,
+    two_doubles,
+)
+from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["adaptive_reference", "kepler_ends", "run_adaptive"]
+
+TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
+PEERS = ("heyoka", "rebound")
+FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
+"""Steps of one length, as multiples of the number of those that choose theirs."""
+TRANSFORMED = (0.4, 0.3, 0.2, 0.15, 0.1)
+"""Steps of tau where dt is the frequency's dtau."""
+LAST = 10**15
+
+
+def run_adaptive(name: str, plan: Plan, say: Say) -> CaseResult:
+    """One trajectory after the other: this project in all its modes, heyoka, and IAS15 where bodies gravitate."""
+    chosen = adaptive_case(name)
+    makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=True) for peer in PEERS if peer in plan.peers}
+    return race(chosen, partial(_ours, chosen, quick=plan.quick), makers, plan, say, adaptive_reference)
+
+
+def _ours(chosen: Case, *, quick: bool) -> list[Contender]:
+    stepper, seconds = compiled(chosen, SVI(8))
+    momenta = momenta_of(stepper, chosen)
+    runs = [("controlled", _tolerance(each), {"t_end": chosen.span, "tolerance": each}) for each in TOLERANCES]
+    count = stepper.integrate(chosen.q[0], momenta[0], t_end=chosen.span).steps
+    fixed = [("fixed", max(1, round(count * factor))) for factor in FIXED]
+    made = [
+        _contender(stepper, chosen, momenta, seconds, mode, setting, partial(_to_its_end, stepper, arguments))
+        for mode, setting, arguments in (runs[:2] if quick else runs)
+    ]
+    made += [
+        _contender(stepper, chosen, momenta, seconds, mode, f"{n} steps", partial(_by_so_many, stepper, chosen.span, n))
+        for mode, n in (fixed[:1] if quick else fixed)
+    ]
+    return made if quick or "kepler" not in chosen.name else [*made, *_transformed(chosen, momenta, seconds)]
+
+
+def _tolerance(given: float | None) -> str:
+    return f"tol={given:.0e}" if given else "tol=default"
+
+
+def _transformed(chosen: Case, momenta: Array, seconds: float) -> list[Contender]:
+    """Steps of one length in a time that runs as the motion does."""
+    stepper = compile_stepper(reparametrise(chosen.system, "frequency"), SVI(8))
+    settings: list[dict[str, Any]] = [{"h": h, "t_end": chosen.span} for h in TRANSFORMED]
+    return [
+        _contender(stepper, chosen, momenta, seconds, "transformed", f"h={each['h']:g}", partial(_whole, stepper, each))
+        for each in settings
+    ]
+
+
+def _contender(
+    stepper: Stepper,
+    chosen: Case,
+    momenta: Array,
+    seconds: float,
+    mode: str,
+    setting: str,
+    start: Callable[[Array, Array], Callable[[], Array]],
+) -> Contender:
+    return Contender(
+        method=f"{OURS} {mode}",
+        setting=setting,
+        options=f"{stepper.title}, {' '.join(stepper.flags)}",
+        compile_seconds=seconds,
+        prepare=lambda index: start(chosen.q[index], momenta[index]),
+        momenta=momenta,
+    )
+
+
+def _to_its_end(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
+    run = stepper.start(q, p, **arguments)
+    return lambda: run.record(every=LAST).q[-1]
+
+
+def _by_so_many(stepper: Stepper, span: float, count: int, q: Array, p: Array) -> Callable[[], Array]:
+    run = stepper.start(q, p, h=span / count)
+    return lambda: run.record(count, every=count).q[-1]
+
+
+def _whole(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
+    return lambda: stepper.integrate(q, p, every=LAST, **arguments).q[-1]
+
+
+def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:
+    """Where a case ends: exactly, or in extended precision (minutes, then from the user's cache)."""
+    velocity = chosen.velocity.astype(np.longdouble)
+    if momenta is not None and chosen.masses is not None:
+        velocity = momenta.astype(np.longdouble) / np.array(chosen.masses, dtype=np.longdouble)
+    return remembered(chosen, velocity, kepler_ends if "kepler" in chosen.name else _ends)
+
+
+def kepler_ends(chosen: Case, velocity: Extended) -> Reference:
+    """By Kepler's equation and Lagrange's coefficients from exactly these doubles, in 40 digits."""
+    ends = [_kepler_end(q, v, chosen.span) for q, v in zip(chosen.q, velocity.astype(float), strict=True)]
+    high = np.array([[float(x) for x in end] for end in ends])
+    low = np.array([[float(x - mp.mpf(float(x))) for x in end] for end in ends])
+    return Reference(high=high, low=low, accuracy=1e-30)
+
+
+def _kepler_end(q: Array, v: Array, t: float) -> tuple[Any, Any]:
+    with mp.workdps(40):
+        (x, y), (u, w) = map(mp.mpf, q.tolist()), map(mp.mpf, v.tolist())
+        r = mp.hypot(x, y)
+        a = 1 / (2 / r - (u * u + w * w))
+        n, cosine, sine = a ** mp.mpf("-1.5"), 1 - r / a, (x * u + y * w) / mp.sqrt(a)
+        anomaly = mp.findroot(
+            lambda E: E - cosine * mp.sin(E) + sine * (1 - mp.cos(E)) - n * t,
+            (n * t - 2, n * t + 2),
+            solver="anderson",
+            tol=1e-70,
+            maxsteps=200,
+        )
+        f, g = 1 - a / r * (1 - mp.cos(anomaly)), t - (anomaly - mp.sin(anomaly)) / n
+        return f * x + g * u, f * y + g * w
+
+
+def _ends(chosen: Case, velocity: Extended) -> Reference:
+    stepper, field, m = compile_stepper(chosen.system, SVI(8)), field_of(chosen), chosen.dimension
+    found = []
+    for q, v in zip(chosen.q, velocity, strict=True):
+        t = stepper.integrate(q, velocity=v.astype(float), t_end=chosen.span).t.astype(np.longdouble)
+        start = np.concatenate([q.astype(np.longdouble), v])[np.newaxis]
+        steps = np.diff(t)
+        found.append([states_after(field, start, each)[0, :m] for each in (steps, np.repeat(steps / 2, 2))])
+    rough, fine = np.array(found).swapaxes(0, 1)
+    high, low = two_doubles(fine)
+    return Reference(high=high, low=low, accuracy=rms(rough - fine) / rms(high))

@@ -1,0 +1,168 @@
+"""Problems with close encounters, for steps that choose their length: eight initial states each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import (
+    Bodies,
+    Case,
+    Formulation,
+    Vector,
+    case,
+    gravitation,
+    kepler,
+    rotated,
+    scaled,
+    second_order,
+)
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.models.problems import problem
+
+__all__ = ["ADAPTIVE_CASES", "ECCENTRICITIES", "adaptive_case"]
+
+ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
+KEPLER_SPAN = 200.0
+MERCURY = {"axis": 0.387098, "eccentricity": 0.205630, "mass": 1.66e-7, "inclination": math.radians(7.0)}
+"""In astronomical units and solar masses."""
+COMET = {"axis": 10.0, "eccentricity": 0.97, "mass": 1e-15, "inclination": math.radians(20.0)}
+ORBITS = 2922.0, 12000.0
+"""Days: eight years with Mercury, a revolution of the comet."""
+
+PYTHAGOREAN = (3.0, 4.0, 5.0), ((1.0, 3.0), (-2.0, -1.0), (1.0, -1.0))
+"""Burrau's problem: masses at rest in the corners opposite to sides of these lengths."""
+FIGURE_EIGHT = (0.97000436, -0.24308753), (-0.93240737, -0.86473146)
+"""Chenciner & Montgomery, Annals of Mathematics 152 (2000): a body, and the velocity of the one in the middle."""
+
+
+def adaptive_case(name: str) -> Case:
+    """One of :data:`ADAPTIVE_CASES`, built."""
+    return replace(ADAPTIVE_CASES[name](), name=f"adaptive:{name}")
+
+
+def _kepler_case(eccentricity: float) -> Case:
+    """From the far end of the axis, where the velocity is small."""
+    speed = math.sqrt((1.0 - eccentricity) / (1.0 + eccentricity))
+    return Case(
+        name="kepler",
+        system=problem("kepler").system,
+        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(kepler)),),
+        q=rotated((1.0 + eccentricity, 0.0), 2),
+        velocity=rotated((0.0, speed), 2),
+        span=KEPLER_SPAN,
+        step=0.1,
+        fine=0.1,
+        bodies=Bodies(masses=(0.0,), gravity=1.0, fixed_centre=True, axes=2),
+    )
+
+
+def atwood(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
+    """R'' = (m r th'^2 - g (M - m cos th)) / (M + m), th'' = -(2 r' th' + g sin th) / r."""
+    heavy, light, g = of["M"], of["m"], of["g"]
+    pull = light * q[0] * (v[1] * v[1]) - g * (heavy - light * functions.cos(q[1]))
+    return [pull / (heavy + light), -(2.0 * v[0] * v[1] + g * functions.sin(q[1])) / q[0]]
+
+
+def _atwood_case() -> Case:
+    system = LagrangianSystem.from_text(
+        name="swinging Atwood machine",
+        coordinates=["r", "th"],
+        lagrangian="(M + m)*r_dot**2/2 + m*r**2*th_dot**2/2 - g*r*(M - m*cos(th))",
+        parameters={"M": 1.7, "m": 1.0, "g": 1.0},
+    )
+    return Case(
+        name="atwood",
+        system=system,
+        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(atwood)),),
+        q=scaled((1.1, 0.8), 0.01),
+        velocity=scaled((0.0, 0.2), 0.01),
+        span=100.0,
+        step=0.05,
+        fine=0.05,
+    )
+
+
+def _double_pendulum_case() -> Case:
+    """Tumbling: both rods go over the top."""
+    plain = case("double-pendulum")
+    return replace(plain, q=scaled((2.2, 2.8), 0.01), velocity=scaled((0.5, 0.5), 0.01), span=20.0)
+
+
+def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[float], **others: Any) -> Case:
+    """Bodies in space that attract each other."""
+    gravity = others.pop("gravity", 1.0)
+    names = [[f"{axis}{n}" for axis in "xyz"] for n in range(len(masses))]
+    kinetic = [f"m_{n}*({' + '.join(f'{x}_dot**2' for x in body)})/2" for n, body in enumerate(names)]
+    potential = [
+        f"G*m_{i}*m_{j}/sqrt({' + '.join(f'({a} - {b})**2' for a, b in zip(names[i], names[j], strict=True))})"
+        for i, j in combinations(range(len(masses)), 2)
+    ]
+    system = LagrangianSystem.from_text(
+        name=others["name"],
+        coordinates=[x for body in names for x in body],
+        lagrangian=" + ".join([*kinetic, *potential]),
+        parameters={f"m_{n}": mass for n, mass in enumerate(masses)} | {"G": gravity},
+    )
+    return Case(
+        system=system,
+        formulations=(Formulation(name="hand-solved accelerations", rates=second_order(gravitation)),),
+        q=rotated(q, 3),
+        velocity=rotated(velocity, 3),
+        bodies=Bodies(masses=tuple(masses), gravity=gravity, fixed_centre=False, axes=3),
+        masses=tuple(mass for mass in masses for _ in range(3)),
+        step=0.1,
+        fine=0.1,
+        **others,
+    )
+
+
+def _pythagorean_case() -> Case:
+    masses, places = PYTHAGOREAN
+    return gravitating(masses, [x for place in places for x in (*place, 0.0)], [0.0] * 9, name="pythagorean", span=65.0)
+
+
+def _figure_eight_case() -> Case:
+    (x, y), (u, v) = FIGURE_EIGHT
+    places, speeds = (x, y, 0, -x, -y, 0, 0, 0, 0), (-u / 2, -v / 2, 0, -u / 2, -v / 2, 0, u, v, 0)
+    return gravitating((1.0, 1.0, 1.0), places, speeds, name="figure-eight", span=100.0)
+
+
+def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: float) -> Case:
+    """The outer solar system and a body on an ellipse around the sun, from perihelion or aphelion (part 1, -1)."""
+    outer = problem("outer-solar-system")
+    assert outer.velocity is not None
+    values = dict(zip(map(str, outer.system.parameters), outer.system.defaults, strict=True))
+    masses = [value for key, value in values.items() if key.startswith("m_")]
+    sun, sun_velocity = np.array(outer.q[:3]), np.array(outer.velocity[:3])
+    e, mu = part * body["eccentricity"], values["G"] * masses[0]
+    distance, speed = body["axis"] * (1.0 - e), math.sqrt(mu * (1.0 + e) / (1.0 - e) / body["axis"])
+    tilt = math.cos(body["inclination"]), math.sin(body["inclination"])
+    place, velocity = sun + np.array([distance, 0.0, 0.0]), sun_velocity + speed * np.array([0.0, *tilt])
+    return gravitating(
+        [*masses, body["mass"]],
+        [*outer.q, *place],
+        [*outer.velocity, *velocity],
+        name=name,
+        gravity=values["G"],
+        span=span,
+    )
+
+
+ADAPTIVE_CASES: Mapping[str, Callable[[], Case]] = {
+    **{f"kepler:{e}": partial(_kepler_case, e) for e in ECCENTRICITIES},
+    "atwood": _atwood_case,
+    "double-pendulum": _double_pendulum_case,
+    "pythagorean": _pythagorean_case,
+    "mercury": partial(_solar_case, "mercury", MERCURY, ORBITS[0], part=1.0),
+    "henon-heiles": partial(case, "henon-heiles"),
+    "comet": partial(_solar_case, "comet", COMET, ORBITS[1], part=-1.0),
+    "figure-eight": _figure_eight_case,
+}
+"""By the name after ``adaptive:``."""

@@ -1,0 +1,59 @@
+"""A picture: the length of a step along an orbit, by each way of choosing it."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import Array
+from scvi_codegen.benchmark.picture import save_figure
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.models.problems import problem
+from scvi_codegen.pictures.canvas import COLORS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_step_lengths", "step_lengths"]
+
+ECCENTRICITY = 0.9
+PERIOD = 2.0 * math.pi
+REVOLUTIONS = 2.0
+TRANSFORMED = 0.2
+"""A step of tau, dt = r^(3/2) dtau."""
+
+
+def step_lengths() -> dict[str, tuple[Array, Array]]:
+    """Times and lengths of the steps of two revolutions from the far end of Kepler's ellipse of eccentricity 0.9."""
+    e, span = ECCENTRICITY, REVOLUTIONS * PERIOD
+    q, p = [1.0 + e, 0.0], [0.0, math.sqrt((1.0 - e) / (1.0 + e))]
+    system = problem("kepler").system
+    stepper = compile_stepper(system, SVI(8))
+    runs = {f"tolerance {each}": stepper.integrate(q, p, t_end=span, tolerance=each).t for each in (1e-6, 1e-11)}
+    runs["round-off"] = stepper.integrate(q, p, t_end=span).t
+    stretched = compile_stepper(reparametrise(system, "frequency"), SVI(8))
+    runs["transformed time"] = stretched.integrate(q, p, h=TRANSFORMED, t_end=span).t
+    return {name: (t[:-2], np.diff(t)[:-1]) for name, t in runs.items()}
+
+
+def draw_step_lengths() -> Figure:
+    """Lengths on a logarithmic axis, against revolutions."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for color, (name, (t, lengths)) in zip(COLORS, step_lengths().items(), strict=False):
+        axes.step(t / PERIOD, lengths, where="post", color=color, label=name)
+    axes.set(yscale="log", xlabel="revolutions", ylabel="length of a step", title=f"Kepler, e = {ECCENTRICITY:g}")
+    axes.legend(loc="lower left")
+    return figure
+
+
+def plot_step_lengths(path: str | os.PathLike[str]) -> None:
+    """Draw them into a file, .png or .svg. Raises as :func:`~scvi_codegen.benchmark.picture.save_figure`."""
+    save_figure(draw_step_lengths, path)

@@ -1,0 +1,94 @@
+"""The adaptive cases of the benchmark: their equations, their references, all modes of this project, the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy
+from mpmath import mp
+
+from scvi_codegen import benchmark as bench
+from scvi_codegen.benchmark import adaptive
+from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES, adaptive_case
+from scvi_codegen.benchmark.references import field_of, final_states, states_after
+from scvi_codegen.benchmark.step_lengths import plot_step_lengths, step_lengths
+from scvi_codegen.native import building
+
+needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path_factory.getbasetemp() / "adaptive-cache"))
+
+
+@pytest.mark.parametrize("name", ["atwood", "pythagorean", pytest.param("comet", marks=pytest.mark.full)])
+def test_hand_solved_accelerations_obey_the_lagrangian(name):
+    chosen = adaptive_case(name)
+    system, m = chosen.system, chosen.dimension
+    x = [sympy.Rational(int(value), 1000) for value in np.random.default_rng(3).integers(100, 9000, 2 * m)]
+    values = dict(zip(system.parameters, map(sympy.Float, system.defaults), strict=True))
+    lagrangian = system.lagrangian.xreplace(values)
+    rates = chosen.formulations[0].rates(x, chosen.parameters, sympy)
+    place = dict(zip((*system.coordinates, *system.velocities), x, strict=True))
+    for q, v in zip(system.coordinates, system.velocities, strict=True):
+        momentum, force = lagrangian.diff(v), lagrangian.diff(q).subs(place)
+        residual = -force
+        for n, (other, its_velocity) in enumerate(zip(system.coordinates, system.velocities, strict=True)):
+            residual += (
+                momentum.diff(other).subs(place) * x[m + n] + momentum.diff(its_velocity).subs(place) * rates[m + n]
+            )
+        assert abs(float(residual)) < 1e-12 * (1.0 + abs(float(force)))
+
+
+def test_every_case_has_eight_states_of_one_energy_scale():
+    for name in ADAPTIVE_CASES:
+        chosen = adaptive_case(name)
+        assert chosen.name == f"adaptive:{name}"
+        assert chosen.q.shape == chosen.velocity.shape == (8, chosen.dimension)
+
+
+@pytest.mark.parametrize("e", [0.0, 0.9, 0.999])
+def test_keplers_reference_returns_after_a_period(e):
+    chosen = replace(adaptive_case(f"kepler:{e}"), span=2.0 * np.pi)
+    found = adaptive.adaptive_reference(chosen)
+    assert np.abs(found.high - chosen.q).max() < 1e-14 / (1.0 - e)  # the period of rounded states
+    q, v = chosen.q[2], chosen.velocity[2]
+    with mp.workdps(30):
+        assert float(abs(mp.mpf(found.high[2, 0]) - adaptive._kepler_end(q, v, chosen.span)[0])) < 1e-16
+
+
+@pytest.mark.full
+@needs_extended
+def test_references_on_chosen_steps_are_those_on_equal_ones():
+    chosen = replace(adaptive_case("atwood"), span=3.0)
+    found = adaptive.adaptive_reference(chosen)
+    assert found.accuracy < 1e-17
+    start = np.concatenate([chosen.q, chosen.velocity], axis=1).astype(np.longdouble)
+    equal = final_states(field_of(chosen), start, chosen.span, 1.0 / 64.0)
+    assert np.abs((equal[:, :2] - found.high) - found.low).max() < 1e-17
+    split = states_after(field_of(chosen), start, [0.0625, 0.03125, 0.03125] + 46 * [0.0625])
+    assert np.abs(split - equal).max() < 1e-12
+
+
+@needs_extended
+def test_all_modes_run_and_agree():
+    chosen = replace(adaptive_case("kepler:0.5"), span=20.0)
+    made = adaptive._ours(chosen, quick=False)
+    assert {each.method.split()[1] for each in made} == {"controlled", "fixed", "transformed"}
+    exact = adaptive.adaptive_reference(chosen)
+    tight = [each for each in made if each.setting in ("tol=default", "h=0.1")]
+    for each in tight:
+        assert np.abs(each.prepare(3)() - exact.high[3]).max() < 1e-12
+    assert all(f"adaptive:{name}" in bench.SECTIONS for name in ADAPTIVE_CASES)
+
+
+def test_steps_in_the_picture_follow_the_motion(tmp_path):
+    for name, (t, lengths) in step_lengths().items():
+        assert len(t) == len(lengths) > 20, name
+        assert lengths.max() > 8.0 * lengths.min()
+    pytest.importorskip("matplotlib")
+    plot_step_lengths(tmp_path / "steps.svg")
+    assert (tmp_path / "steps.svg").stat().st_size > 1000
