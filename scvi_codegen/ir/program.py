@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.ir.sweeps import (
-    Splitting,
-    Sweep,
-)
+from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir.sweeps import Splitting
 
 __all__ = ["FEW_UNKNOWNS", "Integrals", "MomentumMap", "Program"]
 

@@ -23,7 +23,8 @@ from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, lower_matrix, lower_vector
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program
-from scvi_codegen.ir.sweeps import Splitting, Sweep
+from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.families import lowered_family
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.parts import Part, parts
-from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.rendering.lanes import Lanes
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements

@@ -8,21 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.ir.sweeps import (
-    CollocationSweep,
-    CoupledSweep,
-    CurveSweep,
-    GuessTables,
-    HamiltonianSweep,
-    PointSweep,
-    SeparableSweep,
-    ShootingSweep,
-    Sweep,
-)
+from scvi_codegen.ir.sweep import Kept, Sweep, SweepTable
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
@@ -104,7 +94,7 @@ class SweepText:
         return any("LIBRARY" in line for line in self.functions)
 
 
-def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamiltonian: bool) -> SweepText:
+def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool) -> SweepText:
     """A sweep in vectors of ``lanes`` lanes.
 
     Args:
@@ -112,9 +102,8 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamilt
         meaning: of a lane.
         lanes: in a vector.
         newton: whether Newton's iteration is tried where it fails.
-        hamiltonian: whether a Hamiltonian is given.
     """
-    mass = sweep.mass if isinstance(sweep, SeparableSweep) else None
+    mass = sweep.constant_mass
     applied = (*sweep.kernels, *((mass,) if mass and not meaning.are_points else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
     solver = _solver(sweep, newton=newton) if meaning.are_points else ()
@@ -123,13 +112,13 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamilt
         meaning=meaning,
         defines={
             "SWEEPS_AFTER": str(sweep.sweeps_after),
-            **_facts(sweep, hamiltonian=hamiltonian),
+            **{name: str(value) for name, value in sweep.facts.items()},
         },
         functions=tuple(map(_function, sorted(functions))),
         tables=tuple(_tables(sweep, meaning)),
         kernels=sweep.kernels,
         mass=mass,
-        support=(*meaning.before, "contraction", meaning.memory, *_support(sweep), *solver),
+        support=(*meaning.before, "contraction", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),
         highest=_vector("HIGHEST", sweep.guess.highest),
     )
@@ -137,8 +126,8 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool, hamilt
 
 def _kept(sweep: Sweep) -> dict[str, str]:
     """What is kept of a step. Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations."""
-    velocities, degree = isinstance(sweep, PointSweep), sweep.guess.degree
-    forces = isinstance(sweep, SeparableSweep)
+    velocities, degree = sweep.kept is Kept.VELOCITIES, sweep.guess.degree
+    forces = sweep.kept is Kept.FORCES
     return {
         "KEPT": str(len(sweep.guess.abscissae)),
         "KEPT_VELOCITIES": str(int(velocities)),
@@ -156,48 +145,29 @@ def _function(name: str) -> str:
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
 
 
-def _facts(sweep: Sweep, *, hamiltonian: bool) -> dict[str, str]:
-    """What the headers of one kind of sweep ask of it."""
-    if isinstance(sweep, CoupledSweep):
-        return {"PROJECTED": "1"} if sweep.projected else {}
-    if isinstance(sweep, CurveSweep):
-        return {"NODES": str(sweep.nodes.count)} if sweep.points else {"HAMILTONIAN": str(int(hamiltonian))}
-    return {}
-
-
-def _support(sweep: Sweep) -> tuple[str, ...]:
-    """Headers of a kind of sweep, in order."""
-    mass = "diagonal_mass" if sweep.diagonal else "full_mass"
-    match sweep:
-        case SeparableSweep():
-            return ("separable_sweep",)
-        case CoupledSweep():
-            return ("point_weights", mass, "coupled_sweep")
-        case HamiltonianSweep():
-            return ("point_weights", "hamiltonian_sweep")
-        case ShootingSweep():
-            return (mass, "unknown_velocity", "curve", "curve_points", "shooting_sweep")
-        case CollocationSweep(ends=None):
-            return (mass, "known_velocity", "curve", "ends_by_transform", "collocation_sweep")
-        case _:
-            return (mass, "unknown_velocity", "curve", "curve_points", "ends_by_quadrature", "collocation_sweep")
-
-
 def _solver(sweep: Sweep, *, newton: bool) -> tuple[str, ...]:
     """Headers of the solver around a sweep whose lanes are points, in order."""
     solver = ("newton_fallback" if newton else "no_fallback", "sweep_solver")
-    if not isinstance(sweep, PointSweep) or sweep.integrands is None:
+    if not sweep.integral_part:
         return solver
-    return (*solver, f"{sweep.kind}_integrals", "integrals_after_fallback" if newton else "integrals_after_sweep")
+    return (*solver, sweep.integral_part, "integrals_after_fallback" if newton else "integrals_after_sweep")
 
 
 def _tables(sweep: Sweep, meaning: Lanes) -> Iterator[str]:
-    if isinstance(sweep, CurveSweep):
-        yield from _curve_tables(sweep)
-    elif isinstance(sweep, SeparableSweep):
-        yield from _separable_tables(sweep, *_printers(meaning, sweep.points))
-    else:
-        yield from _point_tables(sweep, *_printers(meaning, sweep.points))
+    points = len(sweep.guess.abscissae)
+    vector, matrix = _printers(meaning, points) if sweep.in_groups else (_vector, _columns)
+    for each in sweep.tables:
+        print_table: Callable[[str, Any], str] = matrix if each.is_matrix else vector
+        yield print_table(each.name, each.numbers)
+        if each.in_two_parts:
+            yield print_table(f"{each.name}_LOW", _rests(each))
+
+
+def _rests(each: SweepTable) -> Values | NumberTable:
+    """What rounding cuts off the numbers of a table."""
+    if each.is_matrix:
+        return tuple(tuple(map(DOUBLE.rest, row)) for row in each.numbers)
+    return tuple(map(DOUBLE.rest, each.numbers))
 
 
 PrintVector: TypeAlias = Callable[[str, Values], str]
@@ -234,68 +204,3 @@ def _columns(name: str, rows: NumberTable) -> str:
 
 def _vector(name: str, values: Values) -> str:
     return table(f"static const lanes {name}", _numbers(values))
-
-
-def _separable_tables(sweep: SeparableSweep, vector: PrintVector, matrix: PrintMatrix) -> Iterator[str]:
-    yield vector("ABSCISSA", sweep.abscissae)
-    yield vector("DRIFT", sweep.drift)
-    yield vector("DRIFT_LOW", _rest(sweep.drift))
-    yield matrix("PRODUCT", sweep.product)
-    yield matrix("PRODUCT_LOW", _rests(sweep.product))
-    yield vector("POINT_END_POSITION", sweep.end_position)
-    yield vector("POINT_END_POSITION_LOW", _rest(sweep.end_position))
-    yield vector("POINT_END_MOMENTUM", sweep.end_momentum)
-    yield vector("POINT_END_MOMENTUM_LOW", _rest(sweep.end_momentum))
-    yield from _guess_tables(sweep.guess, matrix)
-
-
-def _rest(values: Values) -> Values:
-    """What rounding cuts off the numbers of a table."""
-    return tuple(map(DOUBLE.rest, values))
-
-
-def _rests(rows: NumberTable) -> NumberTable:
-    return tuple(map(_rest, rows))
-
-
-def _point_tables(sweep: PointSweep, vector: PrintVector, matrix: PrintMatrix) -> Iterator[str]:
-    yield vector("ABSCISSA", sweep.abscissae)
-    yield matrix("POSITION", sweep.position)
-    yield vector("POSITION_WEIGHT", sweep.position_weights)
-    yield matrix("MOMENTUM", sweep.momentum)
-    yield vector("MOMENTUM_WEIGHT", sweep.momentum_weights)
-    yield vector("POINT_END_POSITION", sweep.end_position)
-    yield vector("POINT_END_MOMENTUM", sweep.end_momentum)
-    if isinstance(sweep, CoupledSweep) and sweep.projected:
-        yield matrix("VELOCITY", sweep.velocity)
-        yield matrix("PROJECTION", sweep.projection)
-    yield from _guess_tables(sweep.guess, matrix)
-
-
-def _curve_tables(sweep: CurveSweep) -> Iterator[str]:
-    yield _vector("NODE_TIME", sweep.nodes.abscissae)
-    yield _columns("COLLOCATION", sweep.nodes.collocation)
-    yield _vector("NODE_END", sweep.nodes.end)
-    yield _vector("NODE_MASK", sweep.nodes.mask)
-    if sweep.points:
-        yield _vector("POINT_TIME", sweep.points.abscissae)
-        yield _columns("POINT_POSITION", sweep.points.position)
-        yield _columns("POINT_VELOCITY", sweep.points.velocity)
-    if isinstance(sweep, ShootingSweep):
-        yield _columns("COLLOCATION_T", sweep.collocation_transposed)
-        yield _columns("POINT_POSITION_T", sweep.position_transposed)
-        yield _columns("POINT_VELOCITY_T", sweep.velocity_transposed)
-        yield _vector("POINT_WEIGHT", sweep.weights)
-        yield _vector("NODE_CONSISTENCY", sweep.consistency)
-    if isinstance(sweep, CollocationSweep) and sweep.ends:
-        yield _vector("START_FORCE", sweep.ends.start_force)
-        yield _vector("START_MOMENTUM", sweep.ends.start_momentum)
-        yield _vector("END_FORCE", sweep.ends.end_force)
-        yield _vector("END_MOMENTUM", sweep.ends.end_momentum)
-    yield from _guess_tables(sweep.guess, _columns)
-
-
-def _guess_tables(guess: GuessTables, matrix: PrintMatrix) -> Iterator[str]:
-    yield matrix("LAST_ALONE", guess.last_alone)
-    yield matrix("LAST", guess.last)
-    yield matrix("BEFORE", guess.before)

@@ -8,7 +8,7 @@ from typing import TypeAlias
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.parts import Part, kept_numbers, parts
-from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.rendering.target import DOUBLE, Target
 
 __all__ = [

@@ -16,7 +16,7 @@ from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.parts import parts
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweeps import CoupledSweep, SeparableSweep, Sweep
+from scvi_codegen.ir.sweep import Kept, Sweep
 from scvi_codegen.rendering.control import ladder_text
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
@@ -158,9 +158,7 @@ def render_ensemble(program: Program) -> Source | None:
     Also with integrals: where time is one of these, trajectories have no common times.
     """
     sweep = program.sweep
-    if not isinstance(sweep, SeparableSweep | CoupledSweep) or (isinstance(sweep, CoupledSweep) and sweep.projected):
-        return None
-    if program.integrals:
+    if sweep is None or not sweep.serves_many or program.integrals:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
@@ -170,11 +168,11 @@ def render_ensemble(program: Program) -> Source | None:
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
         "width": ENSEMBLE_LANES,
-        "points": sweep.points,
+        "points": len(sweep.guess.abscissae),
         "cut": _is_cut(sweep.kernels),
-        "needs_velocities": isinstance(sweep, CoupledSweep),
+        "needs_velocities": sweep.kept is Kept.VELOCITIES,
         "hot": "static",
-        "sweep": sweep_text(sweep, TRAJECTORIES, ENSEMBLE_LANES, newton=False, hamiltonian=False),
+        "sweep": sweep_text(sweep, TRAJECTORIES, ENSEMBLE_LANES, newton=False),
     }
     return _render(prefix, context, "ensemble")
 
@@ -258,7 +256,7 @@ def _lane_context(program: Program) -> dict[str, object]:
     if sweep is None:
         return {"sweep": None}
     hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
-    text = sweep_text(sweep, POINTS, sweep.lanes, newton=program.newton, hamiltonian=program.hamiltonian)
+    text = sweep_text(sweep, POINTS, sweep.lanes, newton=program.newton)
     return {"sweep": text, "hot": hot}
 
 

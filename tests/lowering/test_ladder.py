@@ -7,6 +7,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.compiler import program_of
+from scvi_codegen.ir.sweep import Kept
 from scvi_codegen.lowering.solvers.ladder import ladder_of
 from scvi_codegen.rendering.target import DOUBLE
 from scvi_codegen.tables.basis import legendre_functional
@@ -52,7 +53,7 @@ def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
     system = sc.problem("double-pendulum").system
     sweep = program_of(system, method).sweep
     ladder, points = ladder_of(sweep), np.array(sweep.guess.abscissae, dtype=float)
-    accelerations = sweep.kind == "collocation"  # z = h a is kept
+    accelerations = sweep.kept is Kept.ACCELERATIONS  # z = h a is kept
 
     def curve(t):
         return 1.0 + t - 2.0 * t**3 + t**5

@@ -109,14 +109,14 @@ from scvi_codegen.compiler import program_of
 from scvi_codegen.models.problems import problem
 given = problem("kepler")
 method = SCVI(4, abscissae="gauss")
-print(program_of(given.system, method).sweep.kind, program_of(given.system, SCVI(4)).sweep.kind)
+print(*(type(program_of(given.system, each).sweep).__name__ for each in (method, SCVI(4))))
 ends = []
 for solver in ("fixed-point", "newton"):
     run = compile_stepper(given.system, method, solver=solver).integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=50)
     ends.append(np.array([*run.q[-1], *run.p[-1]]))
 print(abs(ends[0] - ends[1]).max() < 1e-13)
 """
-    assert run(extended, script).split() == ["separable", "shooting", "True"]
+    assert run(extended, script).split() == ["SeparableSweep", "ShootingSweep", "True"]
 
 
 # Blocks of another size than the coordinates: multipliers of constraints.

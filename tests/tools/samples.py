@@ -11,7 +11,7 @@ from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import sweep_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

@@ -14,7 +14,10 @@ from scvi_codegen.derivation.page.kernels import kernels_of
 from scvi_codegen.derivation.page.stage_equations import families_contents
 from scvi_codegen.derivation.page.sums import end_formulas, row_formulas
 from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section
+from scvi_codegen.ir.curve_sweeps import CollocationSweep, ShootingSweep
 from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir.sweeps import CoupledSweep, HamiltonianSweep, SeparableSweep
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
@@ -71,7 +74,7 @@ def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program:
     elif name == "newton":
         yield from _newton()
     elif name == "sweep" and program.sweep is not None:
-        yield from SWEEPS[program.sweep.kind]
+        yield from SWEEPS[type(program.sweep)]
     elif name == "gather":
         yield Formula(sympy.Sum(Symbol("table_j_n") * Symbol("z_j"), (j, 1, Symbol("B"))), Symbol("u_n"))
 
@@ -99,14 +102,14 @@ def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
     return sympy.Sum(Symbol(coefficient) * value, (j, 1, g))
 
 
-SWEEPS: dict[str, tuple[Content, ...]] = {
-    "separable": (
+SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
+    SeparableSweep: (
         Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; again until they rest:"),
         Formula(q + h * Symbol("c_n") * v0 + h**2 * _sum("a_n_j", inverse_mass * Symbol("F_j")), Symbol("q_n")),
         Formula(q + h * v0 + h**2 * _sum("beta_j", inverse_mass * Symbol("F_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("b_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
-    "coupled": (
+    CoupledSweep: (
         Paragraph("Velocities V_n at the points, corrected until they rest; M = L_vv there:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
@@ -114,7 +117,7 @@ SWEEPS: dict[str, tuple[Content, ...]] = {
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
     ),
-    "hamiltonian": (
+    HamiltonianSweep: (
         Paragraph(
             "Positions, forces, momenta and velocities V_n = H_p at the points, one from the other until they rest:"
         ),
@@ -125,7 +128,7 @@ SWEEPS: dict[str, tuple[Content, ...]] = {
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
-    "shooting": (
+    ShootingSweep: (
         Paragraph(
             "Scaled accelerations z_n at the nodes, corrected by the Euler-Lagrange residuals E; then p_(k+1), the "
             "velocity v_0 at the start and the multipliers, in turn until all rest:"
@@ -134,7 +137,7 @@ SWEEPS: dict[str, tuple[Content, ...]] = {
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(Symbol("z_n") - h * inverse_mass * Symbol("E_n"), Symbol("z_n_new")),
     ),
-    "collocation": (
+    CollocationSweep: (
         Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; again until they rest:"),
         Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),

@@ -13,7 +13,6 @@ from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines,
 from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweeps import SeparableSweep
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.outline import Function
@@ -28,7 +27,7 @@ def kernels_of(program: Program) -> tuple[Kernel, ...]:
     kernels = list(program.kernels)
     if program.sweep:
         kernels += program.sweep.kernels
-        kernels += [program.sweep.mass] if isinstance(program.sweep, SeparableSweep) else []
+        kernels += [program.sweep.constant_mass] if program.sweep.constant_mass else []
     if program.splitting:
         kernels += program.splitting.kernels
     return tuple({kernel.name: kernel for kernel in kernels}.values())

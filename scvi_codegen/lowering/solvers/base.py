@@ -1,9 +1,9 @@
 """What every solver without a matrix is: a function from a problem to its sweep, or ``None`` where it does not serve.
 
 A solver is a file in this folder with such a function, a line in ``FIXED_POINTS``
-(:mod:`scvi_codegen.lowering.solvers.choice`), and a kind of :class:`~scvi_codegen.ir.sweeps.Sweep`, data alone, of
-which :mod:`scvi_codegen.rendering.lanes` and the support header of that kind make C. Solvers share nothing but the
-problem. What they may rely on:
+(:mod:`scvi_codegen.lowering.solvers.choice`), and a subclass of :class:`~scvi_codegen.ir.sweep.Sweep`, data alone, that
+declares the tables and the support headers of which :mod:`scvi_codegen.rendering.lanes` makes C. Solvers share
+nothing but the problem. What they may rely on:
 
 * the tables of a shape are numbers of the method in 60 digits, and stay so in the sweep; they are rounded when they are
   printed, in two parts where what rounding does to the map is to be less;
@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from scvi_codegen.ir.sweeps import Sweep
+from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem

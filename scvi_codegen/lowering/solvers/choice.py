@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.sweeps import Splitting, Sweep
+from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.solvers.base import Solver, StepProblem
 from scvi_codegen.lowering.solvers.collocation import position_sweep, printed_sweep
 from scvi_codegen.lowering.solvers.coupled import coupled_sweep

@@ -3,19 +3,19 @@
 It serves what collocates the Euler-Lagrange equations and is not variational: spectral collocation and Runge-Kutta
 methods in position form, whose momenta at both ends are those of the velocities there, and the shooting-based method as
 printed, whose momenta at both ends are quadratures. The equations, those of ``methods/collocation.py`` and
-``methods/shooting.py`` solved for the accelerations, stand at :class:`scvi_codegen.ir.program.CollocationSweep`.
+``methods/shooting.py`` solved for the accelerations, stand at :class:`scvi_codegen.ir.curve_sweeps.CollocationSweep`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
+from scvi_codegen.ir.curve_sweeps import CollocationSweep, PrintedEnds
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.sweeps import CollocationSweep, PrintedEnds
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_vector
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shapes import Accelerations, PrintedCurve
@@ -39,10 +39,12 @@ def position_sweep(problem: StepProblem) -> CollocationSweep | None:
     return CollocationSweep(
         lanes=lanes,
         nodes=node_tables(tableau, lanes),
+        guess=guess_tables(tableau.c, lanes),
         points=None,
         kernel=_node_kernel(system),
         mass_entries=tuple(forms_of(system).lower_mass),
         ends=None,
+        hamiltonian=bool(problem.system.auxiliaries),
     )
 
 
@@ -57,10 +59,12 @@ def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
     return CollocationSweep(
         lanes=lanes,
         nodes=node_tables(shape.tableau, lanes),
+        guess=guess_tables(shape.tableau.c, lanes),
         points=point_tables(system, shape.tableau, shape.rule, lanes),
         kernel=_node_kernel(system),
         mass_entries=tuple(forms_of(system).lower_mass),
         ends=_printed_ends(shape.tableau, shape.rule, lanes),
+        hamiltonian=bool(problem.system.auxiliaries),
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.sweeps import NodeTables, PointTables
+from scvi_codegen.ir.curve_sweeps import NodeTables, PointTables
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.padding import guess_tables, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.padding import pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values
@@ -24,7 +24,6 @@ def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
         collocation=pad_matrix(tableau.A, lanes),
         end=pad_vector(tableau.b, lanes, repeat=True),
         mask=pad_vector((mp.one,) * size, lanes),
-        guess=guess_tables(tableau.c, lanes),
     )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from scvi_codegen.ir.control import Control, Ladder
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweeps import CurveSweep, SeparableSweep, Sweep
+from scvi_codegen.ir.sweep import Kept, Sweep
 from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 
 __all__ = ["control_of", "ladder_of"]
@@ -60,12 +60,12 @@ def _tables(
     ``ages``: the ratio of the last step to each of these, by which h a, where that is kept, is longer.
     """
     points = _doubles(sweep.guess.abscissae)
-    through = tuple(map(_doubles, sweep.product)) if isinstance(sweep, SeparableSweep) else ()
+    through = tuple(map(_doubles, sweep.guess_through))
     count = len(points)
     rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree)
     tables = []
     for k, ratio in enumerate(ratios):
-        scales = [ratio * age if isinstance(sweep, CurveSweep) else 1.0 for age in ages]
+        scales = [ratio * age if sweep.kept is Kept.ACCELERATIONS else 1.0 for age in ages]
         part = rows[k * count : (k + 1) * count]
         tables.append(
             [

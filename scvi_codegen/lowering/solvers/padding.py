@@ -7,7 +7,7 @@ Lagrangian, they are inside, and they never delay convergence.
 from __future__ import annotations
 
 from scvi_codegen.ir.numbers import Number, NumberTable, lower_matrix, lower_vector
-from scvi_codegen.ir.sweeps import GuessTables
+from scvi_codegen.ir.sweep import GuessTables
 from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 

@@ -2,7 +2,7 @@
 
 The order of the updates inside a sweep (accelerations, then the action along the new curve, then momentum, initial
 velocity and multipliers) makes it contract twice as fast as all at once. The equations, those of
-``methods/shooting.py`` in these unknowns, stand at :class:`scvi_codegen.ir.program.ShootingSweep`.
+``methods/shooting.py`` in these unknowns, stand at :class:`scvi_codegen.ir.curve_sweeps.ShootingSweep`.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.ir.curve_sweeps import ShootingSweep
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.sweeps import ShootingSweep
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shapes import ShotCurve
@@ -41,6 +41,7 @@ def shooting_sweep(problem: StepProblem) -> ShootingSweep | None:
     return ShootingSweep(
         lanes=lanes,
         nodes=node_tables(tableau, lanes),
+        guess=guess_tables(tableau.c, lanes),
         points=point_tables(system, tableau, rule, lanes),
         collocation_transposed=pad_matrix(transpose(tableau.A), lanes),
         position_transposed=pad_matrix(transpose(position), lanes),
