@@ -12,17 +12,11 @@
 
 enum {
   M = 1, /* coordinates */
-  SITES = 1, /* coordinates, then the components of other unknowns */
-  B = 2, /* unknowns a site */
-  N = 2, /* unknowns */
-  POINTS = 2, /* most points of a family, or blocks */
-  POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
-  MOST_ITERATIONS = INT_MAX, /* whatever the options say */
   MAX_ITERATIONS = 50, /* unless options say otherwise */
   BAND = 0, /* coordinates that meet are at most so many places apart */
   MASS_ENTRIES = 1, /* of the Legendre transform that are not zero */
   MEMORY = 1, /* numbers kept from step to step */
-  SCRATCH = 12 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
+  SCRATCH = 2 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
 };
 
 #include "support/double.h"
@@ -30,38 +24,9 @@ enum {
 #include "support/answers.h"
 #include "support/step.h"
 
-/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b]
- * v0 + MOMENTA[b] p0; h z_b is a length if MOVES[b]. */
-static const double END_POSITION[2] = {0.5, 0.5};
-static const double MOMENTUM_ROW[2] = {0.5, 0.5};
-static const double STRAIGHT[2] = {1.0, 1.0};
-static const double MOMENTA[2] = {0.0, 0.0};
-static const double MOVES[2] = {1.0, 1.0};
-static const double QUADRATURE_WEIGHT[2] = {0.5, 0.5};
-
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
-static const int PLACE[SITES] = {0};
+static const int PLACE[M] = {0};
 static const int MASS_ENTRY[1][2] = {{0, 0}};
-
-/* L_q and L_v at u = (q, v). Operations: 6 *, 1 neg, 1 sin. */
-static void quadrature_value(const double *u, double t, const double *parameters, double *value)
-{
-  (void)t;
-  value[0] = -(parameters[2] * parameters[1] * parameters[0] * sin(u[0]));
-  value[1] = parameters[0] * (parameters[1] * parameters[1]) * u[1];
-}
-
-/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 7 *, 1 cos, 2 neg, 1 sin. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *slope)
-{
-  (void)t;
-  const double w0 = parameters[2] * parameters[1] * parameters[0];
-  value[0] = -(w0 * sin(u[0]));
-  slope[0] = -(w0 * cos(u[0]));
-  const double w1 = parameters[0] * (parameters[1] * parameters[1]);
-  value[1] = w1 * u[1];
-  slope[1] = w1;
-}
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */
 static void legendre(const double *u, double t, const double *parameters, double *value, double *slope)
@@ -86,49 +51,6 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 #include "support/legendre.h"
 #include "support/lagrangian.h"
 #include "support/energies.h"
-#include "support/gather.h"
-#include "support/entry.h"
-
-/* Quadrature points, 2: u = (q, v) at each. */
-static void quadrature_points(const step_data *step, const double *z, double *u)
-{
-  const double h = step->h;
-  u[0] = step->q0[0] + (step->carry_q[0] + h * 0);
-  u[1] = z[0];
-  u[2] = step->q0[0] + (step->carry_q[0] + h * (0.5 * z[0] + 0.5 * z[1]));
-  u[3] = z[1];
-}
-
-/* The stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
- * cancellation; and the Jacobian, of the shape given, unless it is NULL. */
-static void evaluate(const step_data *step, const double *z, double *rows, double *size_p, double *size_q,
-    double *jacobian, const band *shape)
-{
-  const double h = step->h;
-  double u[4], value[4], slope[4];
-  quadrature_points(step, z, u);
-  for (int n = 0; n < 2; n++) {
-    if (jacobian)
-      quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, slope + n * 2);
-    else
-      quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
-  }
-
-  /* The equations, to be 0, where q1 = q0 + h sum_b END_POSITION[b] z_b. */
-  rows[0] = 0.5 * step->p0[0] + 0.5 * (0.5 * h * value[0]) - 0.5 * value[1];
-  rows[1] = 0.5 * step->p0[0] + 0.5 * (0.5 * h * value[0]) - 0.5 * value[3];
-  /* p1 - p0. */
-  rows[2] = 0.5 * h * value[0] + 0.5 * h * value[2];
-  size_p[0] = MATH(fabs)(step->p0[0]) + MATH(fabs)(0.5 * h * value[0]) + MATH(fabs)(0.5 * h * value[2]);
-  size_q[0] = MATH(fabs)(step->q0[0]) + MATH(fabs)(h * 0.5 * z[0]) + MATH(fabs)(h * 0.5 * z[1]);
-  if (!jacobian)
-    return;
-  memset(jacobian, 0, sizeof(double) * band_size(shape));
-  *entry(jacobian, shape, 0, 0, 0, 0) = -0.5 * slope[1];
-  *entry(jacobian, shape, 0, 1, 0, 1) = -0.5 * slope[3];
-}
-
-#include "support/newton.h"
 
 enum { KICKS = 2 };
 static const double KICK[2] = {0.5, 0.5};
@@ -155,24 +77,4 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/time.h"
 #include "support/even_time.h"
 #include "support/run.h"
-
-/* h^1 sum_n w_n lagrangian along the curve given by z. */
-static double quadrature_sum(const step_data *step, const double *z)
-{
-  const double h = step->h;
-  double *u = step->scratch, sum = 0;
-  quadrature_points(step, z, u);
-  for (int n = 0; n < 2; n++) {
-    double value[1];
-    lagrangian(u + n * 2, step->t, step->parameters, value);
-    sum += QUADRATURE_WEIGHT[n] * value[0];
-  }
-  return h * sum;
-}
-
-static double action_along(const step_data *step, const double *z)
-{
-  return quadrature_sum(step, z);
-}
-
-#include "support/discrete_legendre.h"
+#include "support/explicit_legendre.h"

@@ -198,7 +198,7 @@ def program_of(
     swept = lanes and solver in ("auto", "fixed-point") and splitting is None
     sweep = sweep_of(system, stages) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
-    newton = solver in ("auto", "newton") and (method.implicit or not splitting)
+    newton = solver in ("auto", "newton") and splitting is None
     tracked = all_symmetries(system, symmetries)
     return lower(
         system,

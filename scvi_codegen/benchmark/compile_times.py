@@ -39,6 +39,7 @@ COMPILED: Mapping[str, tuple[Callable[[], Written], str]] = {
     "chain of 256": (partial(chain, 256), "SVI(4)"),
     "chain of 1000": (partial(chain, 1000), "SVI(4)"),
     "Lennard-Jones 20": (partial(lennard_jones, 20), "StoermerVerlet()"),
+    "Lennard-Jones 50": (partial(lennard_jones, 50), "StoermerVerlet()"),
     "cloth 20 x 20": (partial(cloth, 20), "StoermerVerlet()"),
 }
 """System and method by name."""

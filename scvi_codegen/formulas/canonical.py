@@ -107,7 +107,7 @@ def _constant_problem(expression: Expr) -> str | None:
     pending = [expression]
     while pending:
         node = pending.pop()
-        if node.free_symbols:
+        if not node.is_number:
             pending.extend(argument for argument in node.args if argument.args)
         elif node.args:
             try:

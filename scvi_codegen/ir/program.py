@@ -60,7 +60,7 @@ class Program:
         coordinate_names, parameter_names, parameter_defaults: for people and for Python.
         sites: the coordinates, then the components of unknowns of other sizes.
         blocks: number of unknowns B at each site.
-        families: points and kernels.
+        families: points and kernels of the equations that Newton's iteration solves; none without it.
         places: (sites,) the place of each site in matrices, chosen so that those that meet are near each other.
         bandwidth: how many places they are apart at most.
         momentum_rows: (B,) coefficient of p0 in each row.
@@ -151,6 +151,8 @@ class Program:
     @property
     def action(self) -> bool:
         """Whether there is a discrete Lagrangian."""
+        if self.splitting:
+            return len(self.splitting.drifts) == 1
         return self.newton and self.sites == self.dimension and any(family.action for family in self.families)
 
     @property

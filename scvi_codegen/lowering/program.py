@@ -60,14 +60,15 @@ def lower(
         prefix: a C identifier.
         sweep: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.sweep_of`).
         splitting: the explicit solver that replaces both
-        (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`). newton: whether Newton's iteration is emitted;
-        with it the discrete Legendre transforms. symmetries: whose momentum maps are emitted.
+        (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
+        newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
+        symmetries: whose momentum maps are emitted.
     """
     m, sites = system.dimension, sites_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
     mass = forms_of(system).legendre_slopes
-    families = tuple(lowered_family(system, family, sites) for family in stages.families)
-    met = [*mass, *_meetings(families if newton else ())]
+    families = tuple(lowered_family(system, family, sites) for family in stages.families) if newton else ()
+    met = [*mass, *_meetings(families)]
     order = (*places([pair for pair in met if max(pair) < m], m), *range(m, sites.count))
     return Program(
         prefix=prefix,

@@ -60,6 +60,10 @@ TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", 
 PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
 
+CUT_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
+"""With -O3, for text with kernels cut into functions: these passes take gcc a tenth of its time and look for common
+parts, which were found before; steps take as long without them."""
+
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
 COMPILE_SECONDS = 600
@@ -264,13 +268,14 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     include = sysconfig.get_paths()["include"]
     python = [] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
     shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
+    passes = CUT_FLAGS if "-O3" in flags and any("support/parts.h" in each.files for each in source.sources) else ()
     wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
     parts = [each.prefix for each in source.sources]
     objects = ["-shared", *wanted, *python, *(f"{name}.o" for name in ("binding", *parts))]
     for define, libraries in _mathematics(flags):
         with ExitStack() as ended:
             for name in parts:
-                command = [*compiler, *shared, *flags, *define, *wanted, "-c", f"{name}.c"]
+                command = [*compiler, *shared, *flags, *passes, *define, *wanted, "-c", f"{name}.c"]
                 ended.enter_context(_finished(command, folder))
             if not (folder / "binding.c").exists():
                 _write_binding(source, folder)

@@ -11,6 +11,8 @@ import pytest
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
@@ -471,6 +473,34 @@ def test_the_two_point_form_walks_the_same_positions(sample, compiled, method):
     run = stepper.integrate(*state, h=0.1, steps=2, t=0.3)
     following = stepper.step_positions(run.q[0], run.q[1], 0.1, 0.3)
     assert following == pytest.approx(run.q[2], abs=1e-13)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        LagrangianSystem.from_text(name="L", coordinates=["x"], lagrangian="x_dot**2 - x**4/4 + x*cos(t)"),
+        HamiltonianSystem.from_text(
+            name="H", coordinates=["x"], momenta=["y"], hamiltonian="y**2/4 + x**4/4 - x*cos(t)"
+        ),
+    ],
+    ids=["lagrangian", "hamiltonian"],
+)
+def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(system):
+    stepper = compile_stepper(system, StoermerVerlet())
+    x, h, t = np.array([0.7, 0.75]), 0.1, np.array([0.3, 0.4])
+    v, force = (x[1] - x[0]) / h, np.cos(t) - x**3
+    action = h / 2 * np.sum(v**2 - x**4 / 4 + x * np.cos(t))
+    assert stepper.discrete_lagrangian(x[:1], x[1:], h, t[0]) == pytest.approx(action, rel=1e-14)
+    start, end = (
+        f(x[:1], x[1:], h, t[0])[1] for f in (stepper.discrete_legendre_minus, stepper.discrete_legendre_plus)
+    )
+    assert [*start, *end] == pytest.approx([2 * v - h / 2 * force[0], 2 * v + h / 2 * force[1]], rel=1e-14)
+    assert "newton" not in stepper.source.code
+
+
+def test_an_action_that_does_not_exist_is_an_error(compiled):
+    with pytest.raises(StepFailedError):
+        compiled("kepler", StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
 
 
 def test_methods_without_a_discrete_lagrangian_say_so(compiled):

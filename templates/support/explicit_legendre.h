@@ -1,0 +1,32 @@
+/* The discrete Lagrangian of a kick, a drift and a kick, and its Legendre transforms: the drift has the velocity
+ * (q1 - q0) / h, so that there is nothing to solve. Before it: splitting.h, energy. */
+
+SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
+    const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
+{
+  const real *ends[2] = {q0, q1};
+  real p[M], F[2][M], product = 0, sum = 0, energy;
+  (void)options;
+  if (report)
+    memset(report, 0, sizeof *report);
+  mass(NULL, t, parameters, p);
+  for (int i = 0; i < M; i++) {
+    const real v = (q1[i] - q0[i]) / h;
+    p[i] *= v;
+    product += p[i] * v;
+  }
+  for (int n = 0; n < 2; n++) {
+    const real then = t + KICK_ABSCISSA[n] * h;
+    const int status = NAME(energy)(then, ends[n], p, parameters, &energy, workspace);
+    if (status != OK)
+      return status;
+    force(ends[n], then, parameters, F[n]);
+    sum += KICK[n] * (product - energy);
+  }
+  for (int i = 0; i < M; i++) {
+    p0[i] = p[i] - h * KICK[0] * F[0][i];
+    p1[i] = p[i] + h * KICK[1] * F[1][i];
+  }
+  *action = h * sum;
+  return all_finite(p0, M) && all_finite(p1, M) && all_finite(action, 1) ? OK : NOT_FINITE;
+}
