@@ -31,6 +31,7 @@ _HOMES = {
     "mechanics.coordinate_change": ("change_coordinates",),
     "derivation.equations": ("StepEquations", "derive"),
     "errors": (
+        "ArgumentError",
         "BuildError",
         "CacheWarning",
         "EventError",
@@ -63,6 +64,7 @@ _HOMES = {
         "RungeKutta",
         "SpectralCollocation",
         "StoermerVerlet",
+        "as_method",
     ),
     "models.model": ("Model",),
     "models.model_file": ("load_model", "save_model"),

@@ -8,6 +8,7 @@ from scvi_codegen.compiler import compile_stepper as compile_stepper
 from scvi_codegen.compiler import generate_source as generate_source
 from scvi_codegen.derivation.equations import StepEquations as StepEquations
 from scvi_codegen.derivation.equations import derive as derive
+from scvi_codegen.errors import ArgumentError as ArgumentError
 from scvi_codegen.errors import BuildError as BuildError
 from scvi_codegen.errors import CacheWarning as CacheWarning
 from scvi_codegen.errors import EventError as EventError
@@ -53,6 +54,7 @@ from scvi_codegen.methods import RadauIIA as RadauIIA
 from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
+from scvi_codegen.methods import as_method as as_method
 from scvi_codegen.models.model import Model as Model
 from scvi_codegen.models.model_file import load_model as load_model
 from scvi_codegen.models.model_file import save_model as save_model

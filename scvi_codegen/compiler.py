@@ -28,12 +28,13 @@ from functools import cache
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.program import Program
+from scvi_codegen.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
-from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
@@ -58,6 +59,7 @@ C_HEADERS = frozenset(
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
+@takes(system=SYSTEM, solver=TEXT, flags=TEXTS, prefix=TEXT, symmetries=SYMMETRIES)
 def compile_stepper(
     system: MechanicalSystem,
     method: Method | str,
@@ -81,8 +83,7 @@ def compile_stepper(
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
         symmetries: known beside those that are found
-        (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`): their momentum
-            maps are tracked, too.
+            (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`): their momentum maps are tracked, too.
         events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
 
     Raises:
@@ -133,6 +134,7 @@ def _text_of(source: Source | None) -> str:
     return "" if source is None else source.to_json()
 
 
+@takes(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
 def generate_source(
     system: MechanicalSystem,
     method: Method | str,

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 __all__ = [
+    "ArgumentError",
     "BuildError",
     "CacheWarning",
     "EventError",
@@ -34,6 +35,10 @@ def closest(name: str, known: Iterable[str]) -> str:
 
 class ScviCodegenError(Exception):
     """Base of all errors raised on purpose by this package."""
+
+
+class ArgumentError(ScviCodegenError, TypeError):
+    """An argument is not of the kind that a public function takes."""
 
 
 class SystemDefinitionError(ScviCodegenError, ValueError):

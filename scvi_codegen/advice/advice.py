@@ -22,9 +22,10 @@ from scvi_codegen.advice.pilot import STEEP, Pilot, launch
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.kinds import SWITCH, TEXT, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
@@ -101,9 +102,10 @@ class Advice:
         return card(f"Advice: {self.method.title}", facts, pilots)
 
 
+@takes(system=SYSTEM, degree=SWITCH, solver=TEXT)
 def advise(
     system: MechanicalSystem,
-    method: Method,
+    method: Method | str,
     q: ArrayLike,
     p: ArrayLike,
     span: float,
@@ -125,7 +127,7 @@ def advise(
 
     Args:
         system: what moves.
-        method: how its motion is discretised.
+        method: how its motion is discretised, or its name, ``"svi:8"``.
         q, p: (m,) initial positions and momenta.
         span: length of time of the run, negative to go back.
         tolerance: wanted error |q - q_exact| / |q| at the end; half of it is aimed at.
@@ -144,6 +146,7 @@ def advise(
         MethodError: if the degree is to be chosen of a method that has none.
         BuildError: without a C compiler.
     """
+    method = as_method(method)
     if system.clock is not None:
         raise MethodError(f"the step of '{system.name}' is one of transformed time, of which there is no advice: try h")
     length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")

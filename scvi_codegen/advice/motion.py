@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.kinds import SWITCH, of, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import SVI, Method
+from scvi_codegen.methods import SVI, Method, as_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.dense_output import times_of_run
@@ -60,12 +61,14 @@ class Motion:
         return self.status >= 0
 
 
+@takes(system=of("a system or its stepper", MechanicalSystem, Stepper), dense_output=SWITCH)
 def solve_motion(
     system: MechanicalSystem | Stepper,
     t_span: Sequence[float],
     y0: ArrayLike,
     *,
-    method: Method | None = None,
+    velocity: ArrayLike | None = None,
+    method: Method | str | None = None,
     h: float | None = None,
     tolerance: float = 1e-9,
     rtol: float | None = None,
@@ -73,7 +76,11 @@ def solve_motion(
     dense_output: bool = False,
     events: EventLike | Sequence[EventLike] | None = None,
     parameters: Mapping[str, float] | Sequence[float] | None = None,
+    args: Sequence[float] | None = None,
     options: SolverOptions | None = None,
+    atol: float | None = None,
+    max_step: float | None = None,
+    first_step: float | None = None,
 ) -> Motion:
     """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, for a run backward).
 
@@ -82,8 +89,9 @@ def solve_motion(
     Args:
         system: what moves; or its compiled stepper, which takes the place of ``method`` and needs ``h`` or ``rtol``.
         t_span: two times.
-        y0: (2 m,) initial positions, then momenta (:meth:`Stepper.momentum` gives them from velocities).
-        method: by default ``SVI(8)``.
+        y0: (2 m,) initial positions, then momenta; (m,) positions alone beside ``velocity``.
+        velocity: (m,) initial velocities, in place of momenta.
+        method: or its name, ``"svi:6"``; by default ``SVI(8)``.
         h: longest step, taken a little shorter so that whole steps fill the span; by default :func:`advise` chooses it.
         tolerance: the error |q - q_exact| / |q| at the end that it then aims at.
         rtol: the relative error of the end of each step, whose length is then its own; leave out ``h``.
@@ -91,19 +99,29 @@ def solve_motion(
         dense_output: whether ``sol`` is wanted, for which all steps are kept.
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
         parameters, options: as of :meth:`Stepper.integrate`.
+        args: as of ``solve_ivp``: all parameters in order, in place of ``parameters``.
+        atol, max_step, first_step: of ``solve_ivp`` alone; the error says what to give instead.
 
     Raises:
         StateError, EventError: on wrong shapes, names or numbers.
     """
+    _refuse({"atol": atol, "max_step": max_step, "first_step": first_step})
+    if args is not None and parameters is not None:
+        raise StateError("args are the parameters in order: give args or parameters, not both")
+    parameters = parameters if args is None else args
     start, end = _span(t_span)
-    q, p = _halves(y0)
+    q: ArrayLike
+    given: ArrayLike | None
+    q, given = (y0, None) if velocity is not None else _halves(y0)
     if isinstance(system, Stepper):
         if method is not None or (h is None and rtol is None):
             raise StateError("a compiled stepper has its method, and its step h, or rtol, must be given")
         stepper = system
+        p = stepper.momenta_given(q, given, velocity, start, parameters)
     else:
-        method = method or SVI(8)
+        method = SVI(8) if method is None else as_method(method)
         stepper = compile_stepper(system, method)
+        p = stepper.momenta_given(q, given, velocity, start, parameters)
         if h is None and rtol is None:
             advice = advise(
                 system, method, q, p, end - start, tolerance, t=start, parameters=parameters, options=options
@@ -128,6 +146,20 @@ def solve_motion(
     if ended_by is not None and failure is None:
         status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
+
+
+INSTEAD = {
+    "atol": "the error of a step is relative to the size of its state: give rtol",
+    "max_step": "steps choose their length with rtol, or all have one: give h, the longest that may be",
+    "first_step": "the first step chooses its length like the others: give rtol, or h for steps of one length",
+}
+"""What serves in place of an argument of ``solve_ivp`` that has no meaning here."""
+
+
+def _refuse(given: Mapping[str, float | None]) -> None:
+    for name, value in given.items():
+        if value is not None:
+            raise StateError(f"solve_motion has no {name}={value!r}: {INSTEAD[name]}")
 
 
 def _steps(stepper: Stepper, start: float, end: float, h: float | None, rtol: float | None) -> dict[str, Any]:

@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.methods import METHODS
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import catalogue_model, load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "Choices", "model_arguments", "read_model"]
+__all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "Choices", "complete_model", "model_arguments", "read_model"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -106,8 +108,24 @@ def _option(*names: str, **settings: Any) -> Callable[[Command], Command]:
     return click.option(*names, **settings)
 
 
+def complete_method(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of methods, for a shell."""
+    return [CompletionItem(name) for name in METHODS if name.startswith(incomplete)]
+
+
+def complete_model(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of the catalogue, and files, for a shell."""
+    names = [CompletionItem(name) for name in PROBLEMS if name.startswith(incomplete)]
+    return [*names, CompletionItem(incomplete, type="file")]
+
+
 METHOD_OPTIONS = (
-    _option("--method", metavar="NAME", help="Method: svi, scvi, sc, gauss, ... (see 'scvi-codegen methods')."),
+    _option(
+        "--method",
+        metavar="NAME",
+        shell_complete=complete_method,
+        help="Method: svi, svi:6, scvi, sc, gauss, ... (see 'scvi-codegen methods').",
+    ),
     _option("--degree", type=int, metavar="N", help="Degree of the trial curve (svi, scvi, sc)."),
     _option("--stages", type=int, metavar="N", help="Number of stages (gauss, radau-iia, lobatto-iiia, ...)."),
     _option("--order", type=int, metavar="N", help="Order of a composition of Stoermer-Verlet: 2, 8 or 10."),
@@ -163,7 +181,12 @@ def model_arguments(command: Command, *, required: bool = True) -> Command:
     """Give a command the argument MODEL and the options of :class:`Choices`."""
     for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
         command = option(command)
-    return click.argument("model_name", metavar="MODEL" if required else "[MODEL]", required=required)(command)
+    return click.argument(
+        "model_name",
+        metavar="MODEL" if required else "[MODEL]",
+        required=required,
+        shell_complete=complete_model,
+    )(command)
 
 
 def read_model(name: str, choices: Choices) -> Model:

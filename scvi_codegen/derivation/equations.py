@@ -25,8 +25,10 @@ from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.kinds import SWITCH, takes
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.methods import as_method
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
@@ -152,14 +154,17 @@ class StepEquations:
         return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
 
 
-def derive(system: MechanicalSystem, method: Method, *, radicals: bool = False) -> StepEquations:
+@takes(system=SYSTEM, radicals=SWITCH)
+def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations:
     """The closed form of one step as the paper writes it.
 
     Args:
         system: the Lagrangian.
-        method: SVI: (27); SCVI: (34), with its multipliers unless as printed; SC: (18), (21); Runge-Kutta: (22).
+        method: or its name. SVI: (27); SCVI: (34), with its multipliers unless as printed; SC: (18), (21); Runge-Kutta:
+            (22).
         radicals: replace table entries by radicals where they have a short form.
     """
+    method = as_method(method)
     check_regular(method, system)
     stages = with_auxiliaries(system, method.paper_form(system))
     writer = _Writer(system, stages)

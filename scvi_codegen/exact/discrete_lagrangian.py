@@ -20,6 +20,7 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
+from scvi_codegen.kinds import MAPPING, NUMBERS, Kind, of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import Number, Vector, mp
 
@@ -33,6 +34,8 @@ MOST_STRAIGHT = 2
 """Pieces with which a straight line is tried as first guess; more have not helped."""
 
 Values = Mapping[str, Any] | Sequence[Any] | None
+LAGRANGIAN = of("a LagrangianSystem", LagrangianSystem)
+VALUES = Kind("values by name or a list of all", lambda value: MAPPING.holds(value) or NUMBERS.holds(value))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +61,7 @@ class ExactStep:
     error: Number
 
 
+@takes(system=LAGRANGIAN, parameters=VALUES)
 def exact_discrete_lagrangian(
     system: LagrangianSystem,
     q0: Sequence[Any],
@@ -111,6 +115,7 @@ def exact_discrete_lagrangian(
     return problem.answer(solve, f"no trajectory from q0 = {_shown(start)} to q1 = {_shown(end)} was found: {hint}")
 
 
+@takes(system=LAGRANGIAN, parameters=VALUES)
 def exact_map(
     system: LagrangianSystem,
     q0: Sequence[Any],

@@ -21,6 +21,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation
+from scvi_codegen.kinds import MAPPING, NAMES, TEXT, of, takes
 from scvi_codegen.mechanics.forces import forces_by_coordinate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
@@ -61,6 +62,7 @@ class HamiltonianSystem(MechanicalSystem):
         self._check("Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
+    @takes(SystemDefinitionError, name=TEXT, coordinates=NAMES, hamiltonian=TEXT, momenta=NAMES, parameters=MAPPING)
     def from_text(
         cls,
         *,
@@ -86,9 +88,6 @@ class HamiltonianSystem(MechanicalSystem):
         ... ).lagrangian
         -p**2/2 + p*q_dot + cos(q)
         """
-        for what, given in (("coordinates", coordinates), ("momenta", momenta)):
-            if isinstance(given, str):
-                raise SystemDefinitionError(f"{what} is a sequence of names: write ['{given}']")
         names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
         values = dict(parameters or {})
         check_names(coordinates, tuple(values), names)
@@ -177,6 +176,7 @@ class HamiltonianSystem(MechanicalSystem):
         return rf"$\displaystyle H = {sympy.latex(self.hamiltonian)}$"
 
 
+@takes(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)
 def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = None) -> HamiltonianSystem:
     """The Hamiltonian p . v - L of a Lagrangian, v expressed by p = dL/dv (paper, section 1.1).
 
@@ -193,6 +193,10 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     k*x**2/2 + p_x**2/(2*m)
     """
     names = _default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
+    if len(names) != system.dimension:
+        raise SystemDefinitionError(
+            f"there are {system.dimension} coordinates, but {len(names)} momenta: list one each"
+        )
     symbols = tuple(symbol(name) for name in names)
     hamiltonian = _legendre_dual(system, system.velocities, symbols)
     velocities = dict(zip(system.velocities, _slopes(hamiltonian, symbols), strict=True))
@@ -209,6 +213,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     )
 
 
+@takes(system=of("a HamiltonianSystem", HamiltonianSystem))
 @lru_cache(maxsize=64)
 def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
     """The Lagrangian p . v - H of a Hamiltonian, p expressed by v = dH/dp (paper, section 1.1).

@@ -13,6 +13,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.formulas.translation import Translation
+from scvi_codegen.kinds import MAPPING, NAMES, TEXT, takes
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate, generalised_forces
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -62,6 +63,15 @@ class LagrangianSystem(MechanicalSystem):
         return self.lagrangian
 
     @classmethod
+    @takes(
+        SystemDefinitionError,
+        name=TEXT,
+        coordinates=NAMES,
+        lagrangian=TEXT,
+        parameters=MAPPING,
+        forces=MAPPING,
+        dissipation=TEXT,
+    )
     def from_text(
         cls,
         *,
@@ -88,8 +98,6 @@ class LagrangianSystem(MechanicalSystem):
         >>> oscillator.lagrangian, oscillator.forces
         (-k*x**2/2 + m*x_dot**2/2, (-c*x_dot + cos(t),))
         """
-        if isinstance(coordinates, str):
-            raise SystemDefinitionError(f"coordinates is a sequence of names: write ['{coordinates}']")
         values = dict(parameters or {})
         check_names(coordinates, tuple(values))
         velocities = [coordinate + DOT for coordinate in coordinates]

@@ -23,10 +23,11 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.kinds import takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.monitors import monitor_function
-from scvi_codegen.mechanics.system import Clock, MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, Clock, MechanicalSystem
 
 __all__ = ["reparametrise"]
 
@@ -34,6 +35,7 @@ ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
 """Of the parameter that is the energy: the first that is free."""
 
 
+@takes(system=SYSTEM)
 def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSystem:
     """The same motion in a time tau with dt = g dtau.
 

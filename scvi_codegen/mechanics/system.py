@@ -32,8 +32,9 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.kinds import of
 
-__all__ = ["Clock", "MechanicalSystem", "named_parameters"]
+__all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
 
 MOST_OPERATIONS = 200
 """Of a formula that a notebook shows."""
@@ -232,3 +233,7 @@ def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[st
     if len(given) < len(parameters or {}):
         raise SystemDefinitionError("two parameters have the same name: rename one of them")
     return given
+
+
+SYSTEM = of("a system, a LagrangianSystem or HamiltonianSystem", MechanicalSystem)
+"""For :func:`~scvi_codegen.kinds.takes`."""

@@ -47,6 +47,8 @@ __all__ = [
     "StoermerVerlet",
     "as_method",
     "method_from_specification",
+    "sized",
+    "specification_of",
 ]
 
 METHODS: dict[str, Callable[..., Method]] = {
@@ -86,14 +88,32 @@ def as_method(method: Method | str) -> Method:
         return method
     if not isinstance(method, str):
         raise MethodError(f"a method is wanted, as SVI(8), or a name such as 'svi:8', not {method!r}")
-    name, colon, number = method.partition(":")
-    size = next((argument for argument in SIZES if argument in ARGUMENTS.get(name, ())), None)
+    return method_from_specification(sized(specification_of(method)))
+
+
+def specification_of(name: str) -> dict[str, Any]:
+    """What a name says of a method: ``{"method": "svi", "degree": 6}`` of ``"svi:6"``.
+
+    Raises:
+        MethodError: for a number that is none or that the method does not take.
+    """
+    method, colon, number = name.partition(":")
+    size = _size_of(method)
     if colon and not (size and number.isascii() and number.isdigit()):
-        raise MethodError(f"there is no method {method!r}: write svi, svi:6, gauss:3, stoermer-verlet, ..")
-    specification: dict[str, Any] = {"method": name}
-    if size and (number or size in REQUIRED[name]):
-        specification[size] = int(number or DEFAULT_SIZE)
-    return method_from_specification(specification)
+        raise MethodError(f"there is no method {name!r}: write svi, svi:6, gauss:3, stoermer-verlet, ..")
+    return {"method": method} | ({size: int(number)} if size and colon else {})
+
+
+def sized(specification: Specification) -> Specification:
+    """With the default degree, number of stages or order where a method needs one that is not given."""
+    name = str(specification.get("method"))
+    size = _size_of(name)
+    needed = size is not None and size in REQUIRED[name]
+    return {size: DEFAULT_SIZE, **specification} if needed and size else specification
+
+
+def _size_of(name: str) -> str | None:
+    return next((argument for argument in SIZES if argument in ARGUMENTS.get(name, ())), None)
 
 
 def method_from_specification(specification: Specification) -> Method:

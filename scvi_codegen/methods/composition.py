@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
@@ -74,7 +75,7 @@ class Composition(Method):
     composition_order: int
 
     def __post_init__(self) -> None:
-        if self.composition_order not in FIRST_HALVES:
+        if checked_count(self.composition_order, "the order", least=2, error=MethodError) not in FIRST_HALVES:
             raise MethodError(f"there are compositions of order 2, 8 and 10, not {self.composition_order!r}")
 
     @classmethod

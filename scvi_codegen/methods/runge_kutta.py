@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
+from scvi_codegen.kinds import NUMBERS, check_kind, of, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import position_system
 from scvi_codegen.methods.exactness import Exactness
@@ -75,6 +76,7 @@ class RungeKutta(Method):
     form: str = "phase-space"
 
     def __post_init__(self) -> None:
+        check_kind(of("a tableau", Tableau), self.tableau, "tableau", MethodError)
         check_form(self.form)
 
     @property
@@ -225,6 +227,7 @@ def check_form(form: str) -> None:
         raise MethodError(f"form must be 'phase-space' or 'position', not {form!r}")
 
 
+@takes(MethodError, abscissae=NUMBERS)
 def CollocationRK(abscissae: Sequence[float], *, form: str = "phase-space") -> RungeKutta:
     """Collocation Runge-Kutta method (22)-(23) on any distinct abscissae c_1 < .. < c_s, usually in [0, 1]."""
     return RungeKutta(tableaux.collocation_tableau(tuple(abscissae)), form)

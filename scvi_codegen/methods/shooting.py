@@ -21,6 +21,7 @@ from typing import Any
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
+from scvi_codegen.kinds import NUMBERS, check_kind
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.exactness import Exactness
@@ -211,6 +212,7 @@ def _resolve_abscissae(abscissae: Sequence[Any] | str, degree: int) -> Vector | 
                 f"there are no abscissae called {abscissae!r}: give {', '.join(COLLOCATION_FAMILIES)}, or numbers"
             )
         return abscissae
+    check_kind(NUMBERS, abscissae, "abscissae", MethodError)
     numbers = tuple(collocation_tableau(tuple(abscissae)).c)
     if len(numbers) != degree:
         raise MethodError(f"a curve of degree {degree} has {degree} abscissae, not {len(numbers)}")

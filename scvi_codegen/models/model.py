@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import Method
+from scvi_codegen.kinds import check_kind
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import Problem
 
@@ -33,7 +34,7 @@ class Model:
 
     Attributes:
         system: what moves, with the parameter values of the run as its defaults.
-        method: how its motion is discretised.
+        method: how its motion is discretised; a name, ``"svi:8"``, becomes the method.
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
@@ -62,6 +63,8 @@ class Model:
     t: float = 0.0
 
     def __post_init__(self) -> None:
+        check_kind(SYSTEM, self.system, "system", ModelFileError)
+        object.__setattr__(self, "method", as_method(self.method))
         _check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
         _check_one_of("h (step)", self.h, "tolerance", self.tolerance)
         _check_one_of("span", self.span, "steps", self.steps)

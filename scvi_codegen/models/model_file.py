@@ -58,10 +58,11 @@ from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification
+from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD, Model, check_length, real
 from scvi_codegen.models.problems import Problem, problem
 
@@ -85,6 +86,7 @@ SHORT_VECTOR = 4
 TEXT_WIDTH = 100
 
 
+@takes(path=PATH)
 def load_model(path: str | os.PathLike[str], given: Document | None = None) -> Model:
     """Read a model file, with the sections ``given`` laid over its own.
 
@@ -103,6 +105,7 @@ def load_model(path: str | os.PathLike[str], given: Document | None = None) -> M
         raise ModelFileError(f"{path}: {error}") from error
 
 
+@takes(model=of("a Model", Model), path=PATH)
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write a model file, whole or not at all; reading it gives an equal model.
 
@@ -190,8 +193,9 @@ def _read_model(document: Document, given: Document) -> Model:
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
         document = _laid_over(_motion(Model.from_problem(entry), names), document)
-    base = document.get("method", DEFAULT_METHOD.specification())
-    document = {**_laid_over(document, given), "method": _changed_method(base, given.get("method", {}))}
+    base = _spelt_out(document.get("method", DEFAULT_METHOD.specification()))
+    chosen = _changed_method(base, _spelt_out(given.get("method", {})))
+    document = {**_laid_over(document, given), "method": chosen}
     if entry is None:
         _check_complete(document)
         _check_used(document, given.get("parameters", {}))
@@ -210,6 +214,18 @@ def _laid_over(below: Document, above: Document) -> dict[str, Section]:
     return document
 
 
+def _spelt_out(section: Section) -> Section:
+    """A method whose name has its degree, ``svi:6``, with both apart."""
+    name = section.get("method")
+    if not isinstance(name, str) or ":" not in name:
+        return section
+    spelt = _in_section("[method]", lambda: specification_of(name))
+    for key, value in spelt.items():
+        if key != "method" and section.get(key, value) != value:
+            raise ModelFileError(f"[method] {name} says {key} {value}, {key} = {section[key]!r} another")
+    return {**section, **spelt}
+
+
 def _changed_method(base: Section, given: Section) -> Section:
     """A method with some arguments changed; another method takes over what it has in common with it."""
     if not given:
@@ -223,7 +239,7 @@ def _changed_method(base: Section, given: Section) -> Section:
         kept = {key: value for key, value in kept.items() if key in INHERITED and key in accepted}
     if {"abscissae", "space"} & given.keys():
         kept.pop("nodes", None)  # they say in other words where the curve is given
-    return {**kept, **given}
+    return sized({**kept, **given}) if "method" in given else {**kept, **given}
 
 
 def _check_complete(document: Document) -> None:

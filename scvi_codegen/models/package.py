@@ -27,6 +27,7 @@ from typing import IO, TYPE_CHECKING
 
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.kinds import PATH, SWITCH, TEXT, Kind, takes
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -49,6 +50,10 @@ OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"
 """Folder names that would collide with ``main.c`` or hide what the package imports."""
 
 
+MODEL = Kind("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
+
+
+@takes(model=MODEL, folder=PATH, solver=TEXT, force=SWITCH)
 def generate_package(
     model: Model,
     folder: str | os.PathLike[str],
@@ -94,6 +99,7 @@ def generate_package(
     return target
 
 
+@takes(folder=PATH)
 def load_package(folder: str | os.PathLike[str]) -> Stepper:
     """The stepper of a generated folder, compiled from the C text in it (from the cache if that is unchanged).
 

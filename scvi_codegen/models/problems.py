@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.kinds import TEXT, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.systems import (
     cart_pole,
@@ -262,6 +263,7 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
 """The catalogue: name on the command line -> function that builds the entry."""
 
 
+@takes(name=TEXT)
 def problem(name: str) -> Problem:
     """Build an entry of the catalogue; a chain takes a size, as in ``fput-chain:64``.
 

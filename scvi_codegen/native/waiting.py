@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["told_to", "waiting_for"]
+__all__ = ["tell", "told_to", "waiting_for"]
 
 PATIENCE_SECONDS = 2.0
 
@@ -20,6 +20,11 @@ def _tell_the_terminal(what: str) -> None:
 
 
 _listener: ContextVar[Callable[[str], None]] = ContextVar("listener", default=_tell_the_terminal)
+
+
+def tell(what: str) -> None:
+    """Say it now, where a person sees it."""
+    _listener.get()(what)
 
 
 @contextmanager

@@ -13,8 +13,9 @@ import numpy as np
 
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
+from scvi_codegen.kinds import FUNCTION, PATH, REAL, takes
 from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
-from scvi_codegen.pictures.motion import Array, DrawnMotion
+from scvi_codegen.pictures.motion import MOTION, Array, DrawnMotion
 from scvi_codegen.pictures.shapes import MovingPoints, shape_of
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ SIZE = 4.8
 """Inches."""
 
 
+@takes(trajectory=MOTION, path=PATH, seconds=REAL, positions=FUNCTION)
 def animate(
     trajectory: DrawnMotion,
     path: str | os.PathLike[str] | None = None,

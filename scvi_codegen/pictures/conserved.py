@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.kinds import CANVAS, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel
-from scvi_codegen.pictures.motion import Array, DrawnMotion, Motions, several
+from scvi_codegen.pictures.motion import MOTION, MOTIONS, Array, DrawnMotion, Motions, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,6 +20,7 @@ __all__ = ["draw_energy_error", "largest_in_bins", "plot_energy", "plot_momentum
 BINS = 600
 
 
+@takes(trajectories=MOTIONS, path=PATH, ax=CANVAS)
 def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the energy error |H - H_0| / |H_0| over time (not divided where H_0 = 0), a colour a trajectory.
 
@@ -36,6 +38,7 @@ def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = Non
     return drawn
 
 
+@takes(trajectory=MOTION, path=PATH, ax=CANVAS)
 def plot_momentum_maps(
     trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.kinds import Kind
 
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface
 
-__all__ = ["Array", "DrawnMotion", "Motions", "Mover", "column", "several"]
+__all__ = ["MOTION", "MOTIONS", "Array", "DrawnMotion", "Motions", "Mover", "column", "several"]
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -56,6 +57,12 @@ class DrawnMotion(Protocol):
 
 Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]
 """One, or several of the same system."""
+
+MOTION = Kind("a trajectory", lambda value: hasattr(value, "stepper") and hasattr(value, "q"))
+MOTIONS = Kind(
+    "a trajectory or a list of them",
+    lambda value: MOTION.holds(value) or (isinstance(value, Sequence) and all(map(MOTION.holds, value))),
+)
 
 
 def several(motions: Motions) -> Sequence[DrawnMotion]:

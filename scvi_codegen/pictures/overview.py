@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from scvi_codegen.kinds import PATH, takes
 from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.pictures.canvas import COLORS, check_plot_path, new_figure, plain, save, style
 from scvi_codegen.pictures.conserved import draw_energy_error
-from scvi_codegen.pictures.motion import DrawnMotion
+from scvi_codegen.pictures.motion import MOTION, DrawnMotion
 from scvi_codegen.pictures.paths import draw_paths, path_panels
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_trajectory"]
 
 
+@takes(trajectory=MOTION, path=PATH)
 def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
     """Draw the motion on the left, the relative energy error over time on the right.
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scvi_codegen.kinds import CANVAS, NAMES, PATH, takes
 from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.motion import Array, DrawnMotion, Motions, column, several
+from scvi_codegen.pictures.motion import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,6 +23,7 @@ MOST_POINTS = 20_000
 MOST_CURVES = 6
 
 
+@takes(trajectory=MOTION, path=PATH, ax=CANVAS)
 def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw where a trajectory goes: orbits, a plane of coordinates, the phase plane of one, or all over time.
 
@@ -42,6 +44,7 @@ def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = N
     return drawn
 
 
+@takes(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
 def plot_phase(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,

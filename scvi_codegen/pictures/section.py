@@ -6,8 +6,9 @@ import os
 from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.kinds import CANVAS, NAMES, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.motion import Array, DrawnMotion, Motions, column, several
+from scvi_codegen.pictures.motion import MOTIONS, Array, DrawnMotion, Motions, column, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +19,7 @@ FEW_POINTS = 2000
 WAY = {1: ", rising", 0: "", -1: ", falling"}
 
 
+@takes(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
 def plot_section(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters
+from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 
@@ -38,8 +38,9 @@ WORKER_SECONDS = 60
 def integrate_ensemble(
     stepper: Stepper,
     q: ArrayLike,
-    p: ArrayLike,
+    p: ArrayLike | None = None,
     *,
+    velocity: ArrayLike | None = None,
     h: float | None = None,
     steps: int | None = None,
     t_end: ArrayLike | None = None,
@@ -58,6 +59,7 @@ def integrate_ensemble(
     Args:
         stepper: compiled here; its source is compiled again by each worker, which needs this package and a C compiler.
         q, p: (k, m) initial positions and momenta.
+        velocity: (k, m) initial velocities, in place of p.
         h, steps, t_end, tolerance, every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
         progress: called now and then with the number of trajectories done.
         address: of a scheduler, as in ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
@@ -71,6 +73,7 @@ def integrate_ensemble(
         StateError: on wrong shapes, names or numbers, before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
+    p = momenta_of_each(stepper, q, p, velocity, t, parameters)
     common: dict[str, Any] = {"every": every, "t": t, "parameters": parameters, "options": options}
     work: Ensemble | EnsembleToEnds
     if h is None and steps is None and t_end is not None:

@@ -39,6 +39,7 @@ __all__ = [
     "LaneBlock",
     "checked_ensemble",
     "integrate_ensemble",
+    "momenta_of_each",
     "parameters_of_each",
 ]
 
@@ -327,6 +328,26 @@ def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[A
     if positions.shape != momenta.shape:
         raise StateError(f"q has shape {positions.shape}, p {momenta.shape}")
     return positions, momenta
+
+
+def momenta_of_each(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    velocity: ArrayLike | None,
+    t: float,
+    parameters: EnsembleParameters,
+) -> ArrayLike:
+    """The momenta of states that are given by one of p and velocity, each with its parameters."""
+    name, given = stepper.momentum_or_velocity(p, velocity)
+    if name == "p":
+        return given
+    at, positions, velocities = checked_number(t, "the time t"), _states(stepper, q, "q"), _states(stepper, given, name)
+    if positions.shape != velocities.shape:
+        raise StateError(f"q has shape {positions.shape}, velocity {velocities.shape}")
+    values = parameters_of_each(stepper, parameters, len(positions))
+    states = zip(positions, velocities, values, strict=True)
+    return np.array([stepper.momentum(position, v, at, value) for position, v, value in states])
 
 
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:

@@ -15,6 +15,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled import Labelled, checked_units, to_dataset
+from scvi_codegen.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
@@ -118,6 +119,7 @@ class EnsembleTrajectory:
                 continue
         return values, sizes
 
+    @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv`` (a line a state: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
 

@@ -41,6 +41,8 @@ class Event:
     terminal: bool | int = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.function, str) and not hasattr(self.function, "free_symbols"):
+            raise EventError(f"the function of an event is text or a SymPy expression, not {self.function!r}")
         if self.direction not in DIRECTIONS:
             raise EventError(f"the direction of an event is 1, -1 or 0, not {self.direction!r}")
         checked_count(int(self.terminal) if isinstance(self.terminal, bool) else self.terminal, "terminal", least=0)

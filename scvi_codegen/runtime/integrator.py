@@ -120,12 +120,20 @@ class Integrator(CompiledMethod):
         Raises:
             StateError: if both or none are given.
         """
-        if (p is None) == (velocity is None):
-            raise StateError(f"give p or velocity, {'one' if p is None else 'not both'} of them, beside q")
-        if velocity is None:
-            assert p is not None
-            return p
-        return self._transform("momentum", q, velocity, t, parameters, "velocity")
+        name, given = self.momentum_or_velocity(p, velocity)
+        return given if name == "p" else self._transform("momentum", q, given, t, parameters, name)
+
+    def momentum_or_velocity(self, p: ArrayLike | None, velocity: ArrayLike | None) -> tuple[str, ArrayLike]:
+        """The one of both that is given, with its name.
+
+        Raises:
+            StateError: if both or none are given.
+        """
+        if p is not None and velocity is None:
+            return "p", p
+        if velocity is not None and p is None:
+            return "velocity", velocity
+        raise StateError(f"give p or velocity, {'one' if p is None else 'not both'} of them, beside q")
 
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Energy p.v - L of the system itself: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
-from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector
 from scvi_codegen.runtime.integrator import Integrator
@@ -64,7 +64,7 @@ class Memory:
             binding.pointer(p0),
         )
         goal = h if isinstance(h, Goal) else None
-        return cls(stepper, memory, stepper.parameters_at(q0, p0, parameters), options, goal)
+        return cls(stepper, memory, stepper.parameters_at(q0, p0, parameters), checked_options(options), goal)
 
     @classmethod
     def restored(
@@ -93,7 +93,7 @@ class Memory:
             )
         if not stepper.has_energy(parameters):
             raise StateError("a saved run in transformed time goes on with its own energy: give its run.parameters")
-        return cls(stepper, memory, checked_parameters(stepper.interface, parameters), options, goal)
+        return cls(stepper, memory, checked_parameters(stepper.interface, parameters), checked_options(options), goal)
 
     @property
     def h(self) -> float:

@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.kinds import FUNCTION, takes
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.ensemble import integrate_ensemble
+from scvi_codegen.runtime.ensemble import integrate_ensemble, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
@@ -41,6 +42,7 @@ class Stepper(Integrator):
         texts = (self.ensemble, self._controlled())
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events))
 
+    @takes(StateError, progress=FUNCTION)
     def integrate(
         self,
         q: ArrayLike,
@@ -117,8 +119,9 @@ class Stepper(Integrator):
     def integrate_ensemble(
         self,
         q: ArrayLike,
-        p: ArrayLike,
+        p: ArrayLike | None = None,
         *,
+        velocity: ArrayLike | None = None,
         h: float | None = None,
         steps: int | None = None,
         t_end: ArrayLike | None = None,
@@ -135,6 +138,7 @@ class Stepper(Integrator):
 
         Args:
             q, p: (k, m) initial positions and momenta.
+            velocity: (k, m) initial velocities, in place of p.
             h, steps, every, t, options, progress: as in :meth:`integrate`.
             t_end: instead of h and steps: one time or (k,) times to go to, by steps that choose their length in each
                 trajectory. Every ``every``-th state of each is kept, and the last: ``times`` says when. ``progress`` is
@@ -151,6 +155,7 @@ class Stepper(Integrator):
         Raises:
             StateError: on wrong shapes, names or numbers.
         """
+        p = momenta_of_each(self, q, p, velocity, t, parameters)
         if h is None and steps is None and t_end is not None:
             work = EnsembleToEnds(
                 self,

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled import checked_units, to_dataset
+from scvi_codegen.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
-from scvi_codegen.runtime.events import Crossings, Event, EventLike
+from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 from scvi_codegen.runtime.quantities import quantities
 
@@ -136,7 +137,7 @@ class Trajectory(KeptStates):
         """
         times = checked_times(t, "t")
         q, p = states_at(self, times.ravel())
-        return q.reshape(*times.shape, -1), p.reshape(*times.shape, -1)
+        return q.reshape(*times.shape, self.stepper.dimension), p.reshape(*times.shape, self.stepper.dimension)
 
     def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
         """Zero crossings of functions along the trajectory, looked for now; it needs all states (``every=1``).
@@ -144,7 +145,9 @@ class Trajectory(KeptStates):
         Args:
             events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
         """
-        return crossings_of(self.stepper.with_events(events), self)
+        if not (asked := as_events(events)):
+            raise EventError("events to look for are wanted, as 'q' or Event('q', direction=1)")
+        return crossings_of(self.stepper.with_events(asked), self)
 
     def _repr_html_(self) -> str:
         every = max(1, -(-len(self) // MOST_DRAWN))
@@ -200,6 +203,7 @@ class Trajectory(KeptStates):
 
         return animate(self, path, seconds=seconds, positions=positions)
 
+    @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
 

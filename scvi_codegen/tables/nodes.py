@@ -14,6 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
+from scvi_codegen.kinds import WHOLE, takes
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 
 __all__ = [
@@ -228,6 +229,7 @@ def nodes_of(name: str, degree: int, points: Callable[[int], Vector]) -> Nodes:
     return Nodes(name=name, degree=degree, points=points(point_count(degree, "the degree", least=1) + 1))
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(degree: int) -> Nodes:
     """Return the Chebyshev-Gauss-Lobatto nodes -cos(j pi / degree), both ends among them.
@@ -238,36 +240,42 @@ def chebyshev_lobatto(degree: int) -> Nodes:
     return nodes_of("chebyshev-lobatto", degree, chebyshev_lobatto_points)
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def legendre_lobatto(degree: int) -> Nodes:
     """Return -1, 1 and the extrema of the Legendre polynomial of this degree."""
     return nodes_of("legendre-lobatto", degree, legendre_lobatto_points)
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def equispaced(degree: int) -> Nodes:
     """Return nodes with equal gaps, both ends among them; interpolation on them is unstable beyond degree 10 or so."""
     return nodes_of("equispaced", degree, equispaced_points)
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def legendre_gauss(degree: int) -> Nodes:
     """Return the degree + 1 roots of the Legendre polynomial P_{degree+1}: no end among them."""
     return nodes_of("legendre-gauss", degree, legendre_gauss_points)
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_gauss(degree: int) -> Nodes:
     """Return the degree + 1 roots of the Chebyshev polynomial T_{degree+1}: no end among them."""
     return nodes_of("chebyshev-gauss", degree, chebyshev_gauss_points)
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_left(degree: int) -> Nodes:
     """Return the degree + 1 left Radau points: -1 among them, 1 not."""
     return nodes_of("radau-left", degree, radau_left_points)
 
 
+@takes(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_right(degree: int) -> Nodes:
     """Return the degree + 1 right Radau points: 1 among them, -1 not."""

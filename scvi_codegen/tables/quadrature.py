@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.kinds import TEXT, WHOLE, takes
 from scvi_codegen.tables.nodes import (
     ascending_points,
     chebyshev_gauss_points,
@@ -178,6 +179,7 @@ def gauss_type(name: str, points: Vector, order: int, weight: Callable[[Number, 
     return Quadrature(name=f"{name}:{len(points)}", points=points, weights=tuple(weights), order=order)
 
 
+@takes(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def gauss_legendre(n: int) -> Quadrature:
     """Return the n-point Gauss-Legendre rule, of order 2n.
@@ -193,6 +195,7 @@ def gauss_legendre(n: int) -> Quadrature:
     return gauss_type("gauss-legendre", legendre_gauss_points(n), 2 * n, lambda x, P2: 2 * (1 - x * x) / (n * n * P2))
 
 
+@takes(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def gauss_lobatto(n: int) -> Quadrature:
     """Return the n-point Gauss-Lobatto rule (both ends are points, n >= 2), of order 2n - 2.
@@ -203,6 +206,7 @@ def gauss_lobatto(n: int) -> Quadrature:
     return gauss_type("gauss-lobatto", legendre_lobatto_points(n), 2 * n - 2, lambda x, P2: 2 / (n * (n - 1) * P2))
 
 
+@takes(MethodError, n=WHOLE, side=TEXT)
 @lru_cache(maxsize=None, typed=True)
 def gauss_radau(n: int, side: Literal["left", "right"] = "left") -> Quadrature:
     """Return the n-point Gauss-Radau rule with a point at -1 (``"left"``) or at 1 (``"right"``), of order 2n - 1.
@@ -238,6 +242,7 @@ def fejer_weights(n: int, pi: Any, cosine: Callable[[Any], Any]) -> tuple[Any, .
     return tuple(2 * cosine_sum((2 * j + 1) * pi / (2 * n), cosine, n, 0) / n for j in range(n))
 
 
+@takes(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def clenshaw_curtis(n: int) -> Quadrature:
     """Return the n-point Clenshaw-Curtis rule (n >= 2) on -cos(j pi / N), N = n - 1; of order n, or n + 1 for odd n.
@@ -252,6 +257,7 @@ def clenshaw_curtis(n: int) -> Quadrature:
     return Quadrature(name=f"clenshaw-curtis:{n}", points=points, weights=weights, order=n + n % 2)
 
 
+@takes(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def fejer(n: int) -> Quadrature:
     """Return Fejer's first rule with n points -cos((2j + 1) pi / 2n); of order n, or n + 1 for odd n.
@@ -264,6 +270,7 @@ def fejer(n: int) -> Quadrature:
     return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
 
 
+@takes(MethodError, n=WHOLE, derivatives=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def hermite(n: int, derivatives: int = 1) -> Quadrature:
     """Return the rule that integrates the Hermite interpolant of f and its derivatives at n Lobatto points.

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError
+from scvi_codegen.kinds import NUMBERS, check_kind
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, differentiation_matrix, matrix_product
 from scvi_codegen.tables.nodes import to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
@@ -236,6 +237,7 @@ class Splines(CurveSpace):
 
     def __post_init__(self) -> None:
         pieces = checked_count(self.pieces, "the number of pieces", least=1, most=MOST_POINTS, error=MethodError)
+        check_kind(NUMBERS, self.breakpoints, "breakpoints", MethodError)
         inner = tuple(float(to_number(x)) for x in self.breakpoints)
         if any(not a < b for a, b in pairwise((0.0, *inner, 1.0))):
             raise MethodError(f"breakpoints must ascend between 0 and 1, not {', '.join(map(str, inner))}")

@@ -16,6 +16,7 @@ from itertools import pairwise
 from typing import Any
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.kinds import WHOLE, takes
 from scvi_codegen.tables.basis import cardinal_integrals, transpose
 from scvi_codegen.tables.nodes import (
     chebyshev_gauss_points,
@@ -201,6 +202,7 @@ def _stages(s: Any) -> int:
     return point_count(s, "the number of stages", least=0, most=MOST_STAGES)
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def gauss(s: int) -> Tableau:
     """Return the s-stage Gauss method: collocation on the Gauss-Legendre points; order 2s, symplectic, symmetric.
@@ -211,12 +213,14 @@ def gauss(s: int) -> Tableau:
     return collocation_tableau(gauss_legendre(_stages(s)).abscissae, f"gauss:{s}")
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_iia(s: int) -> Tableau:
     """Return the s-stage Radau IIA method: collocation on the right Radau points; order 2s - 1."""
     return collocation_tableau(gauss_radau(_stages(s), "right").abscissae, f"radau-iia:{s}")
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_ia(s: int) -> Tableau:
     """Return the s-stage Radau IA method: b of the left Radau quadrature, A from D(s); order 2s - 1.
@@ -226,12 +230,14 @@ def radau_ia(s: int) -> Tableau:
     return symplectic_partner(collocation_tableau(gauss_radau(_stages(s), "left").abscissae), f"radau-ia:{s}")
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def lobatto_iiia(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIA method (s >= 2): collocation on the Lobatto points; order 2s - 2, symmetric."""
     return collocation_tableau(gauss_lobatto(_stages(s)).abscissae, f"lobatto-iiia:{s}")
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def lobatto_iiib(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIB method (s >= 2), the symplectic partner of Lobatto IIIA; order 2s - 2.
@@ -241,6 +247,7 @@ def lobatto_iiib(s: int) -> Tableau:
     return symplectic_partner(lobatto_iiia(s), f"lobatto-iiib:{s}")
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_gauss(s: int) -> Tableau:
     """Return collocation on the s Chebyshev-Gauss points: symmetric, of order s for even s and s + 1 for odd s."""
@@ -248,6 +255,7 @@ def chebyshev_gauss(s: int) -> Tableau:
     return collocation_tableau(to_unit(chebyshev_gauss_points(s)), f"chebyshev-gauss:{s}")
 
 
+@takes(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(s: int) -> Tableau:
     """Return collocation on the s >= 2 Chebyshev-Lobatto points: symmetric, of order s (even s) or s + 1 (odd s)."""

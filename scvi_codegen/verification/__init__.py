@@ -21,9 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.kinds import TEXT, TEXTS, of, takes
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome
 from scvi_codegen.verification.convergence import convergence_checks
@@ -41,9 +45,10 @@ SEEDS = range(20)
 LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 
 
+@takes(system=SYSTEM, stepper=of("a stepper", Stepper), solver=TEXT, flags=TEXTS)
 def verify(
     system: MechanicalSystem,
-    method: Method,
+    method: Method | str,
     q: ArrayLike | None = None,
     p: ArrayLike | None = None,
     *,
@@ -56,7 +61,7 @@ def verify(
     """Measure what the integrator of ``system`` by ``method`` promises.
 
     Args:
-        system, method: what is integrated and how.
+        system, method: what is integrated and how; a method may be its name, ``"svi:8"``.
         q, p: (m,) a state to measure at, both or neither; by default one that is found by trying.
         h: a step; by default one that moves this state by about a tenth of its size.
         t: time.
@@ -72,9 +77,11 @@ def verify(
         MethodError: if the method does not take the system, or has no such solver.
         StateError: if only one of q and p is given, or no state is found.
     """
+    method = as_method(method)
     if system.clock is not None:
         raise MethodError(f"certificates of motions in transformed time are not made: '{system.name}' has none")
     began = time.perf_counter()
+    t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
     given = _given(system, stepper, q, p, h, t)
@@ -134,8 +141,8 @@ def _given(
         raise StateError("give both q and p, or neither")
     if q is None or p is None:
         return _found(system, stepper, h, t)
-    position, momentum = np.array(q, dtype=float), np.array(p, dtype=float)
-    return State(position, momentum, float(t), float(h) if h else _step(stepper, position, momentum, t))
+    position, momentum = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
+    return State(position, momentum, t, h if h else _step(stepper, position, momentum, t))
 
 
 def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:

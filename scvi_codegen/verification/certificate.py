@@ -15,6 +15,7 @@ from typing import IO, Any, NamedTuple
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.native.waiting import waiting_for
 
 __all__ = ["BrokenError", "Certificate", "Check", "Finding", "Outcome", "checked", "information"]
 
@@ -78,7 +79,8 @@ def checked(name: str, promise: str, measure: Callable[[], Finding | None]) -> I
     """The check of a promise; nothing where it does not apply, and the reason where it cannot be measured."""
     outcome, remark, finding = Outcome.NOT_MEASURED, "", None
     try:
-        finding = measure()
+        with waiting_for(f"measuring {name}"):
+            finding = measure()
         if finding is None:
             return
         outcome, remark = Outcome.KEPT if finding.kept else Outcome.BROKEN, finding.remark

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +16,7 @@ from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.native.waiting import tell
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.linearisation import Linearised, linearised
 
@@ -30,6 +32,8 @@ LATER = 5
 """Steps from the first state to the second."""
 MOST_COORDINATES = 12
 """Whose exact motion is computed: with 18, six bodies in space, it takes minutes."""
+SUCH_STEPS, LONG_SECONDS = 12, 10.0
+"""As many steps in 60 digits take as long as a certificate of many unknowns; from when on it is said beforehand."""
 LARGEST = 200
 """Unknowns of a step whose equations are solved in 60 digits."""
 
@@ -213,8 +217,12 @@ class Subject:
     def solved(self, index: int) -> SolvedStep:
         """The step from a state of :attr:`states` in 60 digits. Raises as :meth:`derived` and its solution do."""
         if index not in self._solved:
-            state = self.states[index]
+            state, began = self.states[index], time.perf_counter()
             self._solved[index] = self.derived()(state.q, state.p, state.h, state.t)
+            seconds = time.perf_counter() - began
+            if len(self._solved) == 1 and SUCH_STEPS * seconds > LONG_SECONDS:
+                whole = SUCH_STEPS * seconds
+                tell(f"a step in 60 digits took {seconds:.1f} s, so the certificate takes some {whole:.0f} s")
         return self._solved[index]
 
     def roundings(self) -> Iterator[tuple[int, State, Array]]:

@@ -17,6 +17,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import ABOUT, main
@@ -112,6 +113,22 @@ class TestHelp:
         context = click.Context(main)
         assert [item.value for item in main.shell_complete(context, "re")] == ["reproduce"]
 
+    @pytest.mark.parametrize(
+        ("typed", "offered"),
+        [
+            (["run", "out"], {"outer-solar-system"}),
+            (["run", "kepler", "--method", "sv"], {"svi"}),
+            (["verify", "kepler", "--method", "radau"], {"radau-ia", "radau-iia"}),
+            (["derive", "planar"], {"planar-pendulum"}),
+            (["systems", "hen"], {"henon-heiles"}),
+            (["run", "kepler", "--solver", "new"], {"newton"}),
+        ],
+    )
+    def test_a_shell_completes_models_and_methods(self, typed, offered):
+        completion = ShellComplete(main, {}, "scvi-codegen", "_SCVI_CODEGEN_COMPLETE")
+        found = completion.get_completions(typed[:-1], typed[-1])
+        assert {item.value for item in found if item.type == "plain"} == offered
+
     def test_a_mistyped_command_is_a_usage_error(self):
         assert "No such command" in error_of("rum", "kepler")
 
@@ -137,6 +154,9 @@ class TestChoices:
             ({"method": "scvi"}, SCVI(8)),
             ({"method": "scvi", "degree": 3, "variational": False}, SCVI(3, variational=False)),
             ({"method": "sc", "form": "phase-space"}, SpectralCollocation(8, form="phase-space")),
+            ({"method": "svi:6"}, SVI(6)),
+            ({"method": "scvi:3", "variational": False}, SCVI(3, variational=False)),
+            ({"method": "gauss"}, Gauss(8)),
             ({"method": "gauss", "stages": 3}, Gauss(3)),
             ({"method": "gauss", "stages": 3, "form": "position"}, Gauss(3, form="position")),
             ({"method": "collocation", "abscissae": (0.25, 1.0)}, CollocationRK((0.25, 1.0))),
@@ -184,7 +204,8 @@ class TestChoices:
             ("kepler --p 0,1 --velocity 0,1", "--p and --velocity exclude each other"),
             ("kepler --span 1 --steps 1", "--span and --steps exclude each other"),
             ("kepler --method gaus", "did you mean 'gauss'?"),
-            ("kepler --method gauss", "gauss needs 'stages'"),
+            ("kepler --method svi:6 --degree 4", "[method] svi:6 says degree 6, degree = 4 another"),
+            ("kepler --method svi:x", "there is no method 'svi:x'"),
             ("kepler --stages 3", "unknown key 'stages' in [method] for svi. Known: method, degree, quadrature"),
             ("kepler --quadrature gauss-legendre", "lacks its number of points"),
             ("kepler --degree x", "'x' is not a valid integer"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS
 
+from scvi_codegen.advice.motion import solve_motion
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.methods import SCVI, SVI, Composition, Gauss, StoermerVerlet, as_method
@@ -30,6 +31,46 @@ def test_velocities_stand_for_momenta_with_the_parameters_and_the_time_of_the_ru
     assert stepper.momentum(other.q, other.velocity, other.t, given["parameters"]) == pytest.approx(other.p, rel=1e-13)
     run = stepper.start(Q, velocity=V, **given)
     assert np.array_equal(run.record(20).q, one.q)
+
+
+def test_ensembles_take_velocities_each_with_its_parameters():
+    stepper = pendulum_on_cart()
+    q, v, name = np.array([Q, [0.2, 0.1]]), np.array([V, [0.5, 0.6]]), stepper.parameters[0]
+    settings = {"h": 0.01, "steps": 20, "t": 0.7}
+    runs = stepper.integrate_ensemble(q, velocity=v, parameters={name: [2.5, 0.8]}, **settings)
+    for j, value in enumerate((2.5, 0.8)):
+        assert runs.p[0, j] == pytest.approx(stepper.momentum(q[j], v[j], 0.7, {name: value}), rel=1e-15)
+    with pytest.raises(StateError, match="give p or velocity, one of them"):
+        stepper.integrate_ensemble(q, **settings)
+    with pytest.raises(StateError, match=r"q has shape \(2, 2\), velocity \(1, 2\)"):
+        stepper.integrate_ensemble(q, velocity=V, **settings)
+
+
+def test_motions_take_velocities_and_the_arguments_of_solve_ivp():
+    stepper = pendulum_on_cart()
+    values = [2.0 * value for value in stepper.defaults]
+    given = {"t_span": (0.0, 1.0), "h": 0.1}
+    motion = solve_motion(stepper, y0=Q, velocity=V, args=values, **given)
+    p = stepper.momentum(Q, V, 0.0, values)
+    other = solve_motion(stepper, y0=[*Q, *p], parameters=values, **given)
+    assert np.array_equal(motion.y, other.y)
+    for name in ("atol", "max_step", "first_step"):
+        with pytest.raises(StateError, match=f"solve_motion has no {name}=0.1: .*give"):
+            solve_motion(stepper, y0=Q, velocity=V, **given, **{name: 0.1})
+    with pytest.raises(StateError, match="give args or parameters, not both"):
+        solve_motion(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
+    with pytest.raises(MethodError, match="RK45"):
+        solve_motion(problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
+
+
+def test_velocities_and_momenta_of_many_states():
+    stepper = pendulum_on_cart()
+    q, t = np.array([Q, [0.2, 0.1], Q]), np.array([0.0, 0.5, 1.0])
+    v = np.array([V, [0.5, 0.6], [0.0, 0.0]])
+    p = stepper.momentum(q, v, t)
+    assert p.shape == (3, 2)
+    assert p[1] == pytest.approx(stepper.momentum(q[1], v[1], t[1]), rel=1e-15)
+    assert stepper.velocity(q, p, t) == pytest.approx(v, rel=1e-14, abs=1e-15)
 
 
 def test_one_of_both_is_wanted():

@@ -27,8 +27,11 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import save_model
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.models.problems import problem
+from scvi_codegen.native import waiting
 from scvi_codegen.tables.precision import mp
+from scvi_codegen.verification import subject
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, Outcome, checked
+from scvi_codegen.verification.stepping import step_checks
 
 QUICK = ("numbers printed with 8 digits", "a slope five per cent off", "half of the discrete action", "L_vq v lost")
 
@@ -178,3 +181,16 @@ def test_verify_a_model_file_and_what_was_generated_from_it(tmp_path: Path) -> N
     assert "broken: " in output
     assert json.loads((folder / "certificate.json").read_text())["passed"] is False
     assert command(str(folder), "--degree", "3")[0] == 2
+
+
+def test_a_certificate_says_what_takes_long_and_how_long(quickly_compiled, monkeypatch):
+    entry = problem("harmonic-oscillator")
+    said: list[str] = []
+    monkeypatch.setattr(waiting, "PATIENCE_SECONDS", 0.0)
+    monkeypatch.setattr(subject, "LONG_SECONDS", 0.0)
+    stepper = quickly_compiled(entry.system, SVI(1))
+    given = subject.State(np.array([1.0]), np.array([0.5]), 0.0, 0.1)
+    with waiting.told_to(said.append):
+        next(step_checks(subject.Subject(entry.system, SVI(1), stepper, None, given)))
+    assert "measuring stage equations" in said
+    assert any("so the certificate takes some" in line for line in said)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from scvi_codegen.cli.choices import complete_model
 from scvi_codegen.cli.wording import table
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import dump_model
@@ -13,7 +14,7 @@ __all__ = ["systems"]
 
 
 @click.command()
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=complete_model)
 def systems(name: str | None) -> None:
     """List the systems of the catalogue, or print the one called NAME as a model file.
 

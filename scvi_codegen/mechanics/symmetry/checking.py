@@ -11,13 +11,14 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.kinds import FORMULAS, TEXT, takes
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.ansatz import combined, gauge_columns, polynomial_in
 from scvi_codegen.mechanics.symmetry.gauge import integrated, is_total_derivative
 from scvi_codegen.mechanics.symmetry.invariants import conserved
 from scvi_codegen.mechanics.symmetry.sampling import rates_of
 from scvi_codegen.mechanics.symmetry.symmetry import MOST_COORDINATES, Symmetry
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["check_symmetry"]
@@ -27,6 +28,7 @@ DECIDED_AT = 3
 """Points at which the change of L is looked at."""
 
 
+@takes(system=SYSTEM, direction=FORMULAS, name=TEXT)
 def check_symmetry(
     system: MechanicalSystem,
     direction: Sequence[Expr | str] | None = None,

@@ -32,6 +32,7 @@ from scvi_codegen.display.cards import Html, card
 from scvi_codegen.display.mathml import mathml
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.kinds import several, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.symmetry.ansatz import (
     Terms,
@@ -46,9 +47,9 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
 from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, conserved
 from scvi_codegen.mechanics.symmetry.names import name_of
 from scvi_codegen.mechanics.symmetry.sampling import Rates, rates_of
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 
-__all__ = ["Symmetry", "all_symmetries", "symmetries"]
+__all__ = ["SYMMETRIES", "Symmetry", "all_symmetries", "symmetries"]
 
 MOST_COORDINATES = 12
 MOST_SHOWN = 12
@@ -124,6 +125,11 @@ class Symmetry:
         return _monomials(sympy.expand(self.momentum_map), places) if found is None else found
 
 
+SYMMETRIES = several("a list of symmetries", Symmetry)
+"""For :func:`~scvi_codegen.kinds.takes`."""
+
+
+@takes(system=SYSTEM)
 @lru_cache(maxsize=64)
 def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
     """The affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, others.

@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled import checked_units
+from scvi_codegen.kinds import MAPPING, PATH, takes
 from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
 from scvi_codegen.runtime.portions import first_length
@@ -32,6 +33,7 @@ Array = NDArray[np.float64]
 PIECES_IN_MEMORY = 2
 
 
+@takes(folder=PATH)
 def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
     """The run recorded in a folder, as far as it goes now; another process may still be recording it.
 
@@ -196,6 +198,7 @@ class RecordedRun:
             units=checked_units(units),
         )
 
+    @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`."""
         write_states(self.states(units), path)

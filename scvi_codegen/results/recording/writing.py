@@ -20,6 +20,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
+from scvi_codegen.kinds import FUNCTION, PATH, REAL, TEXT, of, takes
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
@@ -36,6 +37,14 @@ SHORTEST_PORTION, LONGEST_PORTION = 0.01, 0.1
 """Seconds between looks at the clock: a run is never further from its last consistent state."""
 
 
+@takes(
+    run=of("a Run, as stepper.start gives it", Run),
+    folder=PATH,
+    checkpoint_seconds=REAL,
+    model=TEXT,
+    progress=FUNCTION,
+    stop=FUNCTION,
+)
 def record_run(
     run: Run,
     folder: str | os.PathLike[str],
@@ -107,6 +116,7 @@ def record_run(
     return load_run(target)
 
 
+@takes(folder=PATH, checkpoint_seconds=REAL, progress=FUNCTION, stop=FUNCTION)
 def resume_run(
     folder: str | os.PathLike[str],
     *,

@@ -1,0 +1,121 @@
+"""What kinds of things public functions take: the wrong kind is refused by name, before anything is done.
+
+Numbers and arrays, which may come as whatever converts to them, are checked where they are converted
+(:mod:`scvi_codegen.native.arguments`, :mod:`scvi_codegen.counts`).
+"""
+
+from __future__ import annotations
+
+import functools
+import numbers
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from inspect import signature
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from scvi_codegen.errors import ArgumentError, ScviCodegenError
+
+__all__ = [
+    "CANVAS",
+    "FORMULAS",
+    "FUNCTION",
+    "MAPPING",
+    "NAMES",
+    "NUMBERS",
+    "PATH",
+    "REAL",
+    "SWITCH",
+    "TEXT",
+    "TEXTS",
+    "WHOLE",
+    "Kind",
+    "check_kind",
+    "of",
+    "several",
+    "takes",
+]
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+LONGEST_SHOWN = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What an argument has to be, in words after "must be", and whether a value is it."""
+
+    words: str
+    holds: Callable[[Any], bool]
+
+
+def of(words: str, *types: type) -> Kind:
+    """An instance of one of the types."""
+    return Kind(words, lambda value: isinstance(value, types))
+
+
+def several(words: str, *types: type) -> Kind:
+    """A list, a tuple or another sequence of such instances, no text."""
+    return Kind(words, lambda value: _is_sequence(value) and all(isinstance(entry, types) for entry in value))
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+TEXT = of("text", str)
+TEXTS = several("a list of texts", str)
+NAMES = several("a list of names, as ['x', 'y']", str)
+SWITCH = of("True or False", bool, np.bool_)
+WHOLE = Kind("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool))
+REAL = of("a number", numbers.Real)
+PATH = of("a path", str, os.PathLike)
+MAPPING = Kind(
+    "a mapping from names, as {'k': 2.0}",
+    lambda value: isinstance(value, Mapping) and all(isinstance(name, str) for name in value),
+)
+NUMBERS = Kind("a list of numbers", lambda value: _is_sequence(value) or isinstance(value, np.ndarray))
+FORMULAS = Kind("a list of formulas", _is_sequence)
+FUNCTION = Kind("a function", callable)
+CANVAS = Kind("Matplotlib axes", lambda value: hasattr(value, "plot") and hasattr(value, "figure"))
+
+
+def check_kind(kind: Kind, value: Any, name: str, error: type[ScviCodegenError] = ArgumentError) -> None:
+    """Refuse a value that is not of the kind; the error has its name."""
+    if not kind.holds(value):
+        shown = repr(value)
+        shown = shown if len(shown) <= LONGEST_SHOWN else f"{shown[:LONGEST_SHOWN]} .."
+        raise error(f"{name} must be {kind.words}, not {shown}")
+
+
+def takes(error: type[ScviCodegenError] = ArgumentError, /, **kinds: Kind) -> Callable[[Called], Called]:
+    """Check arguments by name at each call; one whose default is ``None`` may be ``None``.
+
+    >>> @takes(name=TEXT)
+    ... def greet(name):
+    ...     return f"hello {name}"
+    >>> greet(3)
+    Traceback (most recent call last):
+    scvi_codegen.errors.ArgumentError: name must be text, not 3
+    """
+
+    def decorate(function: Called) -> Called:
+        parameters = signature(function).parameters
+        names = tuple(parameters)
+        optional = {name for name in names if parameters[name].default is None}
+
+        @functools.wraps(function)
+        def checked(*given: Any, **named: Any) -> Any:
+            pairs: Iterable[tuple[str, Any]] = (*zip(names, given, strict=False), *named.items())
+            for name, value in pairs:
+                if name in kinds and not (value is None and name in optional):
+                    check_kind(kinds[name], value, name, error)
+            return function(*given, **named)
+
+        for of_a_cache in ("cache_clear", "cache_info"):
+            if hasattr(function, of_a_cache):
+                setattr(checked, of_a_cache, getattr(function, of_a_cache))
+        return cast(Called, checked)
+
+    return decorate
