@@ -305,6 +305,13 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 }
 
 #include "support/newton.h"
+
+#define STAGE_POWER 1.5 /* of what is left unresolved, in the error of the end */
+static const double STAGE_HIGHEST[5] = {0.0, -1.0, 1.0, 0.0, 0.0};
+static const double STAGE_BEND[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
+static const double STAGE_OTHER_BEND[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
+
+#include "support/stage_error.h"
 #include "support/newton_from_line.h"
 
 #ifdef __GNUC__
@@ -396,7 +403,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 static const lanes HIGHEST = {-1.0, 1.0};
 
 #include "support/curve_error.h"
-#include "support/sweep_error.h"
+#include "support/sweep_or_stage_error.h"
 #include "support/observed_error.h"
 #else
 static const double EXTRAPOLATION[5][5] = {
@@ -407,7 +414,10 @@ static const double EXTRAPOLATION[5][5] = {
     {0.0, 0.0, 0.0, 0.0, 1.0}};
 
 #include "support/newton_solver.h"
-#include "support/no_error.h"
+#include "support/newton_error.h"
+
+#define ERROR_POWER STAGE_POWER
+#include "support/observed_error.h"
 #endif
 
 #include "support/time.h"

@@ -181,8 +181,10 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #include "support/newton.h"
 
-static const double STAGE_HIGHEST[4] = {
-    -0.37102700340194733, 0.939772470377753, -0.939772470377753, 0.37102700340194733};
+#define STAGE_POWER 1.6666666666666667 /* of what is left unresolved, in the error of the end */
+static const double STAGE_HIGHEST[4] = {-3.710270034019473, 9.39772470377753, -9.39772470377753, 3.710270034019473};
+static const double STAGE_BEND[4] = {-1.0, 0.0, 0.0, 1.0};
+static const double STAGE_OTHER_BEND[4] = {-1.0, 0.0, 1.0, 0.0};
 
 #include "support/stage_error.h"
 #include "support/newton_from_line.h"
@@ -265,7 +267,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #define KEPT_UNIT(i) (data->square * data->inverse_mass[i])
 #define RESOLVED 1.0
 #define ERROR_POWER 1.25
-#define STAGE_POWER 1.3333333333333333
 static const lanes HIGHEST = {-0.37102700340194733, 0.939772470377753, -0.939772470377753, 0.37102700340194733};
 
 #include "support/curve_error.h"
@@ -281,7 +282,7 @@ static const double EXTRAPOLATION[4][4] = {
 #include "support/newton_solver.h"
 #include "support/newton_error.h"
 
-#define ERROR_POWER 1.6666666666666667
+#define ERROR_POWER STAGE_POWER
 #include "support/observed_error.h"
 #endif
 

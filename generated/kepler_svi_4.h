@@ -26,7 +26,8 @@ enum {
   KEPLER_SVI_4_NOT_CONVERGED = 1, /* max_iterations reached */
   KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix has no inverse */
   KEPLER_SVI_4_NOT_FINITE = 3, /* an infinity or a NaN turned up */
-  KEPLER_SVI_4_VANISHED = 4 /* steps that choose their length became as good as nothing */
+  KEPLER_SVI_4_VANISHED = 4, /* steps that choose their length became as good as nothing */
+  KEPLER_SVI_4_STRAYED = 5 /* the equations of the step were solved by what is no motion */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of

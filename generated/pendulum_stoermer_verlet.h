@@ -27,7 +27,8 @@ enum {
   PENDULUM_STOERMER_VERLET_NOT_CONVERGED = 1, /* max_iterations reached */
   PENDULUM_STOERMER_VERLET_SINGULAR = 2, /* the Newton matrix has no inverse */
   PENDULUM_STOERMER_VERLET_NOT_FINITE = 3, /* an infinity or a NaN turned up */
-  PENDULUM_STOERMER_VERLET_VANISHED = 4 /* steps that choose their length became as good as nothing */
+  PENDULUM_STOERMER_VERLET_VANISHED = 4, /* steps that choose their length became as good as nothing */
+  PENDULUM_STOERMER_VERLET_STRAYED = 5 /* the equations of the step were solved by what is no motion */
 };
 
 /* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of

@@ -31,6 +31,7 @@ _HOMES = {
     "mechanics.coordinate_change": ("change_coordinates",),
     "derivation.equations": ("StepEquations", "derive"),
     "errors": (
+        "AccuracyWarning",
         "ArgumentError",
         "BuildError",
         "CacheWarning",

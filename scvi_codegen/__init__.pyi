@@ -8,6 +8,7 @@ from scvi_codegen.compiler import compile_stepper as compile_stepper
 from scvi_codegen.compiler import generate_source as generate_source
 from scvi_codegen.derivation.equations import StepEquations as StepEquations
 from scvi_codegen.derivation.equations import derive as derive
+from scvi_codegen.errors import AccuracyWarning as AccuracyWarning
 from scvi_codegen.errors import ArgumentError as ArgumentError
 from scvi_codegen.errors import BuildError as BuildError
 from scvi_codegen.errors import CacheWarning as CacheWarning

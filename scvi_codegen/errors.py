@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 __all__ = [
+    "AccuracyWarning",
     "ArgumentError",
     "BuildError",
     "CacheWarning",
@@ -66,6 +67,10 @@ class MethodError(ScviCodegenError, ValueError):
 
 class MethodWarning(UserWarning):
     """A method that can be built, with a property the user should know of."""
+
+
+class AccuracyWarning(UserWarning):
+    """A run whose equations were solved, with steps too long for the motion: its states are not to be trusted."""
 
 
 class ModelFileError(ScviCodegenError, ValueError):

@@ -1,19 +1,22 @@
 /* What the curve of the stages of Newton's iteration leaves unresolved, as curve_error.h says. Before it: stages.h, the
- * table STAGE_HIGHEST. */
+ * tables STAGE_HIGHEST, STAGE_BEND and STAGE_OTHER_BEND; STAGE_POWER. */
 
-/* z: velocities of the stages. */
+/* z: unknowns of the stages. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real least)
 {
   real largest = 0;
   for (int i = 0; i < M; i++)
     largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   for (int i = 0; i < M; i++) {
-    const real *v = z + i * B;
     const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + REAL_EPSILON * largest + REAL_MIN);
-    const real bend = MATH(fabs)(unit) * (MATH(fabs)(v[B - 1] - v[0]) + MATH(fabs)(v[B / 2] - v[0])) + NEGLIGIBLE;
-    real top = 0;
-    for (int b = 0; b < B; b++)
-      top += (4 * B - 6) * unit * STAGE_HIGHEST[b] * v[b];
+    real top = 0, bend = 0, other = 0;
+    for (int b = 0; b < B; b++) {
+      top += STAGE_HIGHEST[b] * z[i * B + b];
+      bend += STAGE_BEND[b] * z[i * B + b];
+      other += STAGE_OTHER_BEND[b] * z[i * B + b];
+    }
+    top *= unit;
+    bend = MATH(fabs)(unit) * (MATH(fabs)(bend) + MATH(fabs)(other)) + NEGLIGIBLE;
     if (top * top > least * bend)
       least = top * top / bend;
   }

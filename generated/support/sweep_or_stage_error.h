@@ -1,9 +1,9 @@
 /* The largest error of the curves that sweeps found, or Newton's iteration where they failed. Before it: curve_error.h,
- * stage_error.h; STAGE_POWER makes the errors of one those of the other. */
+ * stage_error.h; their powers make the errors of one those of the other. */
 static double largest_error(const run_memory *run, const step_data *step, const solver_data *data, const double *dq,
     double *workspace)
 {
   if (run->guess > 0)
     return curve_error(step, data, run->memory, dq, run->error);
-  return larger(run->error, pow(stage_error(step, newton_in(workspace).z, dq, 0.0), STAGE_POWER));
+  return larger(run->error, pow(stage_error(step, newton_in(workspace).z, dq, 0.0), STAGE_POWER / ERROR_POWER));
 }

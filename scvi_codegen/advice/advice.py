@@ -28,6 +28,7 @@ from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Advice", "Evidence", "advise"]
@@ -103,6 +104,7 @@ class Advice:
 
 
 @takes(system=SYSTEM, degree=SWITCH, solver=TEXT)
+@unwarned()
 def advise(
     system: MechanicalSystem,
     method: Method | str,

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.advice.advice import advise
+from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.kinds import SWITCH, of, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI, Method, as_method
@@ -27,7 +28,9 @@ __all__ = ["Motion", "solve_motion"]
 
 Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
-REACHED, EVENT, FAILED = 0, 1, -1
+REACHED, EVENT, FAILED, BROKEN = 0, 1, -1, -2
+ADVISED = 1e-9
+"""What steps of one length are advised for where none is given and the method knows no other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +43,7 @@ class Motion:
         sol: from times to states, (2 m,) of a number and (2 m, n) of n times; ``None`` without ``dense_output``.
         t_events: (k,) times of the crossings of each event, ``None`` without events.
         y_events: (k, 2 m) states there.
-        status: 0 the end of the span, 1 a terminal event, -1 a step failed.
+        status: 0 the end of the span, 1 a terminal event, -1 a step failed, -2 a promise of :func:`advise` broke.
         message: the same in words.
         success: whether the status is not negative.
         trajectory: the states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies.
@@ -57,7 +60,7 @@ class Motion:
 
     @property
     def success(self) -> bool:
-        """Whether the end of the span or a terminal event was reached."""
+        """Whether the end of the span or a terminal event was reached, as well as promised."""
         return self.status >= 0
 
 
@@ -70,7 +73,7 @@ def solve_motion(
     velocity: ArrayLike | None = None,
     method: Method | str | None = None,
     h: float | None = None,
-    tolerance: float = 1e-9,
+    tolerance: float | None = None,
     rtol: float | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
@@ -84,17 +87,18 @@ def solve_motion(
 ) -> Motion:
     """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, for a run backward).
 
-    By steps of one length, or with ``rtol`` by steps that choose their length.
+    By steps that choose their length; with ``h`` or ``tolerance``, or by a method that cannot do so, by steps of one.
 
     Args:
-        system: what moves; or its compiled stepper, which takes the place of ``method`` and needs ``h`` or ``rtol``.
+        system: what moves; or its compiled stepper, which takes the place of ``method``.
         t_span: two times.
         y0: (2 m,) initial positions, then momenta; (m,) positions alone beside ``velocity``.
         velocity: (m,) initial velocities, in place of momenta.
         method: or its name, ``"svi:6"``; by default ``SVI(8)``.
-        h: longest step, taken a little shorter so that whole steps fill the span; by default :func:`advise` chooses it.
-        tolerance: the error |q - q_exact| / |q| at the end that it then aims at.
-        rtol: the relative error of the end of each step, whose length is then its own; leave out ``h``.
+        h: longest step of one length, taken a little shorter so that whole steps fill the span.
+        tolerance: in place of ``h``: the error |q - q_exact| / |q| at the end, for which :func:`advise` chooses it.
+            Where the run breaks the promise, ``success`` is False.
+        rtol: the relative error of the end of each step whose length is its own; by default round-off.
         t_eval: (n,) times at which states are wanted; by default the ends of the steps.
         dense_output: whether ``sol`` is wanted, for which all steps are kept.
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
@@ -113,9 +117,10 @@ def solve_motion(
     q: ArrayLike
     given: ArrayLike | None
     q, given = (y0, None) if velocity is not None else _halves(y0)
+    advised = None
     if isinstance(system, Stepper):
-        if method is not None or (h is None and rtol is None):
-            raise StateError("a compiled stepper has its method, and its step h, or rtol, must be given")
+        if method is not None or tolerance is not None:
+            raise StateError("a compiled stepper has its method, and its step is h, or its own: leave out tolerance")
         stepper = system
         p = stepper.momenta_given(q, given, velocity, start, parameters)
     else:
@@ -123,9 +128,9 @@ def solve_motion(
         stepper = compile_stepper(system, method)
         p = stepper.momenta_given(q, given, velocity, start, parameters)
         if h is None and rtol is None:
-            advice = advise(
-                system, method, q, p, end - start, tolerance, t=start, parameters=parameters, options=options
-            )
+            advised = tolerance if tolerance is not None or _chooses(stepper) else ADVISED
+        if advised is not None:
+            advice = advise(system, method, q, p, end - start, advised, t=start, parameters=parameters, options=options)
             h = advice.h
     asked = None if t_eval is None else times_of_run(t_eval, start, end)
     status, message, failure = REACHED, "The end of the span was reached.", None
@@ -145,6 +150,9 @@ def solve_motion(
     ended_by = trajectory.ended_by
     if ended_by is not None and failure is None:
         status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
+    if advised is not None and failure is None and not isinstance(system, Stepper):
+        broken = broken_promise(system, trajectory, advised)
+        status, message = (BROKEN, broken) if broken else (status, message)
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
 
 
@@ -162,11 +170,19 @@ def _refuse(given: Mapping[str, float | None]) -> None:
             raise StateError(f"solve_motion has no {name}={value!r}: {INSTEAD[name]}")
 
 
+def _chooses(stepper: Stepper) -> bool:
+    """Whether its steps can choose their length."""
+    try:
+        stepper.controlled()
+    except MethodError:
+        return False
+    return True
+
+
 def _steps(stepper: Stepper, start: float, end: float, h: float | None, rtol: float | None) -> dict[str, Any]:
     """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
-    if rtol is not None:
+    if rtol is not None or h is None:
         return {"h": h, "t_end": end, "tolerance": rtol}
-    assert h is not None
     if stepper.interface.energy_parameter:
         return {"h": math.copysign(checked_step(h), end - start), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))

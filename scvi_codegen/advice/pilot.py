@@ -80,7 +80,8 @@ def launch(integrate: Integrate, method: Method, q: Array, span: float, *, goal:
     if pilot is None or (failure and CUT * h < pilot.step(pilot.finest)):
         raise StateError(
             f"no run over {longer.length:.3g} succeeds, with steps down to {h:.3g}: "
-            "the motion may end in a singularity; try a shorter span"
+            "the motion may end in a singularity, or is too fast there for steps of one length: let them "
+            "choose their length (t_end, --tolerance), or try a shorter span"
         )
     if not pilot.whole:
         pilot.rate = pilot.rate_of_parting(most // SEARCH)

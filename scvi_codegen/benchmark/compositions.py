@@ -26,6 +26,7 @@ from scvi_codegen.methods import StoermerVerlet
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
+from scvi_codegen.runtime.accuracy import unwarned
 
 __all__ = ["run_compositions"]
 
@@ -44,6 +45,7 @@ RESOLVED = 1e-2
 REPEATS = 3
 
 
+@unwarned()
 def run_compositions(plan: Plan, say: Say) -> ResultTable:
     """Milliseconds of a trajectory for each error, and who is fastest."""
     rows = []

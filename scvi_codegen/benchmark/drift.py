@@ -14,6 +14,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["DRIFTS", "fitted_slope", "run_drift"]
@@ -26,6 +27,7 @@ SAMPLES = 2000
 BLOCKS = 20
 
 
+@unwarned()
 def run_drift(plan: Plan, say: Say) -> ResultTable:
     """All cases at all step sizes, SVI(8) and heyoka at its default tolerance."""
     steps = QUICK_STEPS if plan.quick else STEPS

@@ -16,6 +16,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
 from scvi_codegen.tables.precision import Matrix, mp
@@ -36,6 +37,7 @@ DECLARATIONS = (
 )
 
 
+@unwarned()
 def run_hand_written(plan: Plan, say: Say) -> ResultTable:
     """Nanoseconds a step of both, timed in turn, and how far apart they end."""
     rows = []

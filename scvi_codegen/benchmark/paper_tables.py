@@ -25,6 +25,7 @@ from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["run_paper_tables"]
@@ -39,6 +40,7 @@ TABLES = (
 """Number, case, (q0, v0), h, methods with the seconds printed, degree of collocation and its seconds."""
 
 
+@unwarned()
 def run_paper_tables(plan: Plan, say: Say) -> ResultTable:
     """Both tables."""
     rows: list[dict[str, Any]] = []

@@ -17,6 +17,7 @@ from scvi_codegen.benchmark.measuring import measure
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.runtime.accuracy import unwarned
 
 __all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_ensemble"]
 
@@ -34,6 +35,7 @@ ReferenceOf = Callable[[Case, Array | None], Reference]
 """Where a case ends, from its velocities or from momenta."""
 
 
+@unwarned()
 def run_case(name: str, plan: Plan, say: Say) -> CaseResult:
     """One trajectory after the other, by this project and all peers."""
     chosen = case(name)
@@ -42,6 +44,7 @@ def run_case(name: str, plan: Plan, say: Say) -> CaseResult:
     return race(chosen, partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick), makers, plan, say)
 
 
+@unwarned()
 def run_ensemble(name: str, plan: Plan, say: Say) -> CaseResult:
     """64 trajectories in one thread, from the array of their states to that of the ends; heyoka in its batch mode.
 

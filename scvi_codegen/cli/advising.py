@@ -1,4 +1,4 @@
-"""``scvi-codegen run --tolerance``: the model with the step that its advice gives, and the evidence for people."""
+"""``scvi-codegen run``: the model with steps that choose their length, or with an advised one, and its evidence."""
 
 from __future__ import annotations
 
@@ -14,10 +14,25 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 
-__all__ = ["advised_model"]
+__all__ = ["advised_model", "controlled_model"]
 
+ROUND_OFF = 2.0**-52
 MOST_STEPS = 10**9
 """More are not begun unasked: at a microsecond each these take a quarter of an hour."""
+
+
+def controlled_model(model: Model, tolerance: float) -> Model:
+    """The model with steps that choose their length, each right to the tolerance, or as right as doubles allow.
+
+    Raises:
+        StateError: unless the tolerance is positive and below 1.
+    """
+    if not 0.0 < tolerance < 1.0:
+        raise StateError(f"the tolerance must be positive, and below 1, not {tolerance!r}")
+    if tolerance < ROUND_OFF:
+        click.echo(f"Warning: doubles do not allow {tolerance:g}: steps are as accurate as they do", err=True)
+        tolerance = 0.0
+    return replace(model, h=None, tolerance=tolerance, steps=None, span=model.covered)
 
 
 def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:

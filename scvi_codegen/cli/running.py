@@ -9,18 +9,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scvi_codegen.advice.known_digits import Known, known_digits
 from scvi_codegen.cli.conservation import energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
-from scvi_codegen.cli.wording import counted, duration
+from scvi_codegen.cli.wording import counted, duration, in_known_digits
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, unwarned
 from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.trajectory import TOLERABLE_ERROR, Trajectory
+from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = [
     "RunOutcome",
@@ -32,6 +34,8 @@ __all__ = [
 
 PORTION_SECONDS = 0.2
 SHOWN_COORDINATES = 6
+SECOND_RUN = 10_000
+"""Steps that the run which tells the known digits may always take; and four times as many as the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +59,7 @@ class RunOutcome:
     interrupted: bool
 
 
+@unwarned()
 def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> RunOutcome:
     """Run a model with a progress bar, as far as it goes.
 
@@ -124,7 +129,15 @@ def summary(model: Model, outcome: RunOutcome) -> str:
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory)
         lines += worst_step(trajectory)
-    return "\n".join([*lines, *final_state(run)])
+    return "\n".join([*lines, *final_state(run, _known(model, outcome))])
+
+
+def _known(model: Model, outcome: RunOutcome) -> Known | None:
+    """What is known of the state at the end of a run that came to its end, where that was kept."""
+    run, trajectory = outcome.run, outcome.trajectory
+    if not run.steps or outcome.failure is not None or outcome.interrupted or trajectory.t[-1] != run.t:
+        return None
+    return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps)
 
 
 def of_length(h: float | None, run: Run) -> str:
@@ -150,21 +163,33 @@ def conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
 
 
 def worst_step(trajectory: Trajectory) -> Iterator[str]:
-    """How well the worst step was resolved, where the method has a curve that tells it."""
-    if math.isfinite(trajectory.step_error):
+    """How well the worst step was resolved."""
+    if math.isnan(trajectory.step_error):
+        yield "worst step: its error is not known, nothing tells it here"
+    else:
         said = f"worst step: relative error about {trajectory.step_error:.1e}, from t = {trajectory.step_error_t:g}"
-        yield f"{said}; too long: take a shorter step" if trajectory.step_error > TOLERABLE_ERROR else said
+        too_long = "; too long: take a shorter step, or --tolerance"
+        yield said + too_long * (trajectory.step_error > TOLERABLE_ERROR)
 
 
-def final_state(run: Run) -> Iterator[str]:
-    """Where a run stands: lines with coordinates and momenta."""
+def final_state(run: Run, known: Known | None = None) -> Iterator[str]:
+    """Where a run stands: lines with coordinates and momenta, in the digits that are known."""
     names = run.stepper.coordinates
-    width = max(map(len, names[:SHOWN_COORDINATES]))
-    yield "final state"
-    for name, q, p in list(zip(names, run.q, run.p, strict=True))[:SHOWN_COORDINATES]:
-        yield f"  {name:{width}} = {q: .17g}   p_{name:{width}} = {p: .17g}"
+    shown = names[:SHOWN_COORDINATES]
+    width = max(map(len, shown))
+    yield f"final state ({_how_known(known)})" if run.steps else "final state"
+    for i, (name, q, p) in enumerate(zip(shown, run.q, run.p, strict=False)):
+        known_q, known_p = (known.q[i], known.p[i]) if known else (0.0, 0.0)
+        yield f"  {name:{width}} = {in_known_digits(q, known_q):24} p_{name:{width}} = {in_known_digits(p, known_p)}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} coordinates more"
+
+
+def _how_known(known: Known | None) -> str:
+    if known is None:
+        return "no second run tells how many of these digits are right"
+    said = "in the digits that a second run confirms"
+    return f"{said}; chaotic: nearby motions part tenfold every {known.tenfold:.2g}" if known.chaotic else said
 
 
 def _joined(pieces: list[Trajectory]) -> Trajectory:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-__all__ = ["counted", "duration", "table"]
+__all__ = ["counted", "duration", "in_known_digits", "table"]
 
 
 def counted(count: int, what: str) -> str:
@@ -18,6 +19,15 @@ def duration(seconds: float) -> str:
         if seconds >= scale:
             return f"{seconds / scale:.3g} {unit}"
     return f"{seconds / 1e-9:.3g} ns"
+
+
+def in_known_digits(x: float, error: float) -> str:
+    """A number to the last place that an error of this size leaves right; all 17 digits where there is none."""
+    if error == 0.0 or not math.isfinite(error):
+        return f"{x: .17g}"
+    places = math.floor(-math.log10(2.0 * error))
+    digits = math.floor(math.log10(abs(x))) + 1 + places if x else 0
+    return f"{x: .{min(digits, 17)}g}" if digits > 0 else f"{x: .1g} within {error:.1g}"
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

@@ -50,6 +50,21 @@ class Integrals:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StageCurve:
+    """Of the unknowns of a coordinate, what its curve bends and what it leaves unresolved; tables of (B,) numbers.
+
+    Attributes:
+        highest: h times this sum is what the highest Legendre coefficient of the accelerations moves it by.
+        bends: h times the absolute sums of these is what the curve bends it by.
+        power: of h in the square of the one over the other.
+    """
+
+    highest: tuple[Number, ...]
+    bends: tuple[tuple[Number, ...], tuple[Number, ...]]
+    power: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """All of an integrator but its syntax.
 
@@ -79,8 +94,7 @@ class Program:
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
         order: of the method; where none is claimed, the number of its points.
-        stage_highest: (B,) what gives the highest Legendre coefficient of the velocities of the stages; empty where the
-            unknowns are others.
+        stage_curve: what tells how well the curve of the stages is resolved, or ``None``.
         numbers: the paper's, of equations for a few unknowns, and of those for q1 and p1; ``""`` where
             it has none.
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
@@ -113,7 +127,7 @@ class Program:
     splitting: Splitting | None
     newton: bool
     order: int
-    stage_highest: tuple[Number, ...]
+    stage_curve: StageCurve | None
     numbers: tuple[str, str, str]
     integrals: Integrals | None = None
 
@@ -128,16 +142,11 @@ class Program:
         return self.blocks * self.sites
 
     @property
-    def stage_error_power(self) -> int:
-        """Of h in the square of the displacement by that coefficient over that by all but the mean."""
-        return 2 * (self.blocks - 1)
-
-    @property
     def error_power(self) -> int:
         """Of h in what a run keeps of the error of its curves; 0 where there is none."""
         if self.sweep:
             return self.sweep.error_power
-        return self.stage_error_power if self.stage_highest else 0
+        return self.stage_curve.power if self.stage_curve else 0
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

@@ -21,8 +21,8 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.numbers import Number, lower_matrix, lower_vector
-from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program
+from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program, StageCurve
 from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.families import lowered_family
@@ -33,10 +33,10 @@ from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method, is_symplectic
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.shapes import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import legendre_functional
-from scvi_codegen.tables.precision import Matrix
+from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 __all__ = ["lower"]
 
@@ -101,7 +101,7 @@ def lower(
         splitting=splitting,
         newton=newton,
         order=method.order or len(stages.blocks),
-        stage_highest=_stage_highest(stages) if newton and splitting is None else (),
+        stage_curve=_stage_curve(stages) if newton and splitting is None else None,
         integrals=_integrals(system, method, stages),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
@@ -116,12 +116,27 @@ def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str,
     return rows, q1, p1
 
 
-def _stage_highest(stages: StageSystem) -> tuple[Number, ...]:
-    """Where the unknowns are two or more velocities along the curve."""
-    shape = stages.shape
-    if not isinstance(shape, Velocities) or not 1 < len(shape.blocks) == len(set(shape.blocks)) == len(stages.blocks):
-        return ()
-    return lower_vector(legendre_functional(shape.blocks, len(shape.blocks) - 1))
+def _stage_curve(stages: StageSystem) -> StageCurve | None:
+    """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations."""
+    shape, count = stages.shape, len(stages.blocks)
+    if isinstance(shape, Velocities) and 1 < len(shape.blocks) == len(set(shape.blocks)) == count:
+        degree = count - 1
+        highest = tuple((4 * degree - 2) * x for x in legendre_functional(shape.blocks, degree))
+        bends = [(0, degree), (0, count // 2)]
+        rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
+        power = 2 * degree
+    elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):
+        c, size = shape.tableau.c, len(shape.tableau.c)
+        highest = (mp.zero, *legendre_functional(c, size - 1), *(mp.zero,) * (count - 1 - size))
+        rows = [tuple(mp.mpf(b == only) for b in range(count)) for only in (1, size)]
+        power = 2 * size
+    else:
+        return None
+    return StageCurve(highest=lower_vector(highest), bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
+
+
+def _distinct(points: Vector) -> bool:
+    return len(set(points)) == len(points)
 
 
 def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) -> Integrals | None:

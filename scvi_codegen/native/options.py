@@ -12,13 +12,14 @@ from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 
-STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished"}
+STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed"}
 
 
 ADVICE = {
     "not converged": "try a smaller step, or more iterations",
     "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
+    "strayed": "the equations of the step were solved by what is no motion: take a shorter step, or give t_end",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
 

@@ -21,6 +21,7 @@ from typing import TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
+from scvi_codegen.runtime.accuracy import unwarned
 
 __all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]
 
@@ -129,6 +130,7 @@ def _module_of(experiment: Experiment) -> str:
     return getattr(run, "__module__", "")
 
 
+@unwarned()
 def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
     """Run one experiment; whatever goes wrong in it is its failure."""
     try:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
@@ -33,13 +34,19 @@ class Run(Memory):
 
         The events of the stepper, if it has any, are recorded; a terminal one ends the run before the step it is in.
 
+        An :class:`~scvi_codegen.AccuracyWarning` says when a step is first found to be too long for the motion.
+
         Raises:
             StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
             EventError: where an event function is not finite.
         """
+        before, _ = self.step_error
         if self.stepper.events:
-            return Observation(self, every=every).advance(steps, progress)
-        return record(self, steps, every=every, progress=progress)
+            trajectory = Observation(self, every=every).advance(steps, progress)
+        else:
+            trajectory = record(self, steps, every=every, progress=progress)
+        warn_of_long_steps(trajectory, before=before)
+        return trajectory
 
 
 def _restored(

@@ -19,6 +19,7 @@ from scvi_codegen.kinds import FUNCTION, takes
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.ensemble import integrate_ensemble, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
@@ -82,7 +83,8 @@ class Stepper(Integrator):
                 several. They are compiled with the integrator, once. By default those of :func:`compile_stepper`.
 
         Returns:
-            A :class:`Trajectory`: steps // every + 1 states, fewer if an event ended it.
+            A :class:`Trajectory`: steps // every + 1 states, fewer if an event ended it. An
+            :class:`~scvi_codegen.AccuracyWarning` names the worst step where it is too long for the motion.
 
         Raises:
             StateError: on wrong shapes, names or numbers.
@@ -105,7 +107,7 @@ class Stepper(Integrator):
             options=options,
         )
         if clocked and t_end is not None:
-            return _go_until(run, t_end, steps, every, t_eval, progress)
+            return _said(_go_until(run, t_end, steps, every, t_eval, progress))
         if run.goal is None and steps is None:
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if run.goal is not None and steps is not None:
@@ -114,7 +116,7 @@ class Stepper(Integrator):
             return run.record(steps, every=every, progress=progress)
         if clocked:
             raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
-        return Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress)
+        return _said(Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress))
 
     def integrate_ensemble(
         self,
@@ -231,6 +233,12 @@ class Stepper(Integrator):
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
         return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+
+
+def _said(trajectory: Trajectory) -> Trajectory:
+    """The same, after what is to be said of its worst step."""
+    warn_of_long_steps(trajectory)
+    return trajectory
 
 
 def _go_until(

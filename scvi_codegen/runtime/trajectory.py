@@ -17,6 +17,7 @@ from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled import checked_units, to_dataset
 from scvi_codegen.kinds import MAPPING, PATH, takes
+from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
@@ -30,10 +31,7 @@ if TYPE_CHECKING:
     from scvi_codegen.pictures.animation import Film
     from scvi_codegen.pictures.plots import Plots
 
-__all__ = ["TOLERABLE_ERROR", "Trajectory", "relative_changes"]
-
-TOLERABLE_ERROR = 1e-3
-"""Of a step: one that is wrong by more is too long for its motion."""
+__all__ = ["Trajectory", "relative_changes"]
 
 MOST_DRAWN, MOST_CURVES = 400, 6
 """States, and coordinates, that a notebook draws."""
@@ -163,7 +161,7 @@ class Trajectory(KeptStates):
             ("coordinates", listed(self.stepper.coordinates)),
             ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
             ("iterations", plain(f"{self.iterations.sum()}")),
-            *([("step error", plain(self._worst()))] if math.isfinite(self.step_error) else []),
+            ("step error", plain(self._worst())),
         )
         return card(self.stepper.title, facts, grid(rows))
 
@@ -171,7 +169,10 @@ class Trajectory(KeptStates):
         return f"{self.steps} steps of their own lengths, {self.rejected} rejected" if self.goal else f"h = {self.h:g}"
 
     def _worst(self) -> str:
-        return f"about {self.step_error:.1e} relative in the step from t = {self.step_error_t:g}, the worst"
+        if math.isnan(self.step_error):
+            return "not known: nothing tells it here"
+        said = f"about {self.step_error:.1e} relative in the step from t = {self.step_error_t:g}, the worst"
+        return f"{said}; too long" if self.step_error > TOLERABLE_ERROR else said
 
     def _energies(self, every: int) -> Array | None:
         """Of each so many states, ``None`` where a state has no energy."""

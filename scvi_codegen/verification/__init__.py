@@ -27,6 +27,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome
@@ -46,6 +47,7 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 
 
 @takes(system=SYSTEM, stepper=of("a stepper", Stepper), solver=TEXT, flags=TEXTS)
+@unwarned()
 def verify(
     system: MechanicalSystem,
     method: Method | str,

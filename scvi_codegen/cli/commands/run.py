@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.advising import advised_model
+from scvi_codegen.advice.promise import broken_promise
+from scvi_codegen.cli.advising import advised_model, controlled_model
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
@@ -49,7 +50,13 @@ __all__ = ["run"]
     "--tolerance",
     type=float,
     metavar="X",
-    help="Choose the step for this error of the positions at the end, relative to their size.",
+    help="Steps choose their length: the relative error allowed to the end of each (1e-16: round-off).",
+)
+@click.option(
+    "--advise",
+    type=float,
+    metavar="X",
+    help="Choose one step for all, for this error of the positions at the end, relative to their size.",
 )
 @SOLVER_OPTION
 @click.option(
@@ -66,6 +73,7 @@ def run(
     plot: str | None,
     ensemble: str | None,
     tolerance: float | None,
+    advise: float | None,
     solver: str,
     solver_tolerance: float | None,
     max_iterations: int | None,
@@ -76,8 +84,10 @@ def run(
     A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
     asked for.
 
-    With --tolerance the step is chosen by short pilot runs, for the error wanted at the end; advice and evidence are
-    printed. With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
+    With --tolerance each step has the length that its error allows. With --advise one step for all is chosen by short
+    pilot runs, for the error wanted at the end; advice and evidence are printed, and a run that belies them ends with
+    exit status 1. With --ensemble MODEL is run from many initial states. A grid has one section, every combination is
+    run:
 
     \b
       [grid]
@@ -97,7 +107,8 @@ def run(
     Examples:
       scvi-codegen run outer-solar-system --plot orbits.png
       scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
-      scvi-codegen run kepler --tolerance 1e-9
+      scvi-codegen run kepler --tolerance 1e-12
+      scvi-codegen run kepler --advise 1e-9
     """
     recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
     if resume is not None:
@@ -109,7 +120,8 @@ def run(
     recorded = output is not None and is_folder(output)
     recording.check(recorded)
     _check_outputs(output, plot, ensemble)
-    _check_combination(choices, plot=plot, ensemble=ensemble, tolerance=tolerance, folder=output if recorded else None)
+    wanted = {"tolerance": tolerance, "advise": advise}
+    _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
@@ -118,11 +130,13 @@ def run(
         _run_ensemble(model, ensemble, output, solver, options)
         return
     if tolerance is not None:
-        model = advised_model(model, tolerance, solver=solver, options=options)
+        model = controlled_model(model, tolerance)
+    if advise is not None:
+        model = advised_model(model, advise, solver=solver, options=options)
     if output is not None and recorded:
         _finish_recording(recording.record(model, output, solver=solver, options=options))
         return
-    _run_one(model, output, plot, solver, options)
+    _run_one(model, output, plot, solver, options, promised=advise)
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
@@ -141,21 +155,31 @@ def _check_combination(
     *,
     plot: str | None,
     ensemble: str | None,
-    tolerance: float | None,
+    wanted: dict[str, float | None],
     folder: str | None,
 ) -> None:
     if folder is not None and plot is not None:
         raise click.UsageError("--plot is for a trajectory in memory, not for a run in a folder")
-    if tolerance is not None:
-        for name in ("step", "steps"):
-            if choices[name] is not None:
-                raise click.UsageError(f"--tolerance chooses the step: leave out --{name} (--span is the length)")
-    for name, value in (("plot", plot), ("tolerance", tolerance)):
+    given = [name for name, value in wanted.items() if value is not None]
+    if len(given) > 1:
+        raise click.UsageError("--tolerance and --advise exclude each other: steps of their own, or one for all")
+    for name in ("step", "steps") if given else ():
+        if choices[name] is not None:
+            raise click.UsageError(f"--{given[0]} chooses the step: leave out --{name} (--span is the length)")
+    for name, value in (("plot", plot), *wanted.items()):
         if ensemble is not None and value is not None:
             raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
 
 
-def _run_one(model: Model, output: str | None, plot: str | None, solver: str, options: SolverOptions | None) -> None:
+def _run_one(
+    model: Model,
+    output: str | None,
+    plot: str | None,
+    solver: str,
+    options: SolverOptions | None,
+    *,
+    promised: float | None,
+) -> None:
     outcome = integrate_model(model, solver=solver, options=options)
     click.echo(summary(model, outcome))
     written = _write_outputs(outcome, output, plot)
@@ -165,6 +189,9 @@ def _run_one(model: Model, output: str | None, plot: str | None, solver: str, op
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
     for path in written:
         click.echo(f"wrote {path}")
+    broken = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised)
+    if broken:
+        raise CommandFailure(broken, FAILURE)
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:

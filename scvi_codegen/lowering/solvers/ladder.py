@@ -30,7 +30,7 @@ def control_of(program: Program) -> Control | None:
     return Control(
         mantissas=tuple(2.0 ** (k / RUNGS) for k in range(RUNGS)),
         ladder=ladder_of(program.sweep) if program.sweep else None,
-        stage_growth=2.0 ** (program.stage_error_power / RUNGS) if program.stage_highest else 0.0,
+        stage_growth=2.0 ** (program.stage_curve.power / RUNGS) if program.stage_curve else 0.0,
     )
 
 

@@ -1,0 +1,110 @@
+"""How much of a final state is known: a second run, more accurate and from a state changed in its last places.
+
+The second run is by another method, SVI(8) with steps that choose their length, so what it differs by holds all errors
+of the first: of its steps, its round-off and what the motion makes of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import ScviCodegenError
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import SVI
+from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["Known", "known_digits"]
+
+Array = NDArray[np.float64]
+
+SAMPLES, NEAR = 1024, 0.01
+"""States that are compared, and the part of their size up to which two motions are near each other."""
+QUARTERS, DECADES = 4, 0.5
+"""Nearby motions part exponentially if they part by so many decades from each quarter of the time to the next."""
+NUDGE = 2.0**-50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Known:
+    """What is known of the last state of a run.
+
+    Attributes:
+        q, p: (m,) absolute errors.
+        tenfold: time in which nearby motions part tenfold; infinite unless they part exponentially.
+    """
+
+    q: Array
+    p: Array
+    tenfold: float
+
+    @property
+    def chaotic(self) -> bool:
+        """Whether nearby motions part exponentially."""
+        return math.isfinite(self.tenfold)
+
+
+class _TooLongError(Exception):
+    """The second run would take too many steps."""
+
+
+@unwarned()
+def known_digits(system: MechanicalSystem, trajectory: Trajectory, *, most: int) -> Known | None:
+    """What is known of the last state of ``trajectory``, a motion of ``system``.
+
+    ``None`` where a second run fails, would take more than about ``most`` steps, or time is transformed.
+    """
+    if system.clock is not None or len(trajectory) < 2:
+        return None
+
+    def count(steps: int) -> None:
+        if steps > most:
+            raise _TooLongError
+
+    chosen = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
+    times = trajectory.t[chosen]
+    nudged = trajectory.q[0] * (1.0 + NUDGE * np.cos(np.arange(trajectory.q.shape[1])))
+    try:
+        second = compile_stepper(system, SVI(8)).integrate(
+            nudged,
+            trajectory.p[0],
+            t=float(times[0]),
+            t_end=float(times[-1]),
+            parameters=trajectory.parameters,
+            t_eval=times,
+            progress=count,
+        )
+    except (ScviCodegenError, _TooLongError):
+        return None
+    q, p = np.abs(second.q - trajectory.q[chosen]), np.abs(second.p - trajectory.p[chosen])
+    size = math.sqrt(float(np.mean(np.sum(second.q**2, axis=1)))) or 1.0
+    tenfold = _tenfold(np.linalg.norm(q, axis=1) / size, abs(float(times[-1] - times[0])))
+    return Known(q=_at_the_end(q), p=_at_the_end(p), tenfold=tenfold)
+
+
+def _at_the_end(apart: Array) -> Array:
+    """At the last state; it may be a lucky moment, so no less than in the mean over the last sixteenth."""
+    late = apart[-max(1, len(apart) // 16) :]
+    error: Array = np.maximum(apart[-1], np.sqrt(np.mean(late**2, axis=0)))
+    return error
+
+
+def _tenfold(apart: Array, span: float) -> float:
+    """From distances at equal times, as parts of the size of the motion, to the time of their growth tenfold."""
+    far = np.flatnonzero(apart > NEAR)
+    near = apart[1 : int(far[0]) if len(far) else len(apart)]
+    length = len(near) // QUARTERS
+    if length < 2:
+        return math.inf
+    means = [math.sqrt(float(np.mean(near[k * length : (k + 1) * length] ** 2))) for k in range(QUARTERS)]
+    if means[0] == 0.0:
+        return math.inf
+    gained = np.diff(np.log10(means))
+    if gained.min() < DECADES:
+        return math.inf
+    return float(span * length / (len(apart) - 1) / gained.mean())

@@ -1,0 +1,44 @@
+"""What is said of steps that were solved and are too long for their motion."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Final
+
+from scvi_codegen.errors import AccuracyWarning
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["TOLERABLE_ERROR", "unwarned", "warn_of_long_steps"]
+
+TOLERABLE_ERROR: Final = 1e-3
+"""Of a step, relative to the state: one that is wrong by more is too long for its motion."""
+
+_heard: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
+
+
+@contextmanager
+def unwarned() -> Iterator[None]:
+    """Inside, and in functions that this decorates, long steps are made on purpose."""
+    token = _heard.set(False)
+    try:
+        yield
+    finally:
+        _heard.reset(token)
+
+
+def warn_of_long_steps(trajectory: Trajectory, *, before: float = 0.0) -> None:
+    """An :class:`AccuracyWarning` of the worst step of a run of h, unless one ``before`` was a reason for it."""
+    error = trajectory.step_error
+    if trajectory.goal or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
+        return
+    warnings.warn(
+        f"the step from t = {trajectory.step_error_t:g} with h = {trajectory.h:g} is too long: the relative error of "
+        f"its end is about {error:.1e}; take a shorter h, or steps that choose their length (t_end= with a tolerance)",
+        AccuracyWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,192 @@
+"""What is said of a run is checked on that run: long steps, broken promises, digits that are known, chaos."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import scvi_codegen as sc
+from scvi_codegen.advice.known_digits import known_digits
+from scvi_codegen.advice.promise import broken_promise
+from scvi_codegen.cli import main
+from scvi_codegen.cli.wording import in_known_digits
+
+NEARLY_RADIAL = [1.999, 0.0], [0.0, 0.022366272]
+
+
+@pytest.fixture(scope="module")
+def kepler() -> sc.Stepper:
+    return sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
+
+
+def run(words: str) -> Result:
+    return CliRunner().invoke(main, ["run", *words.split()])
+
+
+class TestLongSteps:
+    def test_the_worst_is_named_with_what_to_do(self, kepler):
+        with pytest.warns(sc.AccuracyWarning, match=r"step from t = \S+ with h = 0.8 is too long.*t_end= with a tol"):
+            trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.8, steps=10)
+        assert trajectory.step_error > 1e-3
+        assert "too long" in trajectory._repr_html_()
+
+    def test_short_ones_are_not(self, kepler):
+        assert kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.05, steps=100).step_error < 1e-3
+
+    def test_a_run_says_it_once(self, kepler):
+        going = kepler.start([0.4, 0.0], [0.0, 2.0], h=0.8)
+        with pytest.warns(sc.AccuracyWarning):
+            going.record(10)
+        assert going.record(5).step_error > 1e-3  # and raises no warning
+
+    def test_where_nothing_tells_it_that_is_said(self):
+        verlet = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
+        trajectory = verlet.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=3)
+        assert math.isnan(trajectory.step_error)
+        assert "not known" in trajectory._repr_html_()
+        assert "its error is not known" in run("kepler --method stoermer-verlet --step 0.1 --steps 3").output
+
+
+class TestAnotherRoot:
+    @pytest.mark.parametrize(
+        ("name", "method", "h", "q", "p"),
+        [
+            ("cart-pole", sc.SCVI(2), 0.816, [1.1906153181856, 1.6868254287493], [-1.1281634410206, -1.1565320090084]),
+            ("cart-pole", sc.SCVI(3), 0.546, [0.8567033196555, -1.4329046594573], [-2.6947054154624, 0.4803669959440]),
+            ("duffing", sc.SCVI(3), 0.574, [1.3148677025525], [1.3204047352462]),
+            ("cart-pole", sc.SVI(8), -1.29, [-0.4553775197433, -1.9000272389824], [-0.9128980810847, 0.8228105556151]),
+            (
+                "henon-heiles",
+                sc.SVI(8),
+                2.51,
+                [-1.4422025976289, -0.2935955483372],
+                [-1.405773424083, 1.2936703707575],
+            ),
+        ],
+    )
+    def test_is_refused_or_said(self, name, method, h, q, p):
+        """Energies that grew to 1e9 in three steps, status ok."""
+        stepper = sc.compile_stepper(sc.problem(name).system, method)
+        with pytest.raises((sc.StepFailedError, sc.AccuracyWarning)):
+            stepper.integrate(q, p, h=h, steps=2)
+
+
+class TestPromises:
+    def test_a_collision_nearly_is_run_through_or_refused(self):
+        state = "--q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
+        assert re.search(r"q1 =\s+1\.99", run(f"kepler {state} --tolerance 1e-9").output)
+        refused = run(f"kepler {state} --advise 1e-9")
+        assert refused.exit_code != 0
+        assert "choose their length" in refused.stderr
+
+    def test_by_default_steps_choose_their_length(self):
+        system = sc.problem("kepler").system
+        motion = sc.solve_motion(system, (0.0, 6.0 * math.pi), [*NEARLY_RADIAL[0], *NEARLY_RADIAL[1]])
+        assert motion.success
+        assert motion.y[0, -1] == pytest.approx(1.999, abs=1e-6)
+        assert motion.trajectory.goal is not None
+
+    def test_a_step_that_is_worse_than_the_tolerance_breaks_it(self, kepler):
+        trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.2, steps=100)
+        system = sc.problem("kepler").system
+        assert "alone has a relative error" in broken_promise(system, trajectory, trajectory.step_error / 20.0)
+        assert broken_promise(system, trajectory, 1e-3) == ""
+
+    def test_an_energy_that_is_not_conserved_breaks_it(self):
+        euler = sc.compile_stepper(sc.problem("kepler").system, sc.ExplicitEuler())
+        trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.01, steps=500)
+        assert "energy" in broken_promise(sc.problem("kepler").system, trajectory, 1e-4)
+
+    def test_it_is_withdrawn_aloud(self, monkeypatch):
+        for module in ("cli.commands.run", "advice.motion"):
+            monkeypatch.setattr(f"scvi_codegen.{module}.broken_promise", lambda *_: "the tolerance is not kept")
+        result = run("kepler --span 5 --advise 1e-6")
+        assert result.exit_code == 1
+        assert "the tolerance is not kept" in result.stderr
+        motion = sc.solve_motion(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6)
+        assert (motion.success, motion.message) == (False, "the tolerance is not kept")
+
+    def test_a_tolerance_that_doubles_do_not_allow_is_said_before(self):
+        result = run("kepler --span 5 --tolerance 1e-30")
+        assert result.exit_code == 0
+        assert "Warning: doubles do not allow 1e-30" in result.stderr
+
+
+class TestKnownDigits:
+    def test_they_are_right(self, kepler):
+        """Against a circle, with a step that leaves an error of 1e-7 or so."""
+        trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=1.9, steps=60)
+        known = known_digits(sc.problem("kepler").system, trajectory, most=10_000)
+        t = trajectory.t[-1]
+        error = np.abs(trajectory.q[-1] - [math.cos(t), math.sin(t)])
+        assert np.all(error <= 1.01 * known.q + 1e-14)
+        assert np.all(known.q < 100.0 * np.linalg.norm(error))
+        assert not known.chaotic
+
+    def test_chaos_is_seen(self):
+        problem = sc.problem("double-pendulum")
+        stepper = sc.compile_stepper(problem.system, sc.SVI(8))
+        trajectory = stepper.integrate(problem.q, velocity=problem.velocity, h=0.02, steps=2500)
+        known = known_digits(problem.system, trajectory, most=100_000)
+        assert known.chaotic
+        assert known.q.max() > 1e-4
+
+    def test_a_second_run_that_takes_too_long_is_given_up(self, kepler):
+        trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.5, steps=4000)
+        assert known_digits(sc.problem("kepler").system, trajectory, most=10) is None
+
+    @pytest.mark.parametrize(
+        ("x", "error", "text"),
+        [
+            (1.23456789, 1e-4, " 1.235"),
+            (-123.456, 8.0, "-1e+02"),
+            (0.3, 7.0, " 0.3 within 7"),
+            (0.0, 1e-9, " 0 within 1e-09"),
+            (0.1, 0.0, " 0.10000000000000001"),
+        ],
+    )
+    def test_are_printed(self, x, error, text):
+        assert in_known_digits(x, error) == text
+
+    def test_on_the_command_line(self):
+        said = run("kepler --steps 400").output
+        assert "in the digits that a second run confirms)" in said
+        assert len(re.search(r"q1 =\s+(\S+)", said)[1]) < 17
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(3))
+def test_every_wrong_step_is_refused_or_said(seed):
+    """Random states and lengths over the catalogue; the judge is the same step, cut by steps of their own lengths."""
+    random, wrong = np.random.default_rng(seed), 0
+    names = ("cart-pole", "henon-heiles", "duffing", "point-vortices", "double-pendulum", "kepler")
+    for name in names:
+        problem = sc.problem(name)
+        judge = sc.compile_stepper(problem.system, sc.SVI(8))
+        for method in (sc.SVI(3), sc.SVI(4), sc.SVI(8), sc.SCVI(3)):
+            if name == "point-vortices" and isinstance(method, sc.SCVI):
+                continue  # no velocities there
+            stepper = sc.compile_stepper(problem.system, method)
+            for _ in range(100):
+                q, p = random.normal(size=(2, stepper.dimension))
+                wrong += _is_wrong(stepper, judge, q, p, problem.step * 10.0 ** random.uniform(-1.0, 1.0))
+    assert wrong > 100  # so that there is something to be said
+
+
+def _is_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.ndarray, h: float) -> bool:
+    """Whether a step is off by more than a hundredth; then it must have been said."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", sc.AccuracyWarning)
+        try:
+            one, exact = stepper.integrate(q, p, h=h, steps=1), judge.integrate(q, p, t_end=h)
+        except (sc.StepFailedError, sc.StateError):
+            return False
+    size = np.linalg.norm([np.abs(q) + np.abs(one.q[-1] - q), p])
+    off = np.linalg.norm([one.q[-1] - exact.q[-1], one.p[-1] - exact.p[-1]]) / size
+    assert off < 1e-2 or one.step_error > 1e-3, (q, p, h)
+    return bool(off > 1e-2)
