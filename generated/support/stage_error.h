@@ -2,13 +2,13 @@
  * tables STAGE_HIGHEST, STAGE_BEND and STAGE_OTHER_BEND; STAGE_POWER. */
 
 /* z: unknowns of the stages. */
-static real stage_error(const step_data *step, const real *z, const real *dq, real least)
+static real stage_error(const step_data *step, const real *z, const real *dq, real share, real least)
 {
   real largest = 0;
   for (int i = 0; i < M; i++)
     largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]));
   for (int i = 0; i < M; i++) {
-    const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + REAL_EPSILON * largest + REAL_MIN);
+    const real unit = step->h / (MATH(fabs)(step->q0[i]) + MATH(fabs)(dq[i]) + share * largest + REAL_MIN);
     real top = 0, bend = 0, other = 0;
     for (int b = 0; b < B; b++) {
       top += STAGE_HIGHEST[b] * z[i * B + b];

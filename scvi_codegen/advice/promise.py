@@ -17,6 +17,7 @@ STEP_MARGIN = 10.0
 ENERGY_MARGIN = 100.0
 """Energies may be off by so many times more, as part of their size, than positions: near a collision they are."""
 ROUNDING = 1e-11
+INSTEAD = "let steps choose their length (t_end, --tolerance)"
 
 
 def broken_promise(system: MechanicalSystem, trajectory: Trajectory, tolerance: float) -> str:
@@ -27,7 +28,7 @@ def broken_promise(system: MechanicalSystem, trajectory: Trajectory, tolerance: 
     if trajectory.step_error > STEP_MARGIN * tolerance:
         return (
             f"the tolerance {tolerance:g} is not kept: the step from t = {trajectory.step_error_t:g} alone has a "
-            f"relative error of about {trajectory.step_error:.1e}"
+            f"relative error of about {trajectory.step_error:.1e}; {INSTEAD}"
         )
     if system.depends_on_time:
         return ""
@@ -39,4 +40,7 @@ def broken_promise(system: MechanicalSystem, trajectory: Trajectory, tolerance: 
     change = float(np.abs(energy - energy[0]).max()) / (size or 1.0)
     if math.isfinite(change) and change <= ENERGY_MARGIN * tolerance + ROUNDING:
         return ""
-    return f"the tolerance {tolerance:g} is not kept: the energy, which the motion conserves, is off by {change:.1e}"
+    return (
+        f"the tolerance {tolerance:g} is not kept: the energy, which the motion conserves, is off by {change:.1e}; "
+        f"{INSTEAD}"
+    )

@@ -6,12 +6,9 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from scvi_codegen.errors import AccuracyWarning
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["TOLERABLE_ERROR", "unwarned", "warn_of_long_steps"]
 
@@ -19,6 +16,19 @@ TOLERABLE_ERROR: Final = 1e-3
 """Of a step, relative to the state: one that is wrong by more is too long for its motion."""
 
 _heard: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
+
+
+class Steps(Protocol):
+    """What a trajectory tells of its steps."""
+
+    @property
+    def goal(self) -> object: ...
+    @property
+    def h(self) -> float: ...
+    @property
+    def step_error(self) -> float: ...
+    @property
+    def step_error_t(self) -> float: ...
 
 
 @contextmanager
@@ -31,7 +41,7 @@ def unwarned() -> Iterator[None]:
         _heard.reset(token)
 
 
-def warn_of_long_steps(trajectory: Trajectory, *, before: float = 0.0) -> None:
+def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0) -> None:
     """An :class:`AccuracyWarning` of the worst step of a run of h, unless one ``before`` was a reason for it."""
     error = trajectory.step_error
     if trajectory.goal or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():

@@ -35,5 +35,5 @@ static inline double attempt(run_memory *run, step_data *step, const solver_data
   step->tables = NULL;
   if (status != OK || !reaches(step->q0, dq) || !reaches(step->p0, dp))
     return INFINITY;
-  return curve_error(step, data, run->memory, dq, least);
+  return curve_error(step, data, run->memory, dq, EACH, least);
 }

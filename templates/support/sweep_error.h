@@ -3,5 +3,5 @@ static double largest_error(const run_memory *run, const step_data *step, const 
     double *workspace)
 {
   (void)workspace;
-  return run->guess > 0 ? curve_error(step, data, run->memory, dq, run->error) : NAN;
+  return run->guess > 0 ? curve_error(step, data, run->memory, dq, ALL, run->error) : NAN;
 }

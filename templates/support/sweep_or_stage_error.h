@@ -4,6 +4,6 @@ static double largest_error(const run_memory *run, const step_data *step, const 
     double *workspace)
 {
   if (run->guess > 0)
-    return curve_error(step, data, run->memory, dq, run->error);
-  return larger(run->error, pow(stage_error(step, newton_in(workspace).z, dq, 0.0), STAGE_POWER / ERROR_POWER));
+    return curve_error(step, data, run->memory, dq, ALL, run->error);
+  return larger(run->error, pow(stage_error(step, newton_in(workspace).z, dq, ALL, 0.0), STAGE_POWER / ERROR_POWER));
 }

@@ -259,7 +259,6 @@ def test_a_motion_chooses_its_step_for_a_tolerance():
         ({"t_span": (0,)}, "two times"),
         ({"y0": [1.0, 2.0, 3.0]}, "positions and then momenta"),
         ({"y0": [1.0, 2.0]}, "shape"),
-        ({"h": None}, "must be given"),
         ({"method": SVI(3)}, "has its method"),
         ({"h": math.inf}, "inf"),
     ],
