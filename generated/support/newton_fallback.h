@@ -25,6 +25,6 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   memset(dq + M, 0, sizeof(double) * M);
   memset(dp + M, 0, sizeof(double) * M);
   if (status == OK && report->iterations - before > NEARLY_LINEAR && strays(step, newtons.z, dq))
-    return STRAYED;
+    return STATUS(STRAYED);
   return status;
 }

@@ -9,18 +9,21 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sympy import Expr
 
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.kinds import SWITCH, of, takes
+from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI, Method, as_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.events import EventLike
+from scvi_codegen.runtime.longest_step import longest_step, too_wrong
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -75,6 +78,7 @@ def solve_motion(
     h: float | None = None,
     tolerance: float | None = None,
     rtol: float | None = None,
+    monitor: str | Expr | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
     events: EventLike | Sequence[EventLike] | None = None,
@@ -99,6 +103,9 @@ def solve_motion(
         tolerance: in place of ``h``: the error |q - q_exact| / |q| at the end, for which :func:`advise` chooses it.
             Where the run breaks the promise, ``success`` is False.
         rtol: the relative error of the end of each step whose length is its own; by default round-off.
+        monitor: g of :func:`reparametrise`: by equal steps of tau, dt = g dtau, symplectic and of variable length in t.
+            ``h`` is then of tau; without it :func:`longest_step` finds one for ``rtol``. A run with steps that do not
+            keep it is no success.
         t_eval: (n,) times at which states are wanted; by default the ends of the steps.
         dense_output: whether ``sol`` is wanted, for which all steps are kept.
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
@@ -119,26 +126,32 @@ def solve_motion(
     q, given = (y0, None) if velocity is not None else _halves(y0)
     advised = None
     if isinstance(system, Stepper):
-        if method is not None or tolerance is not None:
-            raise StateError("a compiled stepper has its method, and its step is h, or its own: leave out tolerance")
+        if method is not None or monitor is not None or tolerance is not None:
+            raise StateError(
+                "a compiled stepper has its method and monitor, and its step is h, or its own: leave out tolerance"
+            )
         stepper = system
         p = stepper.momenta_given(q, given, velocity, start, parameters)
     else:
         method = SVI(8) if method is None else as_method(method)
+        system = system if monitor is None else reparametrise(system, monitor)
         stepper = compile_stepper(system, method)
         p = stepper.momenta_given(q, given, velocity, start, parameters)
-        if h is None and rtol is None:
+        if h is None and rtol is None and system.clock is None:
             advised = tolerance if tolerance is not None or _chooses(stepper) else ADVISED
         if advised is not None:
             advice = advise(system, method, q, p, end - start, advised, t=start, parameters=parameters, options=options)
             h = advice.h
+    promised = h is None and bool(stepper.interface.energy_parameter)
+    if promised:
+        h = longest_step(stepper, q, p, end - start, rtol or 0.0, t=start, parameters=parameters, options=options)
     asked = None if t_eval is None else times_of_run(t_eval, start, end)
     status, message, failure = REACHED, "The end of the span was reached.", None
     try:
         trajectory = stepper.integrate(
             q,
             p,
-            **_steps(stepper, start, end, h, rtol),
+            **_steps(stepper, start, end, h, None if promised else rtol),
             t=start,
             parameters=parameters,
             options=options,
@@ -150,10 +163,20 @@ def solve_motion(
     ended_by = trajectory.ended_by
     if ended_by is not None and failure is None:
         status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
-    if advised is not None and failure is None and not isinstance(system, Stepper):
-        broken = broken_promise(system, trajectory, advised)
-        status, message = (BROKEN, broken) if broken else (status, message)
+    if failure is None and (broken := _broken(system, trajectory, advised, (rtol or 0.0) if promised else None)):
+        status, message = BROKEN, broken
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
+
+
+def _broken(
+    system: MechanicalSystem | Stepper, trajectory: Trajectory, advised: float | None, promised: float | None
+) -> str:
+    """What a run belies of the error advised for its end, or promised of its steps; or nothing."""
+    if advised is not None and not isinstance(system, Stepper):
+        return broken_promise(system, trajectory, advised)
+    if promised is not None:
+        return too_wrong(trajectory.step_error, trajectory.step_error_t, promised) or ""
+    return ""
 
 
 INSTEAD = {

@@ -39,8 +39,11 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
     """The model with step and number of steps for an error at the end; prints why, and warnings to stderr.
 
     Raises:
-        StateError: if the tolerance is not positive, every pilot run fails, or very many steps are needed.
+        StateError: in transformed time, if the tolerance is not positive, every pilot run fails, or very many steps are
+            needed.
     """
+    if model.system.clock is not None:
+        raise StateError("steps of tau are chosen by the error of a step: give --tolerance in place of --advise")
     stepper = compile_stepper(model.system, model.method, solver=solver)
     advice = advise(
         model.system,

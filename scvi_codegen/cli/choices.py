@@ -52,10 +52,12 @@ class Choices:
     span: float | None
     steps: int | None
     every: int | None
+    monitor: str | None = None
 
     def sections(self) -> dict[str, dict[str, Any]]:
         """The same as sections of a model file."""
-        named = {
+        named: dict[str, dict[str, Any]] = {
+            "system": {"monitor": self.monitor},
             "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
             "method": {name: getattr(self, name) for name in METHOD_CHOICES},
             "run": {"step": self.step, "span": self.span, "steps": self.steps, "every": self.every},
@@ -161,10 +163,15 @@ STATE_OPTIONS = (
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
     _option("--velocity", metavar="V1,V2,..", callback=_numbers, help="Initial velocities, instead of momenta."),
     _option("--time", type=float, metavar="T", help="Initial time."),
-    _option("--step", type=float, metavar="H", help="Step size; negative to go back."),
+    _option("--step", type=float, metavar="H", help="Step size; negative to go back; with --monitor of tau."),
     _option("--span", type=float, metavar="T", help="Length of time to cover."),
     _option("--steps", type=int, metavar="N", help="Number of steps, instead of --span."),
     _option("--every", type=int, metavar="N", help="Keep each N-th state."),
+    _option(
+        "--monitor",
+        metavar="G",
+        help="Steps of one length in tau, dt = G dtau: frequency, distance, potential, arclength or a formula.",
+    ),
 )
 
 

@@ -24,7 +24,7 @@ def check_memory(model: Model, trajectories: int = 1) -> None:
     Raises:
         StateError: naming the size, and the distance between states at which they fit.
     """
-    check_room(model, model.step_count if model.h is not None else 0, trajectories)
+    check_room(model, 0 if model.ends_at_time else model.step_count, trajectories)
 
 
 def check_room(model: Model, steps: int, trajectories: int = 1) -> None:

@@ -88,7 +88,9 @@ class RecordedOutcome:
         if steps:
             since = f" since step {self.first}" if self.first else ""
             lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} a step, with writing")
-        return "\n".join([*lines, *self._conserved(), *final_state(self.run)])
+        return "\n".join(
+            [*lines, *self._conserved(), *final_state(self.run.stepper.coordinates, self.run.q, self.run.p)]
+        )
 
     def _conserved(self) -> list[str]:
         """What was conserved, if there is a model to tell what should be."""
@@ -134,6 +136,8 @@ class Recording:
         text = None
         with suppress(ModelFileError):
             text = dump_model(model)
+        if model.system.clock is not None and model.ends_at_time:
+            raise click.UsageError("in transformed time a folder holds a number of steps: give --step and --steps")
         run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
         return self._watched(
             record_run,
@@ -154,6 +158,8 @@ class Recording:
         manifest, further = recorded.manifest, {}
         if manifest.goal and span is not None:
             further["t_end"] = manifest.t + math.copysign(span, manifest.goal.t_end - manifest.t)
+        elif span is not None and manifest.interface.energy_parameter:
+            raise click.UsageError("in transformed time a folder holds a number of steps: give --steps, not --span")
         elif span is not None:
             steps = max(1, round(span / abs(manifest.h)))
         goal = manifest.steps if steps is None else steps
@@ -195,6 +201,8 @@ def standing(recorded: RecordedRun) -> str:
         way += "" if recorded.finished else f" (of {manifest.goal.t_end:g})"
     else:
         far = "all" if recorded.finished else f"of {manifest.steps}"
+        if manifest.interface.energy_parameter:
+            done, t = f"{done} in tau", float(recorded.t[-1])
         way = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
     kept = f"{counted(len(recorded), 'state')} kept in '{recorded.folder}'"
     return f"{' '.join(manifest.interface.title.split())}\n{way}; {kept}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,9 @@ from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, unwarned
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.longest_step import too_wrong
+from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -49,6 +52,7 @@ class RunOutcome:
         seconds: spent in steps.
         failure: the error of the step that failed, or ``None``.
         interrupted: whether the user or the system stopped the run.
+        broken: what was promised of its steps and not kept, or ``None``.
     """
 
     trajectory: Trajectory
@@ -57,6 +61,14 @@ class RunOutcome:
     seconds: float
     failure: StepFailedError | None
     interrupted: bool
+    broken: str | None = None
+
+    @property
+    def end(self) -> tuple[float, Array, Array]:
+        """Time, positions and momenta; in transformed time the run itself stands before a last, shorter step."""
+        run, kept = self.run, self.trajectory
+        inside = kept.tau is not None and (kept.t[-1] - run.t) * run.h > 0.0
+        return (float(kept.t[-1]), kept.q[-1], kept.p[-1]) if inside else (run.t, run.q, run.p)
 
 
 @unwarned()
@@ -71,6 +83,8 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     check_memory(model)
     began = time.perf_counter()
     run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
+    if model.system.clock is not None and model.ends_at_time:
+        return _by_clock(model, run, time.perf_counter() - began)
     preparation, seconds = time.perf_counter() - began, 0.0
     pieces, failure = [run.record(0, every=model.every)], None
     with interruptions() as caught, progress_bar(_length(model)) as advance:
@@ -99,6 +113,37 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     )
 
 
+def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
+    """A run of steps of tau to the end of the model's span of time."""
+    end, began, failure, shown = model.t + model.covered, time.perf_counter(), None, 0
+    observed = Observation(run, every=model.every, end=end)
+    with interruptions() as caught, progress_bar(PARTS) as advance:
+
+        def look(_: int) -> None:
+            nonlocal shown
+            check_room(model, run.steps)
+            done = min(PARTS, int(PARTS * (run.t - model.t) / model.covered))
+            advance(done - shown)
+            shown = done
+
+        try:
+            trajectory = observed.advance(None, look, lambda: bool(caught))
+        except StepFailedError as error:
+            failure, trajectory = error, Trajectory.before(error)
+    broken = None
+    if model.tolerance is not None:
+        broken = too_wrong(trajectory.step_error, trajectory.step_error_t, model.tolerance)
+    return RunOutcome(
+        trajectory=trajectory,
+        run=run,
+        preparation=preparation,
+        seconds=time.perf_counter() - began,
+        failure=failure,
+        interrupted=bool(caught) and not observed.ended,
+        broken=broken,
+    )
+
+
 def _ended(model: Model, run: Run) -> bool:
     return run.arrived if run.goal else run.steps >= model.step_count
 
@@ -121,7 +166,7 @@ def summary(model: Model, outcome: RunOutcome) -> str:
         model.system.name,
         f"{method.title}; {order}, {'' if is_symplectic(method, model.system) else 'not '}symplectic, "
         f"{'' if method.symmetric else 'not '}symmetric",
-        f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {run.t:g}; "
+        f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {outcome.end[0]:g}; "
         f"{counted(len(trajectory), 'state')} kept",
     ]
     if run.steps:
@@ -129,7 +174,7 @@ def summary(model: Model, outcome: RunOutcome) -> str:
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory)
         lines += worst_step(trajectory)
-    return "\n".join([*lines, *final_state(run, _known(model, outcome))])
+    return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], _known(model, outcome))])
 
 
 def _known(model: Model, outcome: RunOutcome) -> Known | None:
@@ -142,6 +187,8 @@ def _known(model: Model, outcome: RunOutcome) -> Known | None:
 
 def of_length(h: float | None, run: Run) -> str:
     """How long the steps of a run are."""
+    if run.stepper.interface.energy_parameter:
+        return f"of {run.h:g} in tau"
     return f"of their own lengths ({run.rejected} rejected)" if run.goal or h is None else f"of {h:g}"
 
 
@@ -172,13 +219,12 @@ def worst_step(trajectory: Trajectory) -> Iterator[str]:
         yield said + too_long * (trajectory.step_error > TOLERABLE_ERROR)
 
 
-def final_state(run: Run, known: Known | None = None) -> Iterator[str]:
+def final_state(names: Sequence[str], positions: Array, momenta: Array, known: Known | None = None) -> Iterator[str]:
     """Where a run stands: lines with coordinates and momenta, in the digits that are known."""
-    names = run.stepper.coordinates
     shown = names[:SHOWN_COORDINATES]
     width = max(map(len, shown))
-    yield f"final state ({_how_known(known)})" if run.steps else "final state"
-    for i, (name, q, p) in enumerate(zip(shown, run.q, run.p, strict=False)):
+    yield f"final state ({_how_known(known)})"
+    for i, (name, q, p) in enumerate(zip(shown, positions, momenta, strict=False)):
         known_q, known_p = (known.q[i], known.p[i]) if known else (0.0, 0.0)
         yield f"  {name:{width}} = {in_known_digits(q, known_q):24} p_{name:{width}} = {in_known_digits(p, known_p)}"
     if len(names) > SHOWN_COORDINATES:

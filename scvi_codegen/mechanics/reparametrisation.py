@@ -23,6 +23,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -76,7 +77,12 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
         name=f"{system.name} in transformed time",
         parameters=(*system.parameters, level),
         defaults=(*system.defaults, 0.0),
-        clock=Clock(rate=rate, energy=level),
+        clock=Clock(
+            rate=rate,
+            energy=level,
+            monitor=monitor if isinstance(monitor, str) else format_expression(rate),
+            plain=system,
+        ),
     )
     if isinstance(named, HamiltonianSystem):
         return replace(named, hamiltonian=_distributed(rate, named.hamiltonian - level))

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import sympy
@@ -48,10 +48,14 @@ class Clock:
         rate: dt/dtau, a function of the coordinates (of a Hamiltonian also of the momenta).
         energy: the parameter that is the energy of the initial state; the function of the system is then
             rate (energy of the state - energy), zero along the motion.
+        monitor: the rate as it was asked for, by name or as text; it and ``plain`` are for model files.
+        plain: the system in its own time.
     """
 
     rate: Expr
     energy: Symbol
+    monitor: str = field(default="", compare=False)
+    plain: MechanicalSystem | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

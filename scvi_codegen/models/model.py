@@ -38,8 +38,10 @@ class Model:
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h: step size, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given.
-        tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off.
+        h: step size, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given. In transformed time
+            steps are of tau.
+        tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off. In
+            transformed time :func:`longest_step` chooses one length of tau for it.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps of h, or ``None`` if ``span`` is given.
         every: distance between kept states in steps.
@@ -97,12 +99,27 @@ class Model:
         """Number of steps of h: ``steps``, or the whole number (at least 1) of steps nearest to ``span``.
 
         Raises:
-            ModelFileError: where steps choose their length.
+            ModelFileError: where the run ends at a time.
         """
         if self.steps is not None:
             return self.steps
+        if self.h is not None and self.ends_at_time:
+            raise ModelFileError(
+                "how many steps of tau a span takes is not known before: give steps (--steps) for this"
+            )
         assert self.span is not None  # by construction
         return max(1, round(self.span / abs(self.step)))
+
+    @property
+    def ends_at_time(self) -> bool:
+        """Whether it is a time that ends the run, after a number of steps that is not known before."""
+        return self.h is None or (self.system.clock is not None and self.span is not None)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """By name: the defaults of the system, but for an energy that is that of the initial state."""
+        level = self.system.clock.energy if self.system.clock else None
+        return {given.name: value for given, value in self.system.constants.items() if given != level}
 
     @property
     def step(self) -> float:
@@ -126,18 +143,26 @@ class Model:
         if self.p is not None:
             return np.array(self.p)
         assert self.velocity is not None  # by construction
-        return stepper.momentum(self.q, self.velocity, self.t, self.system.defaults)
+        return stepper.momentum(self.q, self.velocity, self.t, self.parameters)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
-        """The run of this model from its initial state, to be advanced by :attr:`step_count` steps or to its goal."""
+        """The run of this model from its initial state, to be advanced by :attr:`step_count` steps or to its end."""
+        p, h = self.momenta(stepper), self.h
+        if h is None and self.system.clock is not None:
+            from scvi_codegen.runtime.longest_step import longest_step  # here: reading a model does not wait for NumPy
+
+            assert self.tolerance is not None  # by construction
+            h = longest_step(
+                stepper, self.q, p, self.covered, self.tolerance, t=self.t, parameters=self.parameters, options=options
+            )
         return stepper.start(
             self.q,
-            self.momenta(stepper),
-            h=self.h,
+            p,
+            h=h,
             t=self.t,
-            t_end=self.t + self.covered if self.h is None else None,
-            tolerance=self.tolerance or None,
-            parameters=self.system.defaults,
+            t_end=self.t + self.covered if h is None else None,
+            tolerance=self.tolerance or None if h is None else None,
+            parameters=self.parameters,
             options=options,
         )
 

@@ -4,6 +4,8 @@
     name = "planar pendulum"
     coordinates = ["q"]
     lagrangian = "m*l**2*q_dot**2/2 + m*g*l*cos(q)"     # several lines between """ and """
+    # monitor = "1/(1 + sin(q)**2)"                     # dt/dtau, or a name: steps are then of tau, the span is of
+                                                        # time; without a step tolerance = 0
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
 
@@ -61,6 +63,7 @@ from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD, Model, check_length, real
@@ -72,7 +75,7 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "catalogue")
+SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "catalogue", "monitor")
 RUN_KEYS = ("step", "tolerance", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "parameters", "initial", "method", "run")
@@ -149,7 +152,8 @@ def dump_model(model: Model) -> str:
 
 
 def _document(model: Model) -> dict[str, Any]:
-    system = model.system
+    clock = model.system.clock
+    system = clock.plain if clock and clock.plain else model.system
     names = [coordinate.name for coordinate in system.coordinates]
     kind = "hamiltonian" if system.auxiliaries else "lagrangian"
     momenta = {"momenta": [p.name for p in system.auxiliaries]} if system.auxiliaries else {}
@@ -159,9 +163,10 @@ def _document(model: Model) -> dict[str, Any]:
     forces = zip(names, system.forces, strict=False)
     if acting := {name: _wrapped(format_expression(force)) for name, force in forces if force != 0}:
         document["forces"] = acting
+    if clock:
+        document["system"]["monitor"] = clock.monitor
     if system.parameters:
-        values = zip(system.parameters, system.defaults, strict=True)
-        document["parameters"] = {parameter.name: value for parameter, value in values}
+        document["parameters"] = model.parameters
     return {**document, **_motion(model, names)}
 
 
@@ -190,6 +195,7 @@ def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[
 
 def _read_model(document: Document, given: Document) -> Model:
     entry = _read_catalogue(document.get("system", {}))
+    document, given = _with_own_step(document), _with_own_step(given)
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
         document = _laid_over(_motion(Model.from_problem(entry), names), document)
@@ -200,8 +206,19 @@ def _read_model(document: Document, given: Document) -> Model:
         _check_complete(document)
         _check_used(document, given.get("parameters", {}))
     system = _read_system(document, entry)
+    if "monitor" in document["system"]:
+        monitor = _text(document["system"], "monitor", "[system]")
+        system = _in_section("[system]", lambda: reparametrise(system, monitor))
     state = _read_state(document["initial"], system)
     return Model(system=system, method=_read_method(document["method"]), **state, **_read_run(document["run"]))
+
+
+def _with_own_step(layer: Document) -> Document:
+    """Where time is transformed a step given for another time is of no use: one is chosen unless it is said with it."""
+    run = layer.get("run", {})
+    if "monitor" not in layer.get("system", {}) or "step" in run or "tolerance" in run:
+        return layer
+    return {**layer, "run": {**run, "tolerance": 0.0}}
 
 
 def _laid_over(below: Document, above: Document) -> dict[str, Section]:
@@ -267,7 +284,7 @@ def _check_used(document: Document, parameters: Section) -> None:
 def _read_catalogue(section: Section) -> Problem | None:
     if "catalogue" not in section:
         return None
-    _check_keys(section, ("catalogue",), "key", "[system] beside catalogue")
+    _check_keys(section, ("catalogue", "monitor"), "key", "[system] beside catalogue")
     name = _text(section, "catalogue", "[system]")
     return _in_section("[system]", lambda: problem(name))
 

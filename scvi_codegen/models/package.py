@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from string import Template
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
 from scvi_codegen.files.atomic import write_atomically
@@ -32,6 +32,7 @@ from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.runtime.stepper import Stepper
 
 if TYPE_CHECKING:
+    from scvi_codegen.mechanics.system import MechanicalSystem
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
@@ -187,13 +188,22 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
     """The whole run of the model in at most about twenty lines of output."""
     from scvi_codegen.rendering.text import ExampleRun
 
+    clock = model.system.clock
+    if model.h is None and clock:
+        raise ModelFileError(
+            "give a step of tau (--step, [run] step): without compiling none can be found for a tolerance"
+        )
     if model.h is None and not controlled:
         raise MethodError(f"{model.method.name} has no steps that choose their length (tolerance): give a step h")
-    steps = OUTPUTS if model.h is None else max(1, model.step_count)
+    momenta = model.p if model.p is not None else _momenta(model)
+    if clock and model.ends_at_time:
+        steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
+    else:
+        steps = OUTPUTS if model.h is None else max(1, model.step_count)
     every = max(1, steps // OUTPUTS)
     return ExampleRun(
         q=model.q,
-        p=model.p if model.p is not None else _momenta(model),
+        p=momenta,
         parameters=model.system.defaults,
         t=model.t,
         h=model.h,
@@ -202,6 +212,7 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
         controlled=controlled,
         every=every,
         outputs=steps // every,
+        to_end=bool(clock) and model.ends_at_time,
     )
 
 
@@ -215,13 +226,37 @@ def _momenta(model: Model) -> tuple[float, ...]:
     system = lagrangian_twin(model.system)
     if system is None:
         raise StateError("velocities do not determine the momenta of this Hamiltonian: give p, not q_dot")
+    rate = _rate(system, model.q, ()) if system.clock else 1.0
     symbols = (*system.coordinates, *system.velocities, system.time, *system.parameters)
-    numbers = (*model.q, *(model.velocity or ()), model.t, *system.defaults)
+    numbers = (*model.q, *(rate * mp.mpf(v) for v in model.velocity or ()), model.t, *system.defaults)
     point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))
     try:
         return tuple(float(evaluate(expression, point)) for expression in forms_of(system).momentum)
     except ArithmeticError as error:
         raise StateError(f"the initial velocities have no momenta: {error}") from error
+
+
+def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> Any:
+    """dt/dtau at a state, in 60 digits."""
+    from scvi_codegen.formulas.tape import evaluate
+    from scvi_codegen.tables.precision import mp
+
+    assert system.clock is not None
+    symbols = (*system.coordinates, *system.auxiliaries, *system.parameters)
+    numbers = (*q, *(p if system.auxiliaries else ()), *system.defaults)
+    try:
+        rate = evaluate(system.clock.rate, dict(zip(symbols, map(mp.mpf, numbers), strict=True)))
+    except ArithmeticError as error:
+        raise StateError(f"the rate of time, the monitor, has no value at the initial state: {error}") from error
+    if not rate > 0:
+        raise StateError(f"the rate of time, the monitor, is {float(rate):g} at the initial state, not positive")
+    return rate
+
+
+CLOCK = """
+Time is transformed: steps `h` are of tau, dt = g dtau with the monitor g, and `t` is carried along. The parameter
+`${energy}` is the energy of the initial state; `main.c` shows how it is set.
+"""
 
 
 def _model_text(model: Model) -> str | None:
@@ -257,7 +292,8 @@ def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None
             title=" ".join(interface.title.split()),
             notes=", ".join(interface.notes),
             coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
-            parameters=f"Parameters, with default values: {listed}." if listed else "There are no parameters.",
+            parameters=(f"Parameters, with default values: {listed}." if listed else "There are no parameters.")
+            + Template(CLOCK if interface.energy_parameter else "").substitute(energy=interface.energy_parameter),
             control=Template(CONTROL).substitute(prefix=interface.prefix) if controlled else "",
             integrate=f"\ntrajectory = {interface.prefix}.stepper.integrate(q0, p0, t_end=t_end)" if controlled else "",
             origin="`model.toml` is what it was generated from." if with_model else "",

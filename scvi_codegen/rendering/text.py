@@ -68,6 +68,7 @@ class ExampleRun:
         span: of time.
         tolerance: of steps that choose their length.
         controlled: whether the integrator has these.
+        to_end: whether it goes on to the end of the span, in steps of tau whose number is not known before.
     """
 
     q: tuple[float, ...]
@@ -80,6 +81,7 @@ class ExampleRun:
     controlled: bool
     every: int
     outputs: int
+    to_end: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,8 +51,15 @@ class Observation:
         """Whether the run ended inside of a step, which is not taken: by a terminal event, or where it was to end."""
         return self.arrived or (self.search is not None and self.search.ended)
 
-    def advance(self, steps: int | None, progress: Callable[[int], None] | None = None) -> Trajectory:
+    def advance(
+        self,
+        steps: int | None,
+        progress: Callable[[int], None] | None = None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Trajectory:
         """Advance by ``steps`` (``None``: to the end), or to the step in which a terminal event ends the run.
+
+        ``stop`` is asked after each portion whether to end there.
 
         Raises:
             StepFailedError: with what was kept as ``trajectory``; the run stands before the failing step.
@@ -64,7 +71,7 @@ class Observation:
         self._keep(record(self.run, 0), first=True)
         most = max(1, NUMBERS // self.run.stepper.dimension)
         portion, done = min(FIRST_STEPS, most), 0
-        while done < most_steps and not self.run.arrived:
+        while done < most_steps and not self.run.arrived and not stop():
             size, began = int(min(portion, most_steps - done)), time.perf_counter()
             try:
                 self._portion(size)

@@ -22,7 +22,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
 {
   coordinates own[GROUPS], *z = kept(past, own);
   lanes u[2 * M], value[GROUPS][2 * M], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
-  number inverse_size[M];
+  number inverse_size[M] = {0.0};
   progress now = before_sweeps();
   int status = OK;
   if (*steps > 0)

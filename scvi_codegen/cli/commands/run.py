@@ -50,7 +50,8 @@ __all__ = ["run"]
     "--tolerance",
     type=float,
     metavar="X",
-    help="Steps choose their length: the relative error allowed to the end of each (1e-16: round-off).",
+    help="Steps choose their length: the relative error allowed to the end of each (1e-16: round-off). With --monitor "
+    "one step of tau is chosen for it.",
 )
 @click.option(
     "--advise",
@@ -86,8 +87,13 @@ def run(
 
     With --tolerance each step has the length that its error allows. With --advise one step for all is chosen by short
     pilot runs, for the error wanted at the end; advice and evidence are printed, and a run that belies them ends with
-    exit status 1. With --ensemble MODEL is run from many initial states. A grid has one section, every combination is
-    run:
+    exit status 1.
+
+    With --monitor steps are of one length in a time tau that runs the slower the faster the motion is; the map stays
+    symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
+    and all times are of t.
+
+    With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
 
     \b
       [grid]
@@ -109,6 +115,7 @@ def run(
       scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
       scvi-codegen run kepler --tolerance 1e-12
       scvi-codegen run kepler --advise 1e-9
+      scvi-codegen run kepler --monitor frequency --span 1000
     """
     recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
     if resume is not None:
@@ -187,6 +194,8 @@ def _run_one(
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
+    if outcome.broken is not None:
+        raise CommandFailure(f"{outcome.broken}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         click.echo(f"wrote {path}")
     broken = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised)
@@ -205,6 +214,8 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
 
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
+    if model.system.clock is not None:
+        raise click.UsageError("in transformed time every trajectory has its own times: --ensemble does not go with it")
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
     click.echo(ensemble_summary(model, outcome))
     kept = "the states computed were not written to a file (-o)"

@@ -1,0 +1,110 @@
+"""Models in transformed time: files, the command line, and generated folders."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
+from scvi_codegen.models.package import generate_package, load_package
+
+STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
+BY_CLOCK = {"system": {"monitor": "frequency"}, "run": {"step": 0.2, "span": 20.0}}
+
+
+@pytest.fixture(scope="module")
+def model() -> sc.Model:
+    return catalogue_model("kepler", BY_CLOCK)
+
+
+def invoke(*words: str, status: int = 0) -> str:
+    result = CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
+    assert result.exit_code == status, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("monitor", ["frequency", "(q1**2 + q2**2)**(3/4)"])
+def test_files_hold_the_monitor(monitor: str) -> None:
+    found = catalogue_model("kepler", {"system": {"monitor": monitor}, "parameters": {"mu": 1.5}})
+    text = dump_model(found)
+    assert f'monitor = "{monitor}"' in text
+    assert "E =" not in text
+    again = parse_model(text)
+    assert again == found
+    assert again.system.clock is not None
+    assert (again.h, again.tolerance) == (None, 0.0)
+
+
+def test_a_step_for_another_time_is_not_taken_over(model: sc.Model) -> None:
+    text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
+    assert parse_model(text, {"system": {"monitor": "frequency"}}).h is None
+    assert parse_model(text, BY_CLOCK) == model
+    assert parse_model(dump_model(model)).h == 0.2
+    with pytest.raises(ModelFileError, match="not known before"):
+        _ = model.step_count
+    with pytest.raises(ModelFileError, match="no monitor 'frequencies'"):
+        catalogue_model("kepler", {"system": {"monitor": "frequencies"}})
+    changed = sc.change_coordinates(
+        sc.reparametrise(sc.problem("kepler").system, "frequency"),
+        {"q1": "u**2 - w**2", "q2": "2*u*w"},
+        coordinates=["u", "w"],
+    )
+    with pytest.raises(ModelFileError, match="does not survive"):
+        dump_model(sc.Model(system=changed, method=sc.SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), h=0.1, steps=3))
+
+
+def test_the_command_line_runs_to_a_time(model: sc.Model, tmp_path: Path) -> None:
+    orbit = tmp_path / "orbit.npz"
+    said = invoke("run", "kepler", "--monitor", "frequency", "--step", "0.2", "--span", "20", "-o", str(orbit))
+    assert "of 0.2 in tau from t = 0 to t = 20;" in said
+    stepper = sc.compile_stepper(model.system, model.method)
+    run = stepper.integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
+    with np.load(orbit) as file:
+        assert np.array_equal(file["t"], run.t)
+        assert np.array_equal(file["q"], run.q)
+    assert f"{run.q[-1, 0]:.17g}" in said
+    back = invoke("run", "kepler", "--monitor", "frequency", "--step", "-0.2", "--span", "5")
+    assert "to t = -5;" in back
+
+
+def test_the_command_line_finds_a_step_and_tells_when_it_does_not_serve() -> None:
+    said = invoke("run", "kepler", "--monitor", "frequency", "--span", "50", "--tolerance", "1e-8")
+    error = float(said.partition("relative error about ")[2].partition(",")[0])
+    assert 1e-12 < error < 1e-7
+    far = ("--q", "1.9999,0", "--velocity", "0,0.00707", "--span", "6", "--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)")
+    assert "Error" in invoke("run", "kepler", *far, "--tolerance", "1e-10", status=1)
+
+
+def test_folders_hold_a_number_of_steps(tmp_path: Path) -> None:
+    folder, by_clock = str(tmp_path / "orbit.run"), ("run", "kepler", "--monitor", "frequency")
+    assert "give --step and --steps" in invoke(*by_clock, "--step", "0.2", "--span", "9", "-o", folder, status=2)
+    assert "50 steps in tau (all)" in invoke(*by_clock, "--step", "0.2", "--steps", "50", "-o", folder)
+    assert "not --span" in invoke("run", "--resume", folder, "--span", "9", status=2)
+    assert "60 steps in tau (all)" in invoke("run", "--resume", folder, "--steps", "60")
+
+
+def test_generated_folders_carry_time_and_energy(model: sc.Model, tmp_path: Path) -> None:
+    folder = generate_package(model, tmp_path / "by_clock")
+    done = subprocess.run(
+        ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"], capture_output=True, text=True, check=True
+    )
+    rows = np.array([[float(x) for x in line.split()] for line in done.stdout.splitlines() if not line.startswith("#")])
+    run = load_package(folder).integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
+    kept = rows[rows[:, 0] <= run.t[-2]]
+    assert len(kept) > 15
+    for t, row in zip(kept[:, 0], kept, strict=True):
+        k = int(np.abs(run.t - t).argmin())
+        assert np.abs(np.concatenate([[run.t[k]], run.q[k], run.p[k]]) - row[:5]).max() < 1e-12
+    assert np.abs(rows[:, -1]).max() < 1e-13
+    assert rows[-1, 0] >= 20.0
+    assert "`E` is the energy of the initial state" in (folder / "README.md").read_text()
+    assert parse_model((folder / "model.toml").read_text()) == model
+    with pytest.raises(ModelFileError, match="give a step of tau"):
+        generate_package(catalogue_model("kepler", {"system": {"monitor": "frequency"}}), tmp_path / "none")

@@ -1,0 +1,81 @@
+"""The longest step of tau for a wanted accuracy, and what is said of a run that does not keep it."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.runtime.longest_step import ALLOWED, RUNGS, longest_step, too_wrong
+
+KEPLER = sc.problem("kepler").system
+START: Any = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
+"""Apocentre of an ellipse of eccentricity 0.9, period 2 pi."""
+
+
+@cache
+def stepper() -> sc.Stepper:
+    return sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.SVI(8))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-12, 1e-8])
+def test_it_keeps_the_tolerance_and_a_longer_one_does_not(tolerance: float) -> None:
+    h = longest_step(stepper(), *START, 20.0, tolerance)
+    errors = [stepper().integrate(*START, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / RUNGS))]
+    assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
+    assert longest_step(stepper(), *START, -20.0, tolerance) == pytest.approx(-h)
+
+
+def test_steps_of_it_are_right_to_round_off_after_many_orbits() -> None:
+    """Beside Kepler's ellipse, which closes."""
+    h = longest_step(stepper(), *START, 100.0)
+    run = stepper().integrate(*START, h=h, t_end=40 * np.pi)
+    assert len(run) < 20 * 30
+    assert np.abs(run.q[-1] - START[0]).max() < 2e-11
+    assert np.ptp(run.energy()) < 1e-13
+
+
+def test_one_call_integrates_in_transformed_time() -> None:
+    times = np.array([0.0, np.pi, 2 * np.pi, 8 * np.pi])
+    found = sc.solve_motion(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", t_eval=times)
+    assert found.success
+    assert np.abs(found.y[:2, ::2].T - START[0]).max() < 1e-12
+    assert found.y[:2, 1] == pytest.approx([-0.1, 0.0], abs=1e-12)
+    rough = sc.solve_motion(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", rtol=1e-6)
+    assert rough.success
+    assert 2.0**-53 < rough.trajectory.step_error < 1e-6 * ALLOWED
+    with pytest.raises(StateError, match="has its method and monitor"):
+        sc.solve_motion(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, monitor="frequency")
+
+
+def test_a_monitor_that_fits_the_beginning_alone_is_found_out() -> None:
+    """Slow for hundreds of steps far out, with a rate that hardly changes; then the comet is at the sun."""
+    far = [2.0 - 1e-4, 0.0, 0.0, (1e-4 / (2.0 - 1e-4)) ** 0.5]
+    found = sc.solve_motion(
+        KEPLER, (0.0, 6.0), far, monitor="1e-3*(1 + (q1**2 + q2**2)/1000)", rtol=1e-10, method=sc.SVI(8)
+    )
+    assert not found.success
+    assert found.status == -2
+
+
+def test_what_is_said_of_a_too_wrong() -> None:
+    assert too_wrong(9e-16, 1.0, 0.0) is None
+    assert too_wrong(float("nan"), 1.0, 0.0) is not None
+    said = too_wrong(1e-3, 1.5, 1e-9)
+    assert said is not None
+    assert "t = 1.5" in said
+    assert "1.0e-03, where 1.0e-09 was wanted" in said
+
+
+def test_what_has_no_longest_step_is_refused() -> None:
+    for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
+        with pytest.raises(StateError, match="with a tolerance"):
+            longest_step(stepper(), *START, span, tolerance)
+    verlet = sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.StoermerVerlet())
+    if np.isnan(verlet.integrate(*START, h=0.1, steps=3).step_error):
+        with pytest.raises(MethodError, match="give a step h"):
+            longest_step(verlet, *START, 1.0, 1e-3)
