@@ -98,7 +98,7 @@ def test_generated_folders_carry_time_and_energy(model: sc.Model, tmp_path: Path
     rows = np.array([[float(x) for x in line.split()] for line in done.stdout.splitlines() if not line.startswith("#")])
     run = load_package(folder).integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
     kept = rows[rows[:, 0] <= run.t[-2]]
-    assert len(kept) > 15
+    assert len(kept) > 5
     for t, row in zip(kept[:, 0], kept, strict=True):
         k = int(np.abs(run.t - t).argmin())
         assert np.abs(np.concatenate([[run.t[k]], run.q[k], run.p[k]]) - row[:5]).max() < 1e-12
