@@ -141,7 +141,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #include "support/vector_library.h"
 #include "support/points.h"
 
-LANES_LIBRARY_FUNCTION(sin)
+LANES_LIBRARY_FUNCTION(sin);
 
 static const lanes ABSCISSA[1] = {{0.2113248654051871, 0.7886751345948129}};
 static const lanes DRIFT[1] = {{0.2113248654051871, 0.7886751345948129}};

@@ -27,7 +27,8 @@ typedef union {
     for (int j = 0; j < LANES / SCVI_PART; j++)     \
       view.part[j] = SCVI_NAME(f, v)(view.part[j]); \
     return view.all;                                \
-  }
+  }                                                 \
+  static inline lanes lanes_##f(lanes x)
 
 #define LANES_LIBRARY_FUNCTION_OF_TWO(f)                            \
   library_part SCVI_NAME(f, vv)(library_part, library_part);        \
@@ -37,7 +38,8 @@ typedef union {
     for (int j = 0; j < LANES / SCVI_PART; j++)                     \
       view.part[j] = SCVI_NAME(f, vv)(view.part[j], other.part[j]); \
     return view.all;                                                \
-  }
+  }                                                                 \
+  static inline lanes lanes_##f(lanes x, lanes y)
 
 #else
 #define LANES_LIBRARY_FUNCTION(f) LANES_FUNCTION(f)

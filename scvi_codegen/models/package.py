@@ -62,6 +62,7 @@ def generate_package(
     solver: str = "auto",
     force: bool = False,
     embedded: Embedded | None = None,
+    single_file: bool = False,
 ) -> Path:
     """Write the integrator of a model into a folder, made if it is missing; files of others in it are left alone.
 
@@ -73,6 +74,7 @@ def generate_package(
         solver: of the stage equations, as for ``compile_stepper``.
         force: overwrite files of the same names that were edited or written by someone else.
         embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package.
+        single_file: the support headers inside the one source, each once where it is included, not beside it.
 
     Returns:
         The folder.
@@ -84,7 +86,7 @@ def generate_package(
     """
     target = Path(folder)
     prefix = _prefix(target)
-    texts = _texts(model, prefix, solver, embedded)
+    texts = _texts(model, prefix, solver, embedded, single_file=single_file)
     try:
         target.mkdir(parents=True, exist_ok=True)
         stale = _stale(target, texts)
@@ -158,7 +160,7 @@ def _prefix(folder: Path) -> str:
     return name
 
 
-def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None) -> dict[str, str]:
+def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Text by file name, ``interface.json`` last."""
     from scvi_codegen.compiler import generate_source
     from scvi_codegen.rendering.text import render_example
@@ -171,6 +173,8 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None) ->
         embedded=embedded,
         controlled=not embedded or model.h is None,
     )
+    if single_file:
+        source = source.amalgamated()
     texts = source.files
     texts |= render_example(interface, _example(model, controlled=ADVANCE_TO in source.header), embedded or "double")
     described = _model_text(model)

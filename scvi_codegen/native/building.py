@@ -279,7 +279,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
                 ended.enter_context(_finished(command, folder))
             if not (folder / "binding.c").exists():
                 _write_binding(source, folder)
-                ended.enter_context(_finished([*compiler, *shared, "-O1", "-c", "binding.c"], folder))
+                ended.enter_context(_finished([*compiler, *shared, "-O0", "-c", "binding.c"], folder))
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break

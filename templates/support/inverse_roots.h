@@ -23,7 +23,8 @@ static inline lanes lanes_estimate_inverse_root(lanes x)
     const lanes y = lanes_estimate_inverse_root(x), square = y * y, e = 1.0 - x * square;                \
     const lanes power = powers, first = a + b * e, then = c + d * e;                                     \
     return power + (power * e) * (first + (e * e) * then);                                               \
-  }
+  }                                                                                                      \
+  static inline lanes lanes_inverse_root_##k(lanes x)
 
 #else
 
@@ -40,6 +41,7 @@ static inline lanes lanes_root(lanes x)
   {                                                   \
     const lanes inverse = 1.0 / x;                    \
     return inverses * lanes_root(x);                  \
-  }
+  }                                                   \
+  static inline lanes lanes_inverse_root_##k(lanes x)
 
 #endif

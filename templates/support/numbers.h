@@ -27,10 +27,11 @@ static int all_finite(const real *x, int n)
   return sum == 0;
 }
 
-/* inverse_root_k, x^(-k/2), k odd: INVERSE_ROOT(k, inverse^((k+1)/2)). */
+/* inverse_root_k, x^(-k/2), k odd: INVERSE_ROOT(k, inverse^((k+1)/2)); ends in a declaration, for the semicolon. */
 #define INVERSE_ROOT(k, inverses)             \
   static inline real inverse_root_##k(real x) \
   {                                           \
     const real inverse = 1 / x;               \
     return inverses * MATH(sqrt)(x);          \
-  }
+  }                                           \
+  static inline real inverse_root_##k(real x)

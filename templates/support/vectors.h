@@ -25,7 +25,7 @@ static inline lanes multiply_add(lanes a, lanes b, lanes c)
   return z.all;
 }
 
-/* lanes_f, the function f of libm lane by lane. */
+/* lanes_f, the function f of libm lane by lane; ends in a declaration, for the semicolon. */
 #define LANES_FUNCTION(f)                \
   static inline lanes lanes_##f(lanes x) \
   {                                      \
@@ -33,7 +33,8 @@ static inline lanes multiply_add(lanes a, lanes b, lanes c)
     for (int j = 0; j < LANES; j++)      \
       view.lane[j] = f(view.lane[j]);    \
     return view.all;                     \
-  }
+  }                                      \
+  static inline lanes lanes_##f(lanes x)
 
 #define LANES_FUNCTION_OF_TWO(f)                     \
   static inline lanes lanes_##f(lanes x, lanes y)    \
@@ -42,4 +43,5 @@ static inline lanes multiply_add(lanes a, lanes b, lanes c)
     for (int j = 0; j < LANES; j++)                  \
       view.lane[j] = f(view.lane[j], other.lane[j]); \
     return view.all;                                 \
-  }
+  }                                                  \
+  static inline lanes lanes_##f(lanes x, lanes y)

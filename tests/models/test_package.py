@@ -52,6 +52,28 @@ def test_writes_all_that_belongs_to_an_integrator(pendulum, tmp_path):
     assert "pendulum_svi_step" in (folder / "README.md").read_text()
 
 
+def test_a_single_file_computes_the_same_bits(tmp_path):
+    pendulum = model_of("planar-pendulum", method=SVI(3), steps=200)
+    many = generate_package(pendulum, tmp_path / "many" / "pendulum_svi")
+    single = generate_package(pendulum, tmp_path / "single" / "pendulum_svi", single_file=True)
+    assert sorted(path.name for path in single.glob("*.[ch]")) == ["main.c", "pendulum_svi.c", "pendulum_svi.h"]
+    assert not (single / "support").exists()
+    strict = "CFLAGS=-O1 -ffp-contract=off -std=c11 -Wall -Wextra -Wpedantic -Werror"
+    printed = [
+        subprocess.run(["make", "-s", "-C", folder, strict], capture_output=True, text=True, check=True).stdout
+        for folder in (many, single)
+    ]
+    assert len(printed[0].splitlines()) > 20
+    assert printed[0] == printed[1]
+    assert load_package(single).step([0.5], [0.0], 0.1) == load_package(many).step([0.5], [0.0], 0.1)
+
+
+def test_a_single_file_in_the_place_of_many_leaves_none_of_them(pendulum, tmp_path):
+    folder = generate_package(pendulum, tmp_path / "pendulum_svi")
+    generate_package(pendulum, folder, single_file=True)
+    assert list(folder.glob("support/*")) == []
+
+
 def test_equal_models_give_equal_bytes(pendulum, tmp_path):
     one, two = (generate_package(pendulum, tmp_path / parent / "same") for parent in ("a", "b"))
     for path in filter(Path.is_file, one.rglob("*")):

@@ -25,7 +25,16 @@ __all__ = ["generate"]
     type=click.Choice(["double", "single"]),
     help="C for a microcontroller, in this precision, without a Python package.",
 )
-def generate(model_name: str, output: str, solver: str, force: bool, embedded: Embedded | None, **choices: Any) -> None:
+@click.option("--single-file", is_flag=True, help="One C file without support headers beside it, as for --embedded.")
+def generate(
+    model_name: str,
+    output: str,
+    solver: str,
+    force: bool,
+    embedded: Embedded | None,
+    single_file: bool,
+    **choices: Any,
+) -> None:
     """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
 
     With --embedded the C is small: Newton's iteration alone, or an explicit method, iterations bounded by a macro.
@@ -37,7 +46,7 @@ def generate(model_name: str, output: str, solver: str, force: bool, embedded: E
       python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
     """
     model = read_model(model_name, Choices(**choices))
-    folder = generate_package(model, output, solver=solver, force=force, embedded=embedded)
+    folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
     click.echo(f"{model.system.name}: {model.method.title}")
     python = "" if embedded else f", or 'import {folder.resolve().name}'"
     click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}")
