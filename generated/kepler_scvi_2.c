@@ -87,10 +87,10 @@ static const int NODE_SLOPE_4[2][2] = {{0, 0}, {1, 1}};
 static const int PLACE[SITES] = {0, 1};
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
-INVERSE_ROOT(1, inverse);
-INVERSE_ROOT(3, inverse * inverse);
-INVERSE_ROOT(5, inverse * inverse * inverse);
-INVERSE_ROOT(7, inverse * inverse * inverse * inverse);
+INVERSE_ROOT(1, (inverse));
+INVERSE_ROOT(3, (inverse * inverse));
+INVERSE_ROOT(5, (inverse * inverse * inverse));
+INVERSE_ROOT(7, (inverse * inverse * inverse * inverse));
 
 /* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, double t, const double *parameters, double *value)
@@ -324,8 +324,8 @@ static const double STAGE_OTHER_BEND[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 #include "support/inverse_roots.h"
 #include "support/points.h"
 
-LANES_INVERSE_ROOT(3, square * y, inverse * inverse);
-LANES_INVERSE_ROOT(5, square * square * y, inverse * inverse * inverse);
+LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
+LANES_INVERSE_ROOT(5, (square * square * y), (inverse * inverse * inverse));
 
 static const lanes NODE_TIME = {0.5, 1.0};
 static const lanes COLLOCATION[2] = {{0.75, 1.0}, {-0.25, 0.0}};

@@ -73,9 +73,9 @@ static const int QUADRATURE_SLOPE_1[2][2] = {{0, 0}, {1, 1}};
 static const int PLACE[SITES] = {0, 1};
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
-INVERSE_ROOT(1, inverse);
-INVERSE_ROOT(3, inverse * inverse);
-INVERSE_ROOT(5, inverse * inverse * inverse);
+INVERSE_ROOT(1, (inverse));
+INVERSE_ROOT(3, (inverse * inverse));
+INVERSE_ROOT(5, (inverse * inverse * inverse));
 
 /* L_q and L_v at u = (q, v). Operations: 5 *, 1 +, 1 inverse_root_3, 2 neg. */
 static void quadrature_value(const double *u, double t, const double *parameters, double *value)
@@ -198,7 +198,7 @@ static const double STAGE_OTHER_BEND[4] = {-1.0, 0.0, 1.0, 0.0};
 #include "support/inverse_roots.h"
 #include "support/points.h"
 
-LANES_INVERSE_ROOT(3, square * y, inverse * inverse);
+LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
 
 static const lanes ABSCISSA[1] = {{0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970263}};
 static const lanes DRIFT[1] = {{0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970263}};

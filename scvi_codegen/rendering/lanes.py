@@ -141,7 +141,7 @@ def _function(name: str) -> str:
     if name.startswith(INVERSE_ROOT):
         k = int(name.removeprefix(INVERSE_ROOT))
         powers = " * ".join(["square"] * (k // 2) + ["y"])
-        return f"LANES_INVERSE_ROOT({k}, {powers}, {' * '.join(['inverse'] * ((k + 1) // 2))})"
+        return f"LANES_INVERSE_ROOT({k}, ({powers}), ({' * '.join(['inverse'] * ((k + 1) // 2))}))"
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
 
 

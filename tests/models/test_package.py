@@ -53,7 +53,7 @@ def test_writes_all_that_belongs_to_an_integrator(pendulum, tmp_path):
 
 
 def test_a_single_file_computes_the_same_bits(tmp_path):
-    pendulum = model_of("planar-pendulum", method=SVI(3), steps=200)
+    pendulum = model_of("planar-pendulum", method=SVI(3), steps=200, span=None)
     many = generate_package(pendulum, tmp_path / "many" / "pendulum_svi")
     single = generate_package(pendulum, tmp_path / "single" / "pendulum_svi", single_file=True)
     assert sorted(path.name for path in single.glob("*.[ch]")) == ["main.c", "pendulum_svi.c", "pendulum_svi.h"]
