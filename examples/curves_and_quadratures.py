@@ -1,10 +1,13 @@
 """Where other curves than polynomials, and other quadratures than Gauss's, win (paper, 4.2.3)."""
 
 import math
+import warnings
 
 import numpy as np
 
 import scvi_codegen as sc
+
+warnings.simplefilter("ignore", sc.AccuracyWarning)  # the steps are long on purpose
 
 
 def compare(what, system, start, *, h, steps, methods):

@@ -41,7 +41,7 @@ class Tape:
         try:
             for place, operation, operands in self._steps:
                 values[place] = operation(*[values[operand] for operand in operands])
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, AttributeError) as error:
             raise ArithmeticError(f"no real value: {error}") from error
         found = [values[place] for place in self._results]
         if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in found):

@@ -32,7 +32,7 @@
     [run]
     step = 0.5                                          # negative: backward
     span = 100.0                                        # length of time, or steps = 200
-                                                        # or tolerance = 1e-9 (0: round-off) in place of a step: steps
+                                                        # or tolerance = 1e-9 (0, and without both: round-off): steps
                                                         # choose their length; then a negative span goes back
     every = 1                                           # distance between kept states; left out: 1
 
@@ -81,7 +81,7 @@ KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_K
 SECTIONS = ("system", "forces", "parameters", "initial", "method", "run")
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance"}, {"span", "steps"})
 """One of each is given."""
-NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("step", "span")}
+NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("span",)}
 """Keys, or their alternatives, without which there is nothing to run."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
 """Arguments that a method laid over another takes from it, if it has them."""
@@ -355,6 +355,10 @@ def _read_run(section: Section) -> dict[str, Any]:
     _check_one(section, "run", "span", "steps")
     fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
     numbers = {field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section}
+    if not {"step", "tolerance"} & section.keys():
+        if "steps" in section:
+            raise ModelFileError("[run] has steps and no step, which says how long they are")
+        numbers["tolerance"] = 0.0
     every = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
     if "steps" not in section:
         return {**numbers, "every": every}

@@ -43,7 +43,7 @@ def steps_of_ensemble(h: float | None, steps: int | None, **others: object) -> t
     return h, steps
 
 
-class Kept(NamedTuple):
+class KeptLane(NamedTuple):
     """What is kept of a trajectory: its states, why it ended, and the steps that were taken."""
 
     t: Array
@@ -87,7 +87,7 @@ class EnsembleToEnds:
                 raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
             farthest = max((goal.t_end for goal in self.goals), key=lambda end: abs(end - self.t0))
             self.t_eval = times_of_run(t_eval, self.t0, farthest)
-        self.kept: dict[int, Kept] = {}
+        self.kept: dict[int, KeptLane] = {}
 
     def _goals(self, t_end: ArrayLike, tolerance: float | None) -> list[Goal]:
         """One for each trajectory, all forward or all back."""
@@ -149,7 +149,7 @@ class EnsembleToEnds:
                 stop.set()
                 pool.shutdown(cancel_futures=True)
 
-    def _trajectory(self, j: int, heed: Callable[[int], None]) -> Kept:
+    def _trajectory(self, j: int, heed: Callable[[int], None]) -> KeptLane:
         goal, status = self.goals[j], OK
         try:
             run = Memory.started(
@@ -163,10 +163,10 @@ class EnsembleToEnds:
             )
             found = self._states(run, goal, heed)
         except StateError:  # a sum of finite terms that overflowed
-            return Kept(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
+            return KeptLane(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
         except StepFailedError as failure:
             status, found = failure.status, Trajectory.before(failure)
-        return Kept(found.t, found.q, found.p, status, run.steps)
+        return KeptLane(found.t, found.q, found.p, status, run.steps)
 
     def _states(self, run: Memory, goal: Goal, heed: Callable[[int], None]) -> Trajectory:
         if self.t_eval is None:
@@ -198,7 +198,7 @@ class EnsembleToEnds:
             stepper=self.stepper,
         )
 
-    def _by_number(self, found: list[Kept]) -> tuple[Array, Array, list[slice]]:
+    def _by_number(self, found: list[KeptLane]) -> tuple[Array, Array, list[slice]]:
         """Numbers of the states, and the time of each; a trajectory with fewer states ends before the last row."""
         rows = [slice(0, len(each.t)) for each in found]
         count = max(row.stop for row in rows)
@@ -207,11 +207,11 @@ class EnsembleToEnds:
             times[row, j] = each.t
         return np.arange(count, dtype=float), times, rows
 
-    def _unfinished(self, j: int) -> Kept:
+    def _unfinished(self, j: int) -> KeptLane:
         first = slice(0, 1 if self.t_eval is None else 0)
-        return Kept(np.array([self.t0])[first], self.q[[j]][first], self.p[[j]][first], INTERRUPTED, 0)
+        return KeptLane(np.array([self.t0])[first], self.q[[j]][first], self.p[[j]][first], INTERRUPTED, 0)
 
     def keep(self, part: slice, found: EnsembleTrajectory) -> None:
         """Take over what was integrated of a part elsewhere."""
         for j, each in zip(range(part.start, part.stop), found.each(), strict=True):
-            self.kept[j] = Kept(*each)
+            self.kept[j] = KeptLane(*each)

@@ -58,7 +58,7 @@ def test_from_sympy_as_from_text():
         ({"forces": {"z": "1"}}, "force on 'z', which is no coordinate"),
         ({"forces": {"x": "1 +"}}, "column"),
         ({"forces": {"x": "k*x"}}, "'k'"),
-        ({"forces": "x"}, "mapping from coordinates"),
+        ({"forces": "x"}, "mapping from names"),
         ({"dissipation": "c*x**2"}, "no velocity occurs in the dissipation"),
     ],
 )

@@ -229,7 +229,7 @@ def test_text_errors_carry_the_column() -> None:
 
 
 def test_coordinates_as_one_string_are_refused() -> None:
-    with pytest.raises(SystemDefinitionError, match="sequence of names"):
+    with pytest.raises(SystemDefinitionError, match="list of names"):
         LagrangianSystem.from_text(name="system", coordinates="xy", lagrangian="x_dot**2")
 
 

@@ -159,7 +159,7 @@ def test_a_catalogue_reference_may_be_changed():
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("every", "evry", "unknown key 'evry' in [run]; did you mean 'every'?"),
         ('name = "pendulum"\n', "", "there is no name in [system]"),
-        ("step = 0.25\n", "", "there is no step or tolerance in [run]"),
+        ("step = 0.25\nspan = 10\n", "steps = 40\n", "[run] has steps and no step"),
         ("degree = 3\n", "", "svi needs 'degree'"),
         ("q = [0.5]\n", "", "there is no q in [initial]"),
         ("q_dot = [0]\n", "", "there is no p or q_dot in [initial]"),
@@ -212,9 +212,10 @@ def test_mistakes_are_named(old, new, message, tmp_path):
 
 
 def test_all_that_is_missing_is_named_at_once():
-    with pytest.raises(ModelFileError, match=r"no step or tolerance in \[run\], no span or steps in \[run\]"):
+    with pytest.raises(ModelFileError, match=r"there is no span or steps in \[run\]"):
         parse_model(PENDULUM[: PENDULUM.index("[run]")])
-    everything = ["name", "coordinates", "hamiltonian.or.lagrangian", "q", "p.or.q_dot", "step.or.tolerance"]
+    assert parse_model(PENDULUM.replace("step = 0.25\n", "")).tolerance == 0.0
+    everything = ["name", "coordinates", "hamiltonian.or.lagrangian", "q", "p.or.q_dot"]
     everything.append("span.or.steps")
     with pytest.raises(ModelFileError, match=r" in \[\w+\], no ".join(everything)):
         parse_model("")
