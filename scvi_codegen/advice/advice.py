@@ -26,6 +26,7 @@ from scvi_codegen.kinds import SWITCH, TEXT, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
+from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import unwarned
@@ -162,7 +163,7 @@ def advise(
     for candidate in _candidates(method) if degree else [method]:
         for stepper in _steppers(system, candidate, solver):
             try:
-                found.append(_advised(stepper, candidate, q, state, length, target))
+                found.append(_advised(stepper, candidate, is_symplectic(candidate, system), q, state, length, target))
             except StateError as failure:
                 failures.append(failure)
                 continue
@@ -175,13 +176,27 @@ def advise(
 
 
 def _advised(
-    stepper: Stepper, method: Method, q: ArrayLike, state: Mapping[str, Any], span: float, tolerance: float
+    stepper: Stepper,
+    method: Method,
+    symplectic: bool,
+    q: ArrayLike,
+    state: Mapping[str, Any],
+    span: float,
+    tolerance: float,
 ) -> tuple[float, Advice]:
     """What pilot runs of one stepper advise, and what a unit of time costs then."""
     start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks them
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
-    pilot = launch(partial(stepper.integrate, **state), method, start, span, goal=tolerance / SAFETY, most=most)
+    pilot = launch(
+        partial(stepper.integrate, **state),
+        method,
+        start,
+        span,
+        symplectic=symplectic,
+        goal=tolerance / SAFETY,
+        most=most,
+    )
     choice = _choose(pilot, tolerance)
     return _cost(pilot, choice.n, points), _advice(pilot, choice, method)
 
@@ -332,5 +347,5 @@ def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int) -> Ite
     useless = [n for n in pilot.judged if pilot.error(n) >= 1.0]
     if useless and len(useless) < len(pilot.judged):
         yield f"With a step of {pilot.step(max(useless)):.3g} no digit is right."
-    if method.symplectic:
+    if pilot.symplectic:
         yield "The step is to stay fixed, which keeps the method symplectic."

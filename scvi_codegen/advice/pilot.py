@@ -55,7 +55,9 @@ class Leg(NamedTuple):
     failure: str = ""
 
 
-def launch(integrate: Integrate, method: Method, q: Array, span: float, *, goal: float, most: int) -> Pilot:
+def launch(
+    integrate: Integrate, method: Method, q: Array, span: float, *, symplectic: bool, goal: float, most: int
+) -> Pilot:
     """The pilot over the longest part of the span that can be resolved, down to steps with errors below the goal.
 
     Args:
@@ -63,6 +65,7 @@ def launch(integrate: Integrate, method: Method, q: Array, span: float, *, goal:
         method: of the stepper.
         q: (m,) initial positions.
         span: length of time, not 0; negative to go back.
+        symplectic: whether steps keep the symplectic form.
         goal: error at the end of the span.
         most: steps of any run.
 
@@ -71,7 +74,7 @@ def launch(integrate: Integrate, method: Method, q: Array, span: float, *, goal:
     """
     pilot, first = None, 1
     for cuts in range(MOST_CUTS, -1, -1):
-        longer = Pilot(integrate, method, q, span, span / CUT**cuts)
+        longer = Pilot(integrate, method, q, span, span / CUT**cuts, symplectic)
         longer.resolve(first, most // SEARCH)
         if not longer.resolved:
             break
@@ -95,9 +98,11 @@ class Pilot:
     Errors are extrapolated with ``rate``, that of their exponential growth, if it is not 0.
     """
 
-    def __init__(self, integrate: Integrate, method: Method, q: Array, span: float, length: float) -> None:
+    def __init__(
+        self, integrate: Integrate, method: Method, q: Array, span: float, length: float, symplectic: bool
+    ) -> None:
         self.integrate, self.q, self.span, self.length, self.rate = integrate, q, span, length, 0.0
-        self.order, self.symplectic = method.order or 1, method.symplectic
+        self.order, self.symplectic = method.order or 1, symplectic
         self.legs: dict[int, Leg] = {}
 
     @property

@@ -333,3 +333,12 @@ class TestCommandLine:
             result = self.invoke(words)
             assert result.exit_code == 2, result.output
             assert message in result.stderr
+
+
+def test_nothing_symplectic_is_said_where_forces_act():
+    kept = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
+    damped = LagrangianSystem.from_text(
+        name="damped", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", dissipation="q_dot**2/10"
+    )
+    assert "symplectic" in kept.message
+    assert "symplectic" not in advise(damped, SVI(4), [0.5], [0.0], 5.0, 1e-6).message
