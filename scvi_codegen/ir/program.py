@@ -94,6 +94,7 @@ class Program:
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
         order: of the method; where none is claimed, the number of its points.
+        polynomial_curves: whether the highest coefficient of a curve tells what it leaves unresolved.
         stage_curve: what tells how well the curve of the stages is resolved, or ``None``.
         numbers: the paper's, of equations for a few unknowns, and of those for q1 and p1; ``""`` where
             it has none.
@@ -127,6 +128,7 @@ class Program:
     splitting: Splitting | None
     newton: bool
     order: int
+    polynomial_curves: bool
     stage_curve: StageCurve | None
     numbers: tuple[str, str, str]
     integrals: Integrals | None = None
@@ -144,6 +146,8 @@ class Program:
     @property
     def error_power(self) -> int:
         """Of h in what a run keeps of the error of its curves; 0 where there is none."""
+        if not self.polynomial_curves:
+            return 0
         if self.sweep:
             return self.sweep.error_power
         return self.stage_curve.power if self.stage_curve else 0

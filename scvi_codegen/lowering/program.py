@@ -70,6 +70,7 @@ def lower(
     families = tuple(lowered_family(system, family, sites) for family in stages.families) if newton else ()
     met = [*mass, *_meetings(families)]
     order = (*places([pair for pair in met if max(pair) < m], m), *range(m, sites.count))
+    polynomial = method.exactness.curve != 0
     return Program(
         prefix=prefix,
         title=_comment(f"{system.name}: {method.title}"),
@@ -101,7 +102,8 @@ def lower(
         splitting=splitting,
         newton=newton,
         order=method.order or len(stages.blocks),
-        stage_curve=_stage_curve(stages) if newton and splitting is None else None,
+        polynomial_curves=polynomial,
+        stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
         integrals=_integrals(system, method, stages),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )

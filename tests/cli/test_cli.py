@@ -172,7 +172,7 @@ class TestChoices:
     def test_options_supply_what_a_file_lacks(self):
         text = output_of("systems", "kepler")
         Path("bare.toml").write_text(text[: text.index("[initial]")])
-        missing = "no q in [initial], no p or q_dot in [initial], no step or tolerance in [run]"
+        missing = "no q in [initial], no p or q_dot in [initial], no span or steps in [run]"
         assert missing in error_of("run", "bare.toml")
         model = chosen("bare.toml", q=(1.0, 0.0), velocity=(0.0, 1.0), step=0.1, steps=2)
         assert (model.method, model.h, model.steps, model.p) == (SVI(8), 0.1, 2, None)

@@ -246,13 +246,14 @@ def test_a_wrong_argument_is_named(kepler, arguments, words):
         kepler.integrate([1.0, 0.0], [0.0, 1.0], **arguments)
 
 
-def test_methods_without_a_curve_say_so():
-    stepper = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
+@pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(4, space="trigonometric:0.5")])
+def test_methods_without_a_polynomial_curve_say_so(method):
+    stepper = sc.compile_stepper(sc.problem("kepler").system, method)
     with pytest.raises(MethodError, match="tells the error of a step"):
         stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
 
 
-@pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, space="trigonometric:0.5")])
+@pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, "gauss-legendre:9")])
 def test_newtons_iteration_has_them(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")
     assert "sweep(" not in stepper.source.code
