@@ -9,12 +9,18 @@ from typing import Any
 import pytest
 from browsing import chromium
 from samples import Sample, compile_quickly, sample_named, stepper_for
+from tiers import mark_the_rest_full
 
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.stepper import Stepper
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell
+
+
+@pytest.hookimpl(tryfirst=True)  # before those of the full tier are left out
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    mark_the_rest_full(items)
 
 
 @pytest.fixture(scope="session")

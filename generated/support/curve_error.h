@@ -13,14 +13,14 @@ static double curve_error(const step_data *step, const sweep_data *data, const d
     largest = larger(largest, fabs(step->q0[i]) + fabs(dq[i]));
   for (int i = 0; i < M; i++) {
     const double *x = memory + i * LANES;
-    const double size = fabs(step->q0[i]) + fabs(dq[i]) + share * largest + DBL_MIN, unit = KEPT_UNIT(i) / size;
+    const double size = fabs(step->q0[i]) + fabs(dq[i]) + share * largest + DBL_MIN;
     const double ends = KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0])
                                         : fabs(x[0]) + fabs(x[KEPT - 1]);
-    const double bend = fabs(unit) * ends + NEGLIGIBLE;
+    const double bend = (fabs(KEPT_UNIT(i)) * ends + NEGLIGIBLE * size) * size;
     lanes all;
     double top;
     memcpy(&all, x, sizeof all);
-    top = RESOLVED * unit * lanes_total(HIGHEST * all);
+    top = RESOLVED * KEPT_UNIT(i) * lanes_total(HIGHEST * all);
     if (top * top > least * bend)
       least = top * top / bend;
   }

@@ -21,10 +21,10 @@ static inline real larger(real a, real b)
 /* Whether no x is an infinity or a NaN. */
 static int all_finite(const real *x, int n)
 {
-  real sum = 0;
+  int faults = 0;
   for (int i = 0; i < n; i++)
-    sum += 0 * x[i];
-  return sum == 0;
+    faults |= 0 * x[i] != 0;
+  return !faults;
 }
 
 /* inverse_root_k, x^(-k/2), k odd: INVERSE_ROOT(k, inverse^((k+1)/2)); ends in a declaration, for the semicolon. */

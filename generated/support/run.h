@@ -10,10 +10,10 @@ solver_options NAME(default_options)(void)
 /* Whether x + increment is a finite state. */
 static int reaches(const real *x, const real *increment)
 {
-  real sum = 0;
+  int faults = 0;
   for (int i = 0; i < M; i++)
-    sum += 0 * (x[i] + increment[i]);
-  return sum == 0;
+    faults |= 0 * (x[i] + increment[i]) != 0;
+  return !faults;
 }
 
 int NAME(step)(real t, real h, const real *q0, const real *p0, const real *parameters, const solver_options *options,

@@ -35,8 +35,6 @@ static int solve(const step_data *step, const solver_data *data, real *memory, l
       dq[i] += step->h * DRIFT[n] * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
   }
   report->iterations++;
-  if (!all_finite(dq, M) || !all_finite(dp, M))
-    return NOT_FINITE;
   memcpy(memory, F, sizeof F);
   *guess = 1;
   return OK;

@@ -1,14 +1,14 @@
-"""The compiled module as Python calls it: functions, structs, pointers into arrays, and failures as exceptions."""
+"""The compiled library as Python calls it: functions, structs, pointers into arrays, and failures as exceptions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import SolverOptions, checked_options
 
 __all__ = ["Binding"]
@@ -18,14 +18,14 @@ class Binding:
     """Names and types of one C text.
 
     Args:
-        module: the text, compiled.
+        library: the text, compiled.
         prefix: of its names.
         workspace: doubles that a call needs.
     """
 
-    def __init__(self, module: ModuleType, prefix: str, workspace: int = 0) -> None:
-        self._ffi, self._lib, self._prefix, self._workspace = module.ffi, module.lib, prefix, workspace
-        self.null = module.ffi.NULL
+    def __init__(self, library: Library, prefix: str, workspace: int = 0) -> None:
+        self._ffi, self._lib, self._prefix, self._workspace = library.ffi, library.lib, prefix, workspace
+        self.null = library.ffi.NULL
 
     def function(self, name: str) -> Callable[..., Any]:
         """``<prefix>_<name>``; releases the GIL while it runs."""

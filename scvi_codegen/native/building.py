@@ -1,10 +1,11 @@
-"""C text to a loaded module: compilers, the cache, cffi.
+"""C text to a loaded library: compilers, the cache, cffi.
 
-An integrator is compiled once with its cffi binding (API mode) into one shared library, kept in the user's cache folder
-under a name made from everything that determines it: text, compiler, flags, Python ABI, processor. It is built in a
-temporary folder inside the cache and renamed into place, so processes may race without locks; what does not match its
-recorded checksum is built anew. A cache that cannot be written, or that others can write, falls back to a temporary
-folder (:mod:`scvi_codegen.files.cache`).
+An integrator is compiled once into a shared library, and its declarations once into cffi's description of them (ABI
+mode: no compiled binding, so no headers of Python, at the price of .2 microseconds a call). Both are kept in the user's
+cache folder under a name made from everything that determines them: text, compiler, flags, cffi, processor. They are
+built in a temporary folder inside the cache and renamed into place, so processes may race without locks; what does not
+match its recorded checksum is built anew. A cache that cannot be written, or that others can write, falls back to a
+temporary folder (:mod:`scvi_codegen.files.cache`).
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ import shlex
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple
+
+import _cffi_backend
 
 from scvi_codegen.errors import BuildError
 from scvi_codegen.files.cache import (
@@ -47,6 +51,7 @@ __all__ = [
     "CACHE_VARIABLE",
     "PORTABLE_FLAGS",
     "TUNED_FLAGS",
+    "Library",
     "cache_folder",
     "compiler_title",
     "find_compiler",
@@ -64,17 +69,28 @@ CUT_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-ds
 """With -O3, for text with kernels cut into functions: these passes take gcc a tenth of its time and look for common
 parts, which were found before; steps take as long without them."""
 
+ROLLED_FLAGS = ("--param=max-completely-peel-times=4",)
+"""With -O3, for one trajectory: loops over more coordinates stay loops, which gcc turns into vectors; written out they
+become a heap of scalars (leapfrog of 8 masses: half as long again). The lanes of ensembles must be written out."""
+
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
 COMPILE_SECONDS = 600
 NOT_RUN = (126, 127)
 ATTEMPTS = 3
 """To load what another process may remove at any time."""
-_loaded: dict[str, ModuleType] = {}
+_loaded: dict[str, Library] = {}
 _locks: dict[str, threading.Lock] = {}
 """One a library, so that threads compile it once; a process that is forked off starts with none held."""
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_locks.clear)
+
+
+class Library(NamedTuple):
+    """A loaded library: ``lib`` has its functions, ``ffi`` their types."""
+
+    lib: Any
+    ffi: Any
 
 
 def find_compiler() -> tuple[str, ...]:
@@ -100,13 +116,10 @@ def find_compiler() -> tuple[str, ...]:
     )
 
 
-def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
-    """The compiled module of a source, from memory, from the cache or built now.
+def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
+    """The library of a source, from memory, from the cache or built now.
 
     Flags in the environment variable ``SCVI_CODEGEN_CFLAGS`` follow, and so override, those given.
-
-    Returns:
-        A cffi module with attributes ``lib`` and ``ffi``.
 
     Raises:
         BuildError: without a compiler, or if it refuses the text.
@@ -120,7 +133,7 @@ def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> ModuleType:
 
 
 def fingerprint(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> str:
-    """24 digits made from all that determines the compiled code: text, compiler, flags, Python, processor."""
+    """24 digits made from all that determines the compiled code: text, compiler, flags, cffi, processor."""
     return _key(source, find_compiler(), flags)
 
 
@@ -139,7 +152,7 @@ def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> s
         _compiler_version(compiler),
         " ".join(flags),
         os.environ.get(FLAGS_VARIABLE, ""),
-        str(sysconfig.get_config_var("SOABI")),
+        _cffi_backend.__version__,
         _processor() if "-march=native" in flags else platform.machine(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
@@ -171,7 +184,7 @@ def _processor() -> str:
     return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
 
 
-def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> ModuleType:
+def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> Library:
     folder = trusted_folder()
     if folder is not None:
         with suppress(OSError):  # it cannot be written
@@ -184,23 +197,21 @@ def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, 
         raise BuildError("neither the cache folder nor the temporary folder can be written") from error
 
 
-def _load_from(
-    folder: Path, source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str
-) -> ModuleType:
-    """The module in a folder, put there first if need be; OSError if that cannot be done."""
+def _load_from(folder: Path, source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> Library:
+    """The library in a folder, put there first if need be; OSError if that cannot be done."""
     entry = folder / name
     for _ in range(ATTEMPTS):
         if _is_intact(entry):
             try:
-                module = _import(entry, name)
+                library = _open(entry)
             except ImportError:
                 discard(entry)  # a foreign library: build it anew
             else:
                 touch(entry)
-                return module
+                return library
         _publish(source, compiler, flags, entry)
         try:
-            return _import(entry, name)
+            return _open(entry)
         except ImportError as error:
             if _is_intact(entry):
                 made = f"what the compiler {' '.join(compiler)!r} made cannot be loaded here"
@@ -212,24 +223,35 @@ def _library(entry: Path) -> Path:
     return entry / f"{entry.name}.so"
 
 
+def _binding(entry: Path) -> Path:
+    return entry / "binding.py"
+
+
+def _checksum(entry: Path) -> str:
+    """Of the library and its binding."""
+    return hashlib.sha256(_library(entry).read_bytes() + _binding(entry).read_bytes()).hexdigest()
+
+
 def _is_intact(entry: Path) -> bool:
-    """Whether the library is there, is the one that was recorded, and nobody else can have put it there."""
+    """Whether library and binding are there, are those that were recorded, and nobody else can have put them there."""
     try:
         recorded = json.loads((entry / "manifest.json").read_text())
-        found = hashlib.sha256(_library(entry).read_bytes()).hexdigest()
+        found = _checksum(entry)
     except (OSError, ValueError):
         return False
     matches = isinstance(recorded, dict) and recorded.get("sha256") == found
-    return matches and not exposed(entry) and not exposed(_library(entry))
+    return matches and not any(exposed(path) for path in (entry, _library(entry), _binding(entry)))
 
 
-def _import(entry: Path, name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, _library(entry))
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{entry} cannot be imported")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def _open(entry: Path) -> Library:
+    """The library of an entry; ImportError if there is none that can be loaded."""
+    described = ModuleType(entry.name)
+    try:
+        loader = SourceFileLoader(entry.name, str(_binding(entry)))  # not imported, which would write beside it
+        exec(loader.source_to_code(_binding(entry).read_bytes(), str(_binding(entry))), described.__dict__)
+        return Library(described.ffi.dlopen(str(_library(entry))), described.ffi)
+    except (OSError, ValueError) as error:
+        raise ImportError(str(error)) from error
 
 
 def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], entry: Path) -> None:
@@ -240,8 +262,7 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
         built.mkdir(mode=0o755)
         with waiting_for(_work(source, compiler, flags)):
             _compile(source, compiler, flags, built)
-        checksum = hashlib.sha256(_library(built).read_bytes()).hexdigest()
-        (built / "manifest.json").write_text(json.dumps({"sha256": checksum, "prefix": source.prefix}))
+        (built / "manifest.json").write_text(json.dumps({"sha256": _checksum(built), "prefix": source.prefix}))
         for file in built.rglob("*"):
             file.chmod(file.stat().st_mode & ~0o022)
         try:
@@ -261,44 +282,46 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
-    """Parts and binding at the same time, each in a process; then one library of them."""
+    """The parts at the same time, each in a process; then one library of them, and what describes it."""
     for name, text in source.files.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
-    include = sysconfig.get_paths()["include"]
-    python = [] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
-    shared = ["-fPIC", "-std=c99", f"-I{include}", f"-I{folder}"]
-    passes = CUT_FLAGS if "-O3" in flags and any("support/parts.h" in each.files for each in source.sources) else ()
+    cut = any("support/parts.h" in each.files for each in source.sources)
     wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
-    parts = [each.prefix for each in source.sources]
-    objects = ["-shared", *wanted, *python, *(f"{name}.o" for name in ("binding", *parts))]
+    parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
+    objects = ["-shared", *wanted, *(f"{name}.o" for name in parts)]
     for define, libraries in _mathematics(flags):
         with ExitStack() as ended:
-            for name in parts:
-                command = [*compiler, *shared, *flags, *passes, *define, *wanted, "-c", f"{name}.c"]
-                ended.enter_context(_finished(command, folder))
-            if not (folder / "binding.c").exists():
-                _write_binding(source, folder)
-                ended.enter_context(_finished([*compiler, *shared, "-O0", "-c", "binding.c"], folder))
+            for name, passes in parts.items():
+                command = [*compiler, "-fPIC", "-std=c99", f"-I{folder}", *flags, *passes, *define, *wanted]
+                ended.enter_context(_finished([*command, "-c", f"{name}.c"], folder))
+            _write_binding(source, folder)
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
         except BuildError:
             if not define:
                 raise
-    for name in ("binding.c", "binding.o", *(f"{name}.o" for name in parts)):
-        (folder / name).unlink()
+    for name in parts:
+        (folder / f"{name}.o").unlink()
 
 
 def _write_binding(source: Source, folder: Path) -> None:
     from cffi import FFI  # only building needs the parser; loading does not
-    from cffi.recompiler import make_c_source  # what FFI.emit_c_code calls, without its message on stdout
+    from cffi.recompiler import make_py_source  # what FFI.emit_python_code calls, without its message on stdout
 
     binding = FFI()
     binding.cdef("".join(each.declarations for each in source.sources))
-    preamble = "".join(f'#include "{each.prefix}.h"\n' for each in source.sources)
-    binding.set_source(folder.name, preamble)
-    make_c_source(binding, folder.name, preamble, str(folder / "binding.c"), verbose=False)
+    binding.set_source(folder.name, None)
+    make_py_source(binding, folder.name, str(_binding(folder)), verbose=False)
+
+
+def _passes(part: Source, flags: tuple[str, ...], cut: bool) -> tuple[str, ...]:
+    """What gcc does otherwise than -O3 says."""
+    if "-O3" not in flags:
+        return ()
+    rolled = ROLLED_FLAGS if "support/run.h" in part.files else ()
+    return (*CUT_FLAGS, *rolled) if cut else rolled
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
@@ -328,12 +351,5 @@ def _finished(command: list[str], folder: Path) -> Iterator[None]:
     if process.returncode in NOT_RUN:
         raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}")
     if process.returncode:
-        hint = _header_hint(errors)
         shown = "\n".join(errors.splitlines()[:30])
-        raise BuildError(f"the C compiler refused the text{hint}\n{' '.join(command)}\n{shown}")
-
-
-def _header_hint(message: str) -> str:
-    if "Python.h" not in message and "pyconfig.h" not in message:
-        return ""
-    return "; the headers of Python are missing (Debian, Ubuntu: apt install python3-dev)"
+        raise BuildError(f"the C compiler refused the text\n{' '.join(command)}\n{shown}")

@@ -110,6 +110,7 @@ def solved(derived, stepper):
     return (q, p, h, t), np.array(values[:m], float), np.array(values[m:], float)
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("system", SYSTEMS, ids=lambda s: s.name)
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 def test_closed_form_and_compiled_step_agree(system, method):

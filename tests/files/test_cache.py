@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
@@ -175,8 +174,7 @@ def forge(folder: Path) -> None:
     library = building._library(place)
     library.unlink()
     library.write_bytes(building._library(entry(folder, 2)).read_bytes())
-    checksum = hashlib.sha256(library.read_bytes()).hexdigest()
-    (place / "manifest.json").write_text(json.dumps({"sha256": checksum}))
+    (place / "manifest.json").write_text(json.dumps({"sha256": building._checksum(place)}))
 
 
 @contextmanager

@@ -180,6 +180,7 @@ def test_what_has_no_legendre_transform_is_named() -> None:
 # Steps of regular Hamiltonians.
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle"])
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 def test_a_regular_hamiltonian_gives_the_steps_of_its_lagrangian(sample, name, method) -> None:

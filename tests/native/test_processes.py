@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -105,19 +106,21 @@ exit 1
 """Compiles nothing before another compiles, too."""
 
 
-def test_text_and_binding_are_compiled_at_the_same_time(tmp_path, monkeypatch):
+def test_parts_are_compiled_at_the_same_time(tmp_path, monkeypatch):
     script, folder = tmp_path / "meeting-cc", tmp_path / "met"
     folder.mkdir()
     script.write_text(MEETING_COMPILER.format(folder=folder))
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
-    text = {
-        "header": "int met(void);\n",
-        "code": "int met(void)\n{\n  return 2;\n}\n",
-        "declarations": "int met(void);",
-    }
-    assert building.load(Source(prefix="met", **text), flags=PORTABLE_FLAGS).lib.met() == 2
+    library = building.load(replace(part("first"), events=part("second")), flags=PORTABLE_FLAGS).lib
+    assert library.first() == library.second() == 2
+
+
+def part(name: str) -> Source:
+    declarations = f"int {name}(void);"
+    code = f"int {name}(void)\n{{\n  return 2;\n}}\n"
+    return Source(prefix=name, header=f"{declarations}\n", code=code, declarations=declarations)
 
 
 def told(monkeypatch, seconds: float, patience: float) -> list[str]:

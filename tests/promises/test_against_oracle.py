@@ -97,6 +97,7 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
     assert relative(compiled(name, method, **how).step(q, p, h, t), case.oracle(method, q, p, h, t)) < TOLERANCE
 
 
+@pytest.mark.covering(2)
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
 def test_every_kind_of_lagrangian_steps_as_the_oracle(sample, compiled, name, method):

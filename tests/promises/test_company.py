@@ -105,15 +105,15 @@ def test_entries_that_leave_while_others_load_them_disturb_nobody(folder, rounds
 
 
 def test_an_entry_that_is_removed_as_soon_as_it_is_made_is_made_again(folder, monkeypatch):
-    load, removed = building._import, []
+    load, removed = building._open, []
 
-    def disturbed(entry: Path, name: str) -> object:
+    def disturbed(entry: Path) -> object:
         if not removed:
             removed.append(entry)
             cache.discard(entry)
-        return load(entry, name)
+        return load(entry)
 
-    monkeypatch.setattr(building, "_import", disturbed)
+    monkeypatch.setattr(building, "_open", disturbed)
     assert building.load(source(1), flags=FAST).lib.answer_1() == 1.0
     assert removed == list(folder.glob("_scvi_*"))
 

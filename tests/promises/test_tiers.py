@@ -1,0 +1,26 @@
+"""What the default tier leaves to the full one covers what it should."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import product
+
+import pytest
+from tiers import cover, first_of_each
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+@pytest.mark.parametrize("sizes", [(1, 1), (15, 4), (3, 3, 3), (2, 7, 5)])
+def test_every_value_is_in_as_many_combinations_as_asked_for(sizes: tuple[int, ...], times: int) -> None:
+    combinations = [tuple((f"x{k}", i) for k, i in enumerate(one)) for one in product(*map(range, sizes))]
+    chosen = cover(combinations, times)
+    uses = Counter(value for one in chosen for value in one)
+    there = Counter(value for one in combinations for value in one)
+    assert all(uses[value] >= min(times, count) for value, count in there.items())
+    assert len(chosen) <= min(len(combinations), times * max(sizes) + len(sizes))
+
+
+def test_the_first_of_each_kind_is_in_the_default_tier() -> None:
+    found = first_of_each(["a1", "a2", "b1", "a3", "b2"], key=lambda word: word[0])
+    assert [one.values[0] for one in found if not one.marks] == ["a1", "b1"]
+    assert [one.values[0] for one in found] == ["a1", "a2", "b1", "a3", "b2"]

@@ -1,0 +1,68 @@
+"""What of a product of arguments the default tier runs; the full tier runs all of it.
+
+``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
+value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
+``first_of_each`` does the like for one argument, by what its values have in common.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Any
+
+import pytest
+
+from scvi_codegen.methods.method import Method
+
+__all__ = ["cover", "family", "first_of_each", "mark_the_rest_full"]
+
+Combination = tuple[tuple[str, int], ...]
+"""Which value of each argument."""
+
+
+def cover(combinations: Sequence[Combination], times: int = 1) -> set[Combination]:
+    """Few combinations with every value ``times`` times, as far as there are: always one that adds most, of values that
+    were chosen least."""
+    there = Counter(value for combination in combinations for value in combination)
+    wanted = {value: min(count, times) for value, count in there.items()}
+    used: Counter[tuple[str, int]] = Counter()
+    chosen: list[Combination] = []
+    while any(used[value] < count for value, count in wanted.items()):
+        left = [one for one in combinations if one not in chosen]
+        adds = [(sum(used[value] < wanted[value] for value in one), -sum(used[value] for value in one)) for one in left]
+        chosen.append(left[adds.index(max(adds))])
+        used.update(chosen[-1])
+    return set(chosen)
+
+
+def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
+    """Of tests marked ``covering``, those that are not needed for it become tests of the full tier."""
+    tests: defaultdict[tuple[str, str], list[pytest.Function]] = defaultdict(list)
+    for item in sorted(items, key=lambda item: item.nodeid):  # in one order, however they are shuffled
+        if isinstance(item, pytest.Function) and item.get_closest_marker("covering"):
+            tests[str(item.path), item.originalname].append(item)
+    for found in tests.values():
+        combinations = [tuple((name, id(value)) for name, value in item.callspec.params.items()) for item in found]
+        (marker,) = found[0].iter_markers("covering")
+        kept = cover(combinations, *marker.args)
+        for item, combination in zip(found, combinations, strict=True):
+            if combination not in kept:
+                item.add_marker(pytest.mark.full)
+
+
+def family(method: Method) -> tuple[object, ...]:
+    """Methods are of one family if their names differ in numbers alone, and what they claim in an order above two."""
+    return re.sub(r"[\d.]+", "", method.name), (method.order or 0) > 2, method.symmetric, method.symplectic
+
+
+def first_of_each(values: Iterable[Any], key: Callable[[Any], Hashable]) -> list[Any]:
+    """Values for ``parametrize``: the first of each kind in the default tier, the others in the full one."""
+    seen: set[Hashable] = set()
+    found = []
+    for value in values:
+        kind = key(value)
+        found.append(pytest.param(value, marks=[pytest.mark.full] if kind in seen else []))
+        seen.add(kind)
+    return found
