@@ -6,7 +6,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 
-__all__ = ["WIDTH", "table", "wrapped", "wrapped_comment", "wrapped_prototypes"]
+__all__ = ["WIDTH", "table", "wrapped", "wrapped_comment", "wrapped_comment_lines", "wrapped_prototypes"]
 
 WIDTH = 120
 CONTINUATION = 4
@@ -42,6 +42,12 @@ def wrapped(statement: str, indent: int = 2) -> str:
 def wrapped_comment(text: str) -> str:
     """A comment in the first column."""
     return "\n".join(_lines(f"/* {text} */", "", " * "))
+
+
+def wrapped_comment_lines(text: str) -> str:
+    """A comment of many lines, those broken that are too long."""
+    lines = (_lines(line, "", " * ") if len(line) > WIDTH else [line] for line in text.split("\n"))
+    return "\n".join(part for parts in lines for part in parts)
 
 
 def wrapped_prototypes(text: str) -> str:

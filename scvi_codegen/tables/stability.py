@@ -6,7 +6,6 @@ Coefficients below 1e-30 of their scale count as zero, so that quantities that v
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import count as count_from
 from itertools import pairwise, zip_longest
 from typing import TypeAlias
 
@@ -50,14 +49,14 @@ def trimmed(coefficients: Iterable[Number], scales: Iterable[Number]) -> Polynom
 
 
 def divided(dividend: Polynomial, divisor: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return quotient and remainder; a remainder below 1e-30 of the numbers it came from is zero."""
+    """Return quotient and remainder; what is below 1e-30 of it, or of what it came from, is zero."""
     rest, quotient = list(dividend), [mp.zero] * max(0, len(dividend) - len(divisor) + 1)
     for k in reversed(range(len(quotient))):
         quotient[k] = rest.pop() / divisor[-1]
         for j, value in enumerate(divisor[:-1]):
             rest[k + j] -= quotient[k] * value
     scale = size(dividend) + size(quotient) * size(divisor)
-    return quotient, trimmed(rest, [scale] * len(rest))
+    return trimmed(quotient, [size(quotient)] * len(quotient)), trimmed(rest, [scale] * len(rest))
 
 
 def size(polynomial: Sequence[Number]) -> Number:
@@ -143,7 +142,7 @@ def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
     repeated = common_factor(polynomial, slope)
     rest, other = divided(polynomial, repeated)[0], divided(slope, repeated)[0]
     odd: list[Polynomial] = []
-    for multiplicity in count_from(1):
+    for multiplicity in range(1, len(polynomial) + 1):
         if len(rest) <= 1:
             return odd
         pairs = list(zip_longest(other, derivative(rest), fillvalue=mp.zero))
@@ -152,7 +151,7 @@ def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
         if multiplicity % 2 == 1:
             odd.append(factor)
         rest, other = divided(rest, factor)[0], divided(gap, factor)[0]
-    return odd
+    raise ArithmeticError("60 digits do not tell the roots of this polynomial apart")
 
 
 def positive_roots(polynomial: Polynomial) -> int:

@@ -17,6 +17,7 @@ from scvi_codegen.models.model_file import load_model
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
+    "collisions_in_space",
     "curves_and_quadratures",
     "eccentric_comet",
     "custom_sympy_system",
@@ -85,6 +86,11 @@ def test_eccentric_comet_keeps_its_energy(tmp_path):
     assert stretched[3] < 1e-9
     assert regular[3] < 1e-11
     assert regular[4] < 1e-9
+
+
+def test_a_comet_that_all_but_hits_the_sun_comes_back(tmp_path):
+    errors = [float(line.split()[-1]) for line in output_of("collisions_in_space", tmp_path).splitlines()[1:]]
+    assert max(errors) < 1e-11
 
 
 def test_curves_and_quadratures_win_where_they_say(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scvi_codegen import SVI, compile_stepper, problem
+from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source, problem
 from scvi_codegen.files.templates import template_folder
 from scvi_codegen.rendering.source import Source
 
@@ -40,6 +40,13 @@ def test_generated_files_are_in_style(path):
 @pytest.mark.parametrize(("name", "most"), [("two_point_pendulum.c", 250), ("kepler_svi_4.c", 400)])
 def test_a_method_is_read_on_a_few_pages(name, most):
     assert len((FOLDER / name).read_text().splitlines()) < most
+
+
+def test_titles_are_broken_where_they_are_long():
+    words = "a system whose name nobody would want to say twice, "
+    system = LagrangianSystem.from_text(name=3 * words, coordinates=["q"], lagrangian="q_dot**2/2 - q**4/4")
+    source = generate_source(system, SVI(3), prefix="long_name")[0]
+    assert [line for text in source.files.values() for line in text.splitlines() if len(line) > 120] == []
 
 
 def test_amalgamated_text_computes_the_same_bits():
