@@ -16,7 +16,7 @@ STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: 
 
 
 ADVICE = {
-    "not converged": "try a smaller step, or more iterations",
+    "not converged": "try a smaller step, solver='newton' where the system is stiff, or more iterations",
     "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
     "strayed": "the equations of the step were solved by what is no motion: take a shorter step, or give t_end",

@@ -3,6 +3,9 @@
 A space of degree s is given by the velocities of its curves, on [0, 1]: s functions with cardinal combinations l_b on s
 points, l_b(point_a) = 1 if a = b else 0. A curve is q(c) = q0 + h sum_b V_b int_0^c l_b, its velocity sum_b V_b l_b(c).
 A method needs tables of the l_b, of their integrals, and for quadratures with derivatives of their slopes; no more.
+
+Splines stand for the wavelets that the paper names beside them: what a step gains from a basis of many scales is where
+it may bend, which breakpoints say; a step is a basis of few functions and has nothing to compress.
 """
 
 from __future__ import annotations

@@ -144,6 +144,14 @@ def kepler_page(method: Any, *, started: bool = False) -> str:
 
 
 class TestPage:
+    @pytest.mark.parametrize(("form", "numbers"), [("position", ["18"]), ("phase-space", ["21", "21"])])
+    def test_spectral_collocation_in_matrices(self, form, numbers):
+        page = kepler_page(sc.SpectralCollocation(2, form=form))
+        part = page[page.index("In matrices") :]
+        part = part[: part.index("at the nodes.")]
+        assert re.findall(r"\((\d+)\)", part) == numbers
+        assert part.count("\u2297") == {"position": 3, "phase-space": 4}[form]
+
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
     def test_every_method_has_one_that_is_well_formed_and_needs_nothing_else(self, method):
         page = derivation_html(sc.problem("planar-pendulum").system, method)

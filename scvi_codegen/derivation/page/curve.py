@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from functools import singledispatch
 
 import sympy
-from sympy import Function, Symbol
+from sympy import Function, Identity, KroneckerProduct, MatrixSymbol, Symbol
 
 from scvi_codegen.derivation.notation import TableEntry
 from scvi_codegen.derivation.page.step_drawing import step_drawing
@@ -124,6 +124,7 @@ def _(method: SpectralCollocation) -> Iterator[Content]:
         yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s; node 0 carries no equation.")
     else:
         yield _stages(method.form)
+    yield from _kronecker(method)
 
 
 @_curve.register
@@ -163,6 +164,27 @@ def _nodal(degree: int) -> Iterator[Content]:
     )
     cardinal = Function("l_j")(tau)
     yield Formula(sympy.Sum(Symbol("Q__j") * cardinal, (j, 0, s)), Function("q")(tau))
+
+
+def _kronecker(method: SpectralCollocation) -> Iterator[Content]:
+    """(18), (21) with letters for matrices; with all entries in ``StepEquations.matrix_form``."""
+    s, m = method.degree, Symbol("m", integer=True, positive=True)
+    A, a0 = MatrixSymbol("A", s, s), MatrixSymbol("a_0", s, 1)
+    q0, p0, v0 = (MatrixSymbol(name, m, 1) for name in ("q_k", "p_k", "v_k"))
+    Q, P, V, G, rates = (MatrixSymbol(name, s * m, 1) for name in ("Q", "P", "V", "G", "Q_ddot"))
+    yield Paragraph(
+        "In matrices, A the differentiation matrix on the step without the row of node 0, a_0 its column of node 0, "
+        "and what belongs to the nodes one below the other:"
+    )
+    if method.form == "position":
+        slopes = KroneckerProduct(A**2, Identity(m)) * Q + KroneckerProduct(a0, v0) + KroneckerProduct(A * a0, q0)
+        yield Formula(rates, slopes, "18")
+        yield Paragraph("where the accelerations on the right solve the Euler-Lagrange equations at the nodes.")
+    else:
+        once = KroneckerProduct(A, Identity(m))
+        yield Formula(V, once * Q + KroneckerProduct(a0, q0), "21")
+        yield Formula(G, once * P + KroneckerProduct(a0, p0), "21")
+        yield Paragraph("where V and G are H_p and -H_q at the nodes.")
 
 
 def _action(number: str) -> Iterator[Content]:
