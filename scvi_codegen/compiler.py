@@ -9,7 +9,8 @@
       -> lower       Program       kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering.program`)
       -> render      Source        header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering.text`);
                                    with events, the search for them behind it (:mod:`scvi_codegen.rendering.events`)
-      -> build       module        compiled, bound and cached (:mod:`scvi_codegen.native.building`)
+      -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration behind
+                                   sweeps when these first fail (:mod:`scvi_codegen.rendering.fallback`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.stepper`)
 
 Beside the way: :func:`scvi_codegen.derivation.equations.derive` writes the equations out as the paper prints them, and
@@ -23,10 +24,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.lowering.program import lower
@@ -79,7 +81,7 @@ def compile_stepper(
             points on every system, but variational SCVI with more than 8 coordinates, and SVI with fewer points than
             the degree), ``"newton"`` (always, also for stiff systems and large steps), ``"explicit"`` (Stoermer-Verlet
             and compositions on separable systems) or ``"auto"``: explicit or fixed point where there is one, Newton
-            where it fails.
+            where it fails, derived and compiled when that first happens.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
         symmetries: known beside those that are found
@@ -94,40 +96,47 @@ def compile_stepper(
     key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries))
 
     @cache
-    def program() -> Program:
-        return program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries)
+    def program(*, fallback: bool = False) -> Program:
+        with waiting_for(f"deriving the equations of {system.name} by {method.name}"):
+            return program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, fallback=fallback)
+
+    def borrows() -> bool:
+        return solver == "auto" and program().sweep is not None and not program().newton
 
     def texts() -> str:
-        with waiting_for(f"deriving the equations of {system.name} by {method.name}"):
-            program()
-        return json.dumps([render(program()).to_json(), describe(program(), system, method).to_json()])
+        interface = describe(program(), system, method, borrows=borrows())
+        return json.dumps([_rendered(program(), borrows=borrows()).to_json(), interface.to_json()])
 
-    @cache
-    def ensemble() -> Source | None:
-        text = remembered_text((*key, "ensemble"), lambda: _text_of(render_ensemble(program())))
-        return Source.from_json(text) if text else None
+    def remembered(name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
+        @cache
+        def source() -> Source | None:
+            text = remembered_text((*key, name), lambda: _text_of(make()))
+            return Source.from_json(text) if text else None
 
-    @cache
+        return source
+
     def controlled() -> Source | None:
-        text = remembered_text((*key, "controlled"), lambda: _text_of(_controlled(program())))
-        return Source.from_json(text) if text else None
+        control = control_of(program())
+        return _rendered(program(), control, borrows=borrows()) if control else None
+
+    def fallback() -> Source | None:
+        return render(program(fallback=True), fallback="lent") if borrows() else None
 
     texts_of = json.loads(remembered_text((*key, "integrator"), texts))
     source, interface = Source.from_json(texts_of[0]), Interface.from_json(texts_of[1])
     return Stepper(
         source,
         interface,
-        ensemble=ensemble,
-        controlled=controlled,
+        ensemble=remembered("ensemble", lambda: render_ensemble(program())),
+        controlled=remembered("controlled", controlled),
+        fallback=remembered("fallback", fallback),
         flags=flags,
         events=as_events(events),
     )
 
 
-def _controlled(program: Program) -> Source | None:
-    """The text with steps that choose their length, where the curve of a step tells its error."""
-    control = control_of(program)
-    return render(program, control) if control else None
+def _rendered(program: Program, control: Control | None = None, *, borrows: bool) -> Source:
+    return render(program, control, fallback="borrowed" if borrows else None)
 
 
 def _text_of(source: Source | None) -> str:
@@ -187,11 +196,13 @@ def program_of(
     prefix: str | None = None,
     symmetries: Sequence[Symmetry] = (),
     lanes: bool = True,
+    fallback: bool = True,
 ) -> Program:
     """The integrator without syntax; arguments as of :func:`compile_stepper`.
 
     Args:
         lanes: whether there may be a solver with vector lanes.
+        fallback: whether Newton's iteration is to stand behind it. Time as an integral along the curve needs it there.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     stages = discretise(system, method)
@@ -200,7 +211,8 @@ def program_of(
     swept = lanes and solver in ("auto", "fixed-point") and splitting is None
     sweep = sweep_of(system, stages) if swept else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
-    newton = solver in ("auto", "newton") and splitting is None
+    alone = sweep is not None and not fallback and not system.integrands
+    newton = solver in ("auto", "newton") and splitting is None and not alone
     tracked = all_symmetries(system, symmetries)
     return lower(
         system,
@@ -214,8 +226,8 @@ def program_of(
     )
 
 
-def describe(program: Program, system: MechanicalSystem, method: Method) -> Interface:
-    """The interface of a program."""
+def describe(program: Program, system: MechanicalSystem, method: Method, *, borrows: bool = False) -> Interface:
+    """The interface of a program; ``borrows``: whether Newton's iteration is that of another library."""
     return Interface(
         prefix=program.prefix,
         title=program.title,
@@ -227,11 +239,11 @@ def describe(program: Program, system: MechanicalSystem, method: Method) -> Inte
         defaults=program.parameter_defaults,
         unknowns=program.unknowns,
         workspace=workspace_size(program),
-        has_action=program.action,
+        has_action=program.action or (borrows and program.acts),
         map_names=tuple(each.name for each in program.momentum_maps),
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
-        has_fallback=program.newton and program.sweep is not None,
+        has_fallback=borrows or (program.newton and program.sweep is not None),
         momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
         energy_parameter=system.clock.energy.name if system.clock else "",
     )

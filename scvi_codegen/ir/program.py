@@ -93,6 +93,7 @@ class Program:
         sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's iteration is there at all.
+        acts: whether the equations are those of a discrete Lagrangian, which Newton's iteration gives.
         order: of the method; where none is claimed, the number of its points.
         polynomial_curves: whether the highest coefficient of a curve tells what it leaves unresolved.
         stage_curve: what tells how well the curve of the stages is resolved, or ``None``.
@@ -127,6 +128,7 @@ class Program:
     sweep: Sweep | None
     splitting: Splitting | None
     newton: bool
+    acts: bool
     order: int
     polynomial_curves: bool
     stage_curve: StageCurve | None
@@ -166,7 +168,7 @@ class Program:
         """Whether there is a discrete Lagrangian."""
         if self.splitting:
             return len(self.splitting.drifts) == 1
-        return self.newton and self.sites == self.dimension and any(family.action for family in self.families)
+        return self.newton and self.acts
 
     @property
     def memory(self) -> int:

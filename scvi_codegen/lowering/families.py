@@ -15,10 +15,10 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, PointFamily
 
-__all__ = ["argument_name", "lowered_family"]
+__all__ = ["argument_name", "has_action", "lowered_family"]
 
 
-def _has_action(system: MechanicalSystem) -> bool:
+def has_action(system: MechanicalSystem) -> bool:
     """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist.
 
     Nor does it where forces act: momenta are not its slopes.
@@ -56,7 +56,7 @@ def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) 
             purpose=f"The same, and the non-zero derivatives with respect to {u}.",
         ),
         blocks=blocks,
-        action=_action(system, family, u) if family.in_action and _has_action(system) else None,
+        action=_action(system, family, u) if family.in_action and has_action(system) else None,
         action_power=family.scalar_power,
     )
 

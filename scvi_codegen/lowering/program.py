@@ -25,7 +25,7 @@ from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program, StageCurve
 from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.ir.sweeps import Splitting
-from scvi_codegen.lowering.families import lowered_family
+from scvi_codegen.lowering.families import has_action, lowered_family
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.sites import sites_of
@@ -101,6 +101,7 @@ def lower(
         sweep=sweep,
         splitting=splitting,
         newton=newton,
+        acts=sites.count == m and has_action(system) and any(family.in_action for family in stages.families),
         order=method.order or len(stages.blocks),
         polynomial_curves=polynomial,
         stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,

@@ -1,15 +1,20 @@
-"""The compiled library as Python calls it: functions, structs, pointers into arrays, and failures as exceptions."""
+"""The compiled library as Python calls it: functions, structs, pointers into arrays.
+
+A library of sweeps alone borrows Newton's iteration from another, which is compiled when a call first asks for it
+(:mod:`scvi_codegen.rendering.fallback`); that call is then made again, from where it began.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.native.building import Library
-from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.native.options import NEEDED, SolverOptions, checked_options
 
 __all__ = ["Binding"]
 
@@ -21,16 +26,49 @@ class Binding:
         library: the text, compiled.
         prefix: of its names.
         workspace: doubles that a call needs.
+        fallback: compiles the library that lends Newton's iteration, if it is borrowed.
     """
 
-    def __init__(self, library: Library, prefix: str, workspace: int = 0) -> None:
+    def __init__(
+        self, library: Library, prefix: str, workspace: int = 0, *, fallback: Callable[[], Library] | None = None
+    ) -> None:
         self._ffi, self._lib, self._prefix, self._workspace = library.ffi, library.lib, prefix, workspace
         self.null = library.ffi.NULL
+        self._fallback = fallback if self._has("borrow_fallback") else None
+        self._lacks_fallback = self._fallback is not None
+        self._lender: Self | None = None
 
     def function(self, name: str) -> Callable[..., Any]:
         """``<prefix>_<name>``; releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
-        return function
+        return partial(self._call, function) if self._lacks_fallback else function
+
+    def with_function(self, name: str) -> Self:
+        """This one, or that of the fallback where the function is there alone."""
+        if self._fallback is None or self._has(name):
+            return self
+        if self._lender is None:
+            lender = type(self)(self._fallback(), self._prefix)
+            lender._workspace = lender.constant("LENT_WORKSPACE")
+            self._lender = lender
+        return self._lender
+
+    def _has(self, name: str) -> bool:
+        return hasattr(self._lib, f"{self._prefix}_{name}")
+
+    def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """The call; if it asks for the fallback, that is borrowed, and it is made again on the memory it began with."""
+        memory = self._ffi.buffer(arguments[0]) if isinstance(arguments[0], self._ffi.CData) else None
+        before = None if memory is None else bytes(memory)
+        status = function(*arguments)
+        if status != NEEDED or self._fallback is None:
+            return status
+        lender = self.with_function("lent_fallback")
+        getattr(self._lib, f"{self._prefix}_borrow_fallback")(lender.function("lent_fallback")())
+        self._lacks_fallback = False
+        if memory is not None:
+            memory[:] = before
+        return function(*arguments)
 
     def constant(self, name: str) -> int:
         """``<PREFIX>_<NAME>``, of an enumeration."""

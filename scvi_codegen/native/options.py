@@ -12,7 +12,9 @@ from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 
 __all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
 
-STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed"}
+STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed", 6: "no memory"}
+NEEDED = 6
+"""Newton's iteration is needed, and is not there (:mod:`scvi_codegen.native.binding`), or had no memory."""
 
 
 ADVICE = {
@@ -20,6 +22,7 @@ ADVICE = {
     "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
     "strayed": "the equations of the step were solved by what is no motion: take a shorter step, or give t_end",
+    "no memory": "Newton's iteration found none: the machine's is used up",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
 

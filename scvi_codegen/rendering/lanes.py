@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.sweep import Kept, Sweep, SweepTable
+from scvi_codegen.rendering.fallback import HEADERS, Fallback
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
@@ -94,19 +95,19 @@ class SweepText:
         return any("LIBRARY" in line for line in self.functions)
 
 
-def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, newton: bool) -> SweepText:
+def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, fallback: Fallback) -> SweepText:
     """A sweep in vectors of ``lanes`` lanes.
 
     Args:
         sweep: what is written.
         meaning: of a lane.
         lanes: in a vector.
-        newton: whether Newton's iteration is tried where it fails.
+        fallback: what is tried where it fails.
     """
     mass = sweep.constant_mass
     applied = (*sweep.kernels, *((mass,) if mass and not meaning.are_points else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    solver = _solver(sweep, newton=newton) if meaning.are_points else ()
+    solver = _solver(sweep, fallback) if meaning.are_points else ()
     return SweepText(
         lanes=lanes,
         meaning=meaning,
@@ -145,12 +146,12 @@ def _function(name: str) -> str:
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
 
 
-def _solver(sweep: Sweep, *, newton: bool) -> tuple[str, ...]:
+def _solver(sweep: Sweep, fallback: Fallback) -> tuple[str, ...]:
     """Headers of the solver around a sweep whose lanes are points, in order."""
-    solver = ("newton_fallback" if newton else "no_fallback", "sweep_solver")
+    solver = (*HEADERS[fallback], "sweep_solver")
     if not sweep.integral_part:
         return solver
-    return (*solver, sweep.integral_part, "integrals_after_fallback" if newton else "integrals_after_sweep")
+    return (*solver, sweep.integral_part, f"integrals_after_{'sweep' if fallback == 'none' else 'fallback'}")
 
 
 def _tables(sweep: Sweep, meaning: Lanes) -> Iterator[str]:

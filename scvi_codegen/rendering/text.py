@@ -19,6 +19,7 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweep import Kept, Sweep
 from scvi_codegen.rendering.control import ladder_text
 from scvi_codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.rendering.fallback import Fallback
 from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
 from scvi_codegen.rendering.source import Interface, Source, included
@@ -113,9 +114,12 @@ class EventSearch:
         return "event_velocity_by_clock" if self.transformed else "event_velocity"
 
 
-def render(program: Program, control: Control | None = None) -> Source:
-    """Header and source of a program; with control, steps that choose their length. Equal programs give equal bytes."""
-    return _render(program.prefix, _context(program, DOUBLE) | _control_context(program, control))
+def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
+    """Header and source of a program; with control, steps that choose their length. Equal programs give equal bytes.
+
+    Where sweeps fail, Newton's iteration is the fallback if the program has it; or another is named.
+    """
+    return _render(program.prefix, _context(program, DOUBLE, fallback) | _control_context(program, control))
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
@@ -174,7 +178,7 @@ def render_ensemble(program: Program) -> Source | None:
         "cut": _is_cut(sweep.kernels),
         "needs_velocities": sweep.kept is Kept.VELOCITIES,
         "hot": "static",
-        "sweep": sweep_text(sweep, TRAJECTORIES, ENSEMBLE_LANES, newton=False),
+        "sweep": sweep_text(sweep, TRAJECTORIES, ENSEMBLE_LANES, fallback="none"),
     }
     return _render(prefix, context, "ensemble")
 
@@ -209,9 +213,12 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
 
 
 def workspace_size(program: Program) -> int:
-    """Doubles of workspace: scratch, memory, and for Newton unknowns, point, update, pivots, rows and Jacobian."""
+    """Doubles of workspace: scratch, memory, and for Newton unknowns, point, update, pivots, rows and Jacobian.
+
+    Without Newton one in their place, for what a fallback may leave.
+    """
     if not program.newton:
-        return scratch_size(program) + program.memory
+        return scratch_size(program) + program.memory + 1
     rows = program.unknowns + program.sites
     jacobian = program.matrix_size(program.sites, program.blocks + (1 if program.action else 0))
     return scratch_size(program) + program.memory + program.unknowns + program.point + 3 * rows + jacobian
@@ -223,7 +230,8 @@ def scratch_size(program: Program) -> int:
     return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
 
 
-def _context(program: Program, target: Target) -> dict[str, object]:
+def _context(program: Program, target: Target, fallback: Fallback | None = None) -> dict[str, object]:
+    fallback = fallback or ("own" if program.newton else "none")
     return {
         "program": program,
         "prefix": program.prefix,
@@ -239,7 +247,8 @@ def _context(program: Program, target: Target) -> dict[str, object]:
         "embedded": False,
         "written_out": written_out(program, target),
         "control": None,
-        **_lane_context(program),
+        "fallback": fallback,
+        **_lane_context(program, fallback),
     }
 
 
@@ -252,13 +261,13 @@ def _is_cut(kernels: Iterable[Kernel]) -> bool:
     return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
 
 
-def _lane_context(program: Program) -> dict[str, object]:
+def _lane_context(program: Program, fallback: Fallback) -> dict[str, object]:
     """What the templates of the fixed-point solver need; nothing without one."""
     sweep = program.sweep
     if sweep is None:
         return {"sweep": None}
     hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
-    text = sweep_text(sweep, POINTS, sweep.lanes, newton=program.newton)
+    text = sweep_text(sweep, POINTS, sweep.lanes, fallback=fallback)
     return {"sweep": text, "hot": hot}
 
 

@@ -34,6 +34,7 @@ class CompiledMethod:
         dimension: degrees of freedom m.
         momentum_map_names: what symmetries conserve.
         source: the C text it was compiled from.
+        fallback: text with Newton's iteration, where the source has sweeps alone.
         events: zero crossings that every run records.
     """
 
@@ -44,15 +45,17 @@ class CompiledMethod:
         *,
         ensemble: Callable[[], Source | None] = no_text,
         controlled: Callable[[], Source | None] = no_text,
+        fallback: Callable[[], Source | None] = no_text,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
-        self._ensemble, self._controlled = ensemble, controlled
+        self._ensemble, self._controlled, self._fallback = ensemble, controlled, fallback
         self._with_control: Self | None = None
         self._plain = source
         self.source = _watching(source, interface, events) if events else source
-        self.binding = Binding(building.load(self.source, flags=flags), interface.prefix, interface.workspace)
+        library = building.load(self.source, flags=flags)
+        self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.title}>"
@@ -74,6 +77,17 @@ class CompiledMethod:
     def ensemble(self) -> Source | None:
         """The C text for many trajectories at once, derived when first asked for; ``None`` if the method has none."""
         return self._ensemble()
+
+    @property
+    def fallback(self) -> Source | None:
+        """The C text that lends Newton's iteration, derived when first asked for; ``None`` if none is borrowed."""
+        return self._fallback()
+
+    def _load_fallback(self) -> building.Library:
+        source = self.fallback
+        if source is None:
+            raise MethodError(f"'{self.title}' has no text with Newton's iteration, which its C text borrows")
+        return building.load(source, flags=self.flags)
 
     @property
     def title(self) -> str:
@@ -115,6 +129,7 @@ class CompiledMethod:
             self.interface,
             ensemble=self._ensemble,
             controlled=self._controlled,
+            fallback=self._fallback,
             flags=self.flags,
             events=wanted,
         )
@@ -139,6 +154,7 @@ class CompiledMethod:
             self.interface,
             ensemble=self._ensemble,
             controlled=self._controlled,
+            fallback=self._fallback,
             flags=self.flags,
             events=self.events,
         )

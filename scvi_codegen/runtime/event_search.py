@@ -60,11 +60,9 @@ class CrossingSearch:
         h, t, q, p = map(np.ascontiguousarray, (part.lengths, part.t, part.q, part.p))
         parameters, options = self.binding.pointer(part.parameters), self.binding.options(part.options)
         workspace, report = self.binding.workspace(), self.binding.new("report *")
-        filled = self.binding.number("long long *")
         done = 0
         while True:
-            crossings = self.binding.new(f"crossing[{self._room}]")
-            filled[0] = 0
+            crossings, filled = self.binding.new(f"crossing[{self._room}]"), self.binding.number("long long *")
             status = self.binding.function("crossings")(
                 self.watch,
                 len(t) - done,

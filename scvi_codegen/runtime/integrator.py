@@ -265,19 +265,20 @@ class Integrator(CompiledMethod):
             )
         start, end = self._vector(q0, "q0"), self._vector(q1, "q1")
         p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
-        report = self.binding.new("report *")
-        status = self.binding.function("discrete_legendre")(
+        binding = self.binding.with_function("discrete_legendre")
+        report = binding.new("report *")
+        status = binding.function("discrete_legendre")(
             checked_number(t, "the time t"),
             checked_step(h),
-            self.binding.pointer(start),
-            self.binding.pointer(end),
-            self.binding.pointer(self._parameters(parameters)),
-            self.binding.options(options),
-            self.binding.pointer(p0),
-            self.binding.pointer(p1),
-            self.binding.pointer(action),
+            binding.pointer(start),
+            binding.pointer(end),
+            binding.pointer(self._parameters(parameters)),
+            binding.options(options),
+            binding.pointer(p0),
+            binding.pointer(p1),
+            binding.pointer(action),
             report,
-            self.binding.workspace(),
+            binding.workspace(),
         )
         if status:
             raise step_failure(status, report, step=0, h=h)

@@ -40,7 +40,7 @@ class Stepper(Integrator):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        texts = (self.ensemble, self._controlled())
+        texts = (self.ensemble, self._controlled(), self.fallback)
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events))
 
     @takes(StateError, progress=FUNCTION)
@@ -266,11 +266,17 @@ def _end_of(run: Run, steps: int | None) -> float:
 def _rebuild(
     source: Source,
     interface: Interface,
-    texts: tuple[Source | None, Source | None],
+    texts: tuple[Source | None, Source | None, Source | None],
     flags: tuple[str, ...],
     events: tuple[Event, ...],
 ) -> Stepper:
-    ensemble, controlled = texts
+    ensemble, controlled, fallback = texts
     return Stepper(
-        source, interface, ensemble=lambda: ensemble, controlled=lambda: controlled, flags=flags, events=events
+        source,
+        interface,
+        ensemble=lambda: ensemble,
+        controlled=lambda: controlled,
+        fallback=lambda: fallback,
+        flags=flags,
+        events=events,
     )

@@ -309,6 +309,7 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
 {
   event_sample left, right;
   memset(report, 0, sizeof *report);
+  *filled = 0;
   for (long long k = 0; k < count && !watch->ended; k++) {
     const long long start = k > 0 ? k - 1 : 0, first = *filled;
     const event_step step = {t[start], h[start], q + start * M, p + start * M, parameters, options, watch, found, room,

@@ -30,8 +30,8 @@ def templates(name: str) -> list[str]:
     """What the C of a case is made from."""
     own = case(name)
     stepper = compile_stepper(own.system, own.method(), flags=QUICK_FLAGS)
-    texts = [stepper.source] + ([stepper.ensemble] if stepper.ensemble else [])
-    return sorted({file for text in texts for file in text.files if file.startswith("support/")})
+    texts = (stepper.source, stepper.ensemble, stepper.fallback)
+    return sorted({file for text in texts if text for file in text.files if file.startswith("support/")})
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ class Manifest:
 
     Attributes:
         source, interface, flags: of its stepper.
+        fallback: text that lends Newton's iteration to the source, ``None`` where that has its own.
         options: when the stage equations count as solved; ``None`` for the defaults.
         parameters: values in the order of ``interface.parameters``.
         h: step size, 0 where steps choose their length.
@@ -85,11 +86,18 @@ class Manifest:
     model: str | None
     certificate: Any
     builds: tuple[Build, ...]
+    fallback: Source | None = None
 
     def stepper(self) -> Stepper:
         """The integrator, compiled or from the cache."""
         controlled = self.source if self.goal else None
-        return Stepper(self.source, self.interface, controlled=lambda: controlled, flags=self.flags)
+        return Stepper(
+            self.source,
+            self.interface,
+            controlled=lambda: controlled,
+            fallback=lambda: self.fallback,
+            flags=self.flags,
+        )
 
     def reached(self, run: Run) -> bool:
         """Whether a run is as far as is wanted."""
@@ -119,6 +127,7 @@ class Manifest:
             "builds": [asdict(build) for build in self.builds],
             "interface": json.loads(self.interface.to_json()),
             "source": self.source.to_record(),
+            **({"fallback": self.fallback.to_record()} if self.fallback else {}),
         }
         return json.dumps(document, indent=1) + "\n"
 
@@ -137,6 +146,7 @@ class Manifest:
             builds=tuple(Build(**build) for build in document["builds"]),
             interface=Interface.from_json(json.dumps(document["interface"])),
             source=Source.from_record(document["source"]),
+            fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
         )
 
 

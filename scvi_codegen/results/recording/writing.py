@@ -88,6 +88,7 @@ def record_run(
         raise StateError(f"a run is recorded from its start, but this one has {run.steps} steps: start another")
     manifest = Manifest(
         source=run.stepper.source,
+        fallback=run.stepper.fallback,
         interface=run.stepper.interface,
         flags=run.stepper.flags,
         options=run.options,

@@ -1,0 +1,29 @@
+/* Newton's iteration for a library without it. Before it: newton_fallback.h, LENT_WORKSPACE. */
+#include <stdlib.h>
+
+static SELDOM int lent_step(const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *error)
+{
+  double *workspace = malloc(sizeof(double) * STATUS(LENT_WORKSPACE));
+  step_data own = *step;
+  int status;
+  if (workspace == NULL)
+    return STATUS(NEEDED);
+  own.scratch = workspace;
+  own.first = 1;
+  own.tables = NULL;
+  status = fall_back(NOT_CONVERGED, &own, dq, dp, options, report, workspace + SCRATCH);
+  *error = NAN;
+#ifdef STAGE_POWER
+  if (status == OK)
+    *error = pow(stage_error(&own, newton_in(workspace + SCRATCH).z, dq, ALL, 0.0), STAGE_POWER);
+#endif
+  free(workspace);
+  return status;
+}
+
+const void *NAME(lent_fallback)(void)
+{
+  static const fallback lent = {lent_step};
+  return &lent;
+}

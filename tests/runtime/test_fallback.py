@@ -1,0 +1,126 @@
+"""Newton's iteration borrowed from a second library, where sweeps fail, equals one's own, and comes when it is needed."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
+from scvi_codegen.models.problems import problem
+from scvi_codegen.native import building
+from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.results.recording import record_run, resume_run
+from scvi_codegen.runtime.stepper import Stepper
+
+LONG = 0.2
+"""A step of the double pendulum on which sweeps fail now and then, and Newton's iteration does not."""
+
+each_method = pytest.mark.parametrize(
+    "method", [SVI(4), SCVI(2), Gauss(3), SpectralCollocation(2)], ids=lambda method: method.name
+)
+
+
+@cache
+def both(method):
+    """One that borrows, anew from its text, and one with an iteration of its own."""
+    chosen = problem("double-pendulum")
+    source, interface = generate_source(chosen.system, method)
+    return compile_stepper(chosen.system, method, flags=PORTABLE_FLAGS), Stepper(
+        source, interface, flags=PORTABLE_FLAGS
+    )
+
+
+@pytest.fixture
+def start():
+    chosen = problem("double-pendulum")
+    return np.array(chosen.q), 0.3 * np.array(chosen.q)
+
+
+def outcome(stepper, start, h, **more):
+    """Every number of a run, as far as it goes."""
+    try:
+        run, status = stepper.integrate(*start, h=h, steps=60, **more), ""
+    except StepFailedError as error:
+        run, status = error.trajectory, f"{error.status} {error.t} {error.residual}"
+    events = [(found.t.tolist(), found.q.tolist()) for found in run.events] if more else []
+    return [*(x.tolist() for x in (run.t, run.q, run.p, run.iterations)), status, events]
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
+@each_method
+@pytest.mark.parametrize("h", [0.02, LONG, 0.3])
+@pytest.mark.parametrize("events", [{}, {"events": "sin(theta1)"}], ids=["plain", "events"])
+def test_what_is_borrowed_gives_the_bits_of_ones_own(method, h, events, start):
+    borrowing, owning = both(method)
+    assert outcome(borrowing, start, h, **events) == outcome(owning, start, h, **events)
+
+
+def test_the_error_of_a_borrowed_step_is_that_of_ones_own(start):
+    errors = []
+    for stepper in both(SVI(4)):
+        run = stepper.start(*start, h=LONG)
+        run.skip(6)
+        errors.append(run.step_error)
+    assert errors[0][0] == pytest.approx(errors[1][0], rel=1e-12)
+    assert errors[0][1] == errors[1][1]
+
+
+def test_newtons_iteration_is_compiled_once_it_is_needed(start, monkeypatch):
+    built = []
+    load = building.load
+    monkeypatch.setattr(building, "load", lambda source, **flags: built.append(source.prefix) or load(source, **flags))
+    stepper = compile_stepper(problem("double-pendulum").system, SVI(5), prefix="late", flags=PORTABLE_FLAGS)
+    stepper.integrate(*start, h=0.02, steps=100)
+    assert built == ["late"]
+    assert "_slope" not in stepper.source.code
+    with pytest.raises(StepFailedError):
+        stepper.step(*start, 40.0)
+    assert built == ["late"] * 2
+    with pytest.raises(StepFailedError):
+        stepper.step(*start, 40.0)
+    assert built == ["late"] * 2
+
+
+def test_the_discrete_lagrangian_is_that_of_the_lender(start):
+    borrowing, owning = both(SVI(4))
+    assert "discrete_legendre" not in borrowing.source.declarations
+    q, _ = start
+    values = [stepper.discrete_lagrangian(q, q + 0.01, 0.1) for stepper in (borrowing, owning)]
+    assert values[0] == values[1]
+
+
+def test_threads_may_all_be_the_first_to_need_it(start):
+    stepper = compile_stepper(problem("double-pendulum").system, SVI(3), prefix="threads", flags=PORTABLE_FLAGS)
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda _: outcome(stepper, start, LONG), range(16)))
+    assert all(each == found[0] for each in found)
+    assert found[0] == outcome(stepper, start, LONG)
+
+
+def test_a_copy_in_another_process_borrows_too(start):
+    borrowing, owning = both(SVI(4))
+    assert outcome(pickle.loads(pickle.dumps(borrowing)), start, LONG) == outcome(owning, start, LONG)
+
+
+def test_a_recorded_run_goes_on_with_what_it_borrowed(start, tmp_path):
+    borrowing, owning = both(SVI(4))
+    expected = owning.start(*start, h=LONG).record(60)
+    record_run(borrowing.start(*start, h=LONG), tmp_path / "run", steps=20)
+    whole = resume_run(tmp_path / "run", steps=60)[:]
+    assert np.array_equal(whole.q, expected.q)
+    assert np.array_equal(whole.iterations, expected.iterations)
+
+
+def test_a_run_that_fails_stands_before_the_step(start):
+    borrowing, _ = both(SVI(4))
+    run = borrowing.start(*start, h=40.0)
+    before = run.save()
+    with pytest.raises(StepFailedError):
+        run.skip(1)
+    assert run.save() == before
