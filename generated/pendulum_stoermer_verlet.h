@@ -19,7 +19,7 @@ extern "C" {
 #define PENDULUM_STOERMER_VERLET_PARAMETERS 3
 #define PENDULUM_STOERMER_VERLET_UNKNOWNS 2
 /* Length, in doubles, of the workspace that the functions below ask for. */
-#define PENDULUM_STOERMER_VERLET_WORKSPACE 3
+#define PENDULUM_STOERMER_VERLET_WORKSPACE 4
 
 /* What a function returns. A call that fails leaves its state untouched. */
 enum {

@@ -53,6 +53,13 @@ class Binding:
             self._lender = lender
         return self._lender
 
+    def borrow_fallback(self) -> None:
+        """Compile Newton's iteration, if that is borrowed and was not needed yet."""
+        if self._lacks_fallback:
+            lender = self.with_function("lent_fallback")
+            getattr(self._lib, f"{self._prefix}_borrow_fallback")(lender.function("lent_fallback")())
+            self._lacks_fallback = False
+
     def _has(self, name: str) -> bool:
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
@@ -61,11 +68,9 @@ class Binding:
         memory = self._ffi.buffer(arguments[0]) if isinstance(arguments[0], self._ffi.CData) else None
         before = None if memory is None else bytes(memory)
         status = function(*arguments)
-        if status != NEEDED or self._fallback is None:
+        if status != NEEDED:
             return status
-        lender = self.with_function("lent_fallback")
-        getattr(self._lib, f"{self._prefix}_borrow_fallback")(lender.function("lent_fallback")())
-        self._lacks_fallback = False
+        self.borrow_fallback()
         if memory is not None:
             memory[:] = before
         return function(*arguments)

@@ -83,6 +83,13 @@ class CompiledMethod:
         """The C text that lends Newton's iteration, derived when first asked for; ``None`` if none is borrowed."""
         return self._fallback()
 
+    def prepare(self) -> None:
+        """Derive and compile now what is otherwise compiled when a step first needs it: Newton's iteration behind sweeps.
+
+        For loops that must not wait a second for it.
+        """
+        self.binding.borrow_fallback()
+
     def _load_fallback(self) -> building.Library:
         source = self.fallback
         if source is None:

@@ -10,7 +10,8 @@ enum {
 #define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
 #define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
-#define LEAST_ERROR (REAL(0.03125) * REAL_EPSILON) /* allowed to a step: a million add up to what rounding leaves */
+#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
+#define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: less is rounding */
 #define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
 
 /* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
@@ -21,7 +22,7 @@ typedef struct {
 
 static error_limits limits_of(real tolerance)
 {
-  const real most = MATH(pow)(tolerance, 1 / ERROR_POWER);
+  const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
   const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH)};
   return limits;
 }
@@ -178,7 +179,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
 {
   solver_options standard = NAME(default_options)();
   solver_report unread;
-  trial now = {.limits = limits_of(larger(tolerance, LEAST_ERROR)), .t_end = t_end};
+  trial now = {.limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR), .t_end = t_end};
   const step_data step = {run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
       NULL};
   standard.tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);

@@ -60,9 +60,9 @@ class Sabotage:
     def edit(self, pattern: str, replacement: str) -> None:
         """Edit the first place of each C text, of the artefact, of Newton's solver and of lanes, with the pattern."""
 
-        def make(render: Callable[[Any], Any]) -> Callable[[Any], Any]:
-            def rendered(program: Any) -> Any:
-                source = render(program)
+        def make(render: Callable[..., Any]) -> Callable[..., Any]:
+            def rendered(program: Any, *control: Any, **where: Any) -> Any:
+                source = render(program, *control, **where)
                 if source is None:
                     return None
                 source = source.amalgamated()
