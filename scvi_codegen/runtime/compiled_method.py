@@ -84,7 +84,7 @@ class CompiledMethod:
         return self._fallback()
 
     def prepare(self) -> None:
-        """Derive and compile now what is otherwise compiled when a step first needs it: Newton's iteration behind sweeps.
+        """Compile now what is otherwise compiled when a step first needs it: Newton's iteration behind sweeps.
 
         For loops that must not wait a second for it.
         """

@@ -105,7 +105,7 @@ def test_a_run_killed_at_random_moments_goes_on(kepler, times):
 
 def test_a_file_that_may_not_grow_is_told_with_where_the_run_stands(kepler):
     limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))"
-    with child(kepler, before=limit) as process:
+    with child(kepler, before=limit, rows=10_000) as process:
         _, stderr = process.communicate(timeout=60)
     last, steps = stderr.splitlines()[-1], load_run("a.run").steps
     assert "RecordingError: 'a.run' cannot be written: File too large. " in last

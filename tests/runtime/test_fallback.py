@@ -1,4 +1,4 @@
-"""Newton's iteration borrowed from a second library, where sweeps fail, equals one's own, and comes when it is needed."""
+"""Newton's iteration borrowed from a second library where sweeps fail: equal to one's own, compiled when needed."""
 
 from __future__ import annotations
 
