@@ -27,10 +27,13 @@ import re
 from collections.abc import Callable, Sequence
 from functools import cache
 
+from sympy import Expr
+
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.kinds import SWITCH, TEXT, TEXTS, takes
+from scvi_codegen.lowering.density import density_of
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
@@ -71,6 +74,7 @@ def compile_stepper(
     prefix: str | None = None,
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
+    monitor: str | Expr | None = None,
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -87,13 +91,16 @@ def compile_stepper(
         symmetries: known beside those that are found
             (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`): their momentum maps are tracked, too.
         events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
+        monitor: g(q, t) > 0, or a name as of :func:`~scvi_codegen.reparametrise`, of a Hamiltonian g(q, p, t): runs
+            with h and t_end then take steps of h in a time with dt = g dtau, by the reversible controller of Hairer and
+            Soederlind, also where the system depends on time and where forces act. Momentum maps are kept.
 
     Raises:
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
     method = as_method(method)
-    key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries))
+    key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries), str(monitor))
 
     @cache
     def program(*, fallback: bool = False) -> Program:
@@ -104,7 +111,7 @@ def compile_stepper(
         return solver == "auto" and program().sweep is not None and not program().newton
 
     def texts() -> str:
-        interface = describe(program(), system, method, borrows=borrows())
+        interface = describe(program(), system, method, borrows=borrows(), monitor=monitor)
         return json.dumps([_rendered(program(), borrows=borrows()).to_json(), interface.to_json()])
 
     def remembered(name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
@@ -116,7 +123,7 @@ def compile_stepper(
         return source
 
     def controlled() -> Source | None:
-        control = control_of(program())
+        control = control_of(program()) if monitor is None else density_of(system, monitor)
         return _rendered(program(), control, borrows=borrows()) if control else None
 
     def fallback() -> Source | None:
@@ -226,7 +233,14 @@ def program_of(
     )
 
 
-def describe(program: Program, system: MechanicalSystem, method: Method, *, borrows: bool = False) -> Interface:
+def describe(
+    program: Program,
+    system: MechanicalSystem,
+    method: Method,
+    *,
+    borrows: bool = False,
+    monitor: str | Expr | None = None,
+) -> Interface:
     """The interface of a program; ``borrows``: whether Newton's iteration is that of another library."""
     return Interface(
         prefix=program.prefix,
@@ -245,6 +259,7 @@ def describe(program: Program, system: MechanicalSystem, method: Method, *, borr
         map_exact=tuple(each.exact for each in program.momentum_maps),
         has_fallback=borrows or (program.newton and program.sweep is not None),
         momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
+        monitor="" if monitor is None else str(monitor),
         energy_parameter=system.clock.energy.name if system.clock else "",
     )
 

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import NumberTable
 
-__all__ = ["Control"]
+__all__ = ["Control", "Ladder"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """Steps on a ladder, h = 2^(k / rungs), by sweeps or by Newton's iteration.
+    """Steps on a ladder, h = 2^(k / rungs), by sweeps or by Newton's iteration; or steps of a density of their own.
 
     Attributes:
         mantissas: 2^(k / rungs) for the rungs of an octave.
         ladder: of sweeps, ``None`` without these.
         stage_growth: of the error of the curve of Newton's iteration from rung to rung; 0 where that tells no error.
+        density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a monitor g; in place of the ladder.
     """
 
-    mantissas: tuple[float, ...]
-    ladder: Ladder | None
-    stage_growth: float
+    mantissas: tuple[float, ...] = ()
+    ladder: Ladder | None = None
+    stage_growth: float = 0.0
+    density: Kernel | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

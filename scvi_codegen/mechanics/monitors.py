@@ -34,19 +34,21 @@ MOST_SIMPLIFIED = 200
 """Operations of a formula that SymPy simplifies in a second: Kepler's comes out as 5 mu^2/r^6."""
 
 
-def monitor_function(system: MechanicalSystem, monitor: str | Expr) -> Expr:
+def monitor_function(system: MechanicalSystem, monitor: str | Expr, *, in_time: bool = False) -> Expr:
     """The formula of a monitor: one by name, or text or an expression in coordinates, momenta and parameters.
 
     Args:
         system: what moves.
         monitor: a name among ``MONITORS``, or a formula.
+        in_time: whether it may depend on the time, too.
 
     Raises:
         SystemDefinitionError: for a formula in other symbols, and a name that the system is not fit for.
     """
     if isinstance(monitor, str) and monitor in MONITORS:
         return MONITORS[monitor](system)
-    known = {given.name: given for given in (*system.coordinates, *system.auxiliaries, *system.parameters)}
+    time = (system.time,) if in_time else ()
+    known = {given.name: given for given in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
     if isinstance(monitor, Expr):
         formula = monitor.xreplace({free: known[free.name] for free in monitor.free_symbols if free.name in known})
     elif isinstance(monitor, str):

@@ -62,13 +62,13 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
         )
     if system.depends_on_time:
         raise SystemDefinitionError(
-            f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or the "
-            "reversible controller"
+            f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or "
+            "compile_stepper(..., monitor=...), the reversible controller"
         )
     if system.forces:
         raise SystemDefinitionError(
             f"forces act on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
-            "controlled steps (t_end=...)"
+            "controlled steps (t_end=...), or compile_stepper(..., monitor=...), the reversible controller"
         )
     level = _free_symbol(system)
     rate = monitor_function(system, monitor)

@@ -112,6 +112,7 @@ class Interface:
         map_exact: whether the method is known to conserve them exactly, to round-off.
         momentum_names: of a Hamiltonian; see :attr:`momenta`.
         energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
+        monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
     """
 
     prefix: str
@@ -131,6 +132,7 @@ class Interface:
     momentum_names: tuple[str, ...] = ()
     has_fallback: bool = False
     energy_parameter: str = ""
+    monitor: str = ""
 
     @property
     def dimension(self) -> int:

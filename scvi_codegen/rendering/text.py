@@ -119,7 +119,7 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
 
     Where sweeps fail, Newton's iteration is the fallback if the program has it; or another is named.
     """
-    return _render(program.prefix, _context(program, DOUBLE, fallback) | _control_context(program, control))
+    return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
@@ -129,12 +129,10 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
         MethodError: for a number that single precision cannot hold.
     """
     target = TARGETS[precision]
-    target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program)))))
+    target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
     bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
-    return _render(
-        program.prefix, _context(program, target) | _control_context(program, control) | bounded
-    ).amalgamated()
+    return _render(program.prefix, _context(program, target, control) | bounded).amalgamated()
 
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
@@ -230,30 +228,33 @@ def scratch_size(program: Program) -> int:
     return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
 
 
-def _context(program: Program, target: Target, fallback: Fallback | None = None) -> dict[str, object]:
-    fallback = fallback or ("own" if program.newton else "none")
+def _context(
+    program: Program, target: Target, control: Control | None, fallback: Fallback | None = None
+) -> dict[str, object]:
+    fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control)
     return {
         "program": program,
         "prefix": program.prefix,
         "target": target,
         "real": target.scalar,
         "kernels": program.kernels,
-        "cut": _is_cut((*_scalar_kernels(program), *(program.sweep.kernels if program.sweep else ()))),
-        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, _scalar_kernels(program)))),
+        "cut": _is_cut((*scalars, *(program.sweep.kernels if program.sweep else ()))),
+        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
         "max_iterations": MAX_ITERATIONS,
         "most_iterations": "INT_MAX",
         "embedded": False,
         "written_out": written_out(program, target),
-        "control": None,
         "fallback": fallback,
+        **_control_context(program, control),
         **_lane_context(program, fallback),
     }
 
 
-def _scalar_kernels(program: Program) -> tuple[Kernel, ...]:
-    return (*program.kernels, *(program.splitting.kernels if program.splitting else ()))
+def _scalar_kernels(program: Program, control: Control | None) -> tuple[Kernel, ...]:
+    splitting = program.splitting.kernels if program.splitting else ()
+    return (*program.kernels, *splitting, *((control.density,) if control and control.density else ()))
 
 
 def _is_cut(kernels: Iterable[Kernel]) -> bool:

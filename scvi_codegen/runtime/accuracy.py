@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from typing import Final, Protocol
 
 from scvi_codegen.errors import AccuracyWarning
+from scvi_codegen.runtime.goal import Goal
 
 __all__ = ["TOLERABLE_ERROR", "unwarned", "warn_of_long_steps"]
 
@@ -22,7 +23,7 @@ class Steps(Protocol):
     """What a trajectory tells of its steps."""
 
     @property
-    def goal(self) -> object: ...
+    def goal(self) -> Goal | None: ...
     @property
     def h(self) -> float: ...
     @property
@@ -44,7 +45,8 @@ def unwarned() -> Iterator[None]:
 def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0) -> None:
     """An :class:`AccuracyWarning` of the worst step of a run of h, unless one ``before`` was a reason for it."""
     error = trajectory.step_error
-    if trajectory.goal or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
+    controlled = trajectory.goal is not None and not trajectory.goal.tau
+    if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
         return
     warnings.warn(
         f"the step from t = {trajectory.step_error_t:g} with h = {trajectory.h:g} is too long: the relative error of "

@@ -12,10 +12,17 @@ __all__ = ["Goal"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Goal:
-    """The time to reach, and the relative error allowed to the end of each step (0: round-off)."""
+    """The time to reach, and how steps are chosen.
+
+    Attributes:
+        t_end: the time.
+        tolerance: the relative error allowed to the end of each step, 0: round-off.
+        tau: in place of it the length of steps where a monitor chooses what they last.
+    """
 
     t_end: float
     tolerance: float = 0.0
+    tau: float = 0.0
 
     @classmethod
     def checked(cls, t_end: float, tolerance: float | None) -> Goal:

@@ -182,7 +182,7 @@ class Memory:
         report = binding.new("report *")
         status = binding.function("advance_to" if goal else "advance")(
             self._memory,
-            *((goal.t_end, goal.tolerance) if goal else ()),
+            *((goal.t_end, goal.tau or goal.tolerance) if goal else ()),
             steps,
             every,
             binding.pointer(self._parameters),

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import FUNCTION, takes
-from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
@@ -70,7 +70,8 @@ class Stepper(Integrator):
             h: step size, negative to go back; in transformed time (:func:`~scvi_codegen.reparametrise`) of tau.
             steps: number of steps.
             t_end: instead of both: where to go, by steps that choose their length. The last ends there exactly. In
-                transformed time instead of steps alone: steps of h, the last of them shorter, lead there.
+                transformed time, and where a monitor chooses the steps (:func:`~scvi_codegen.compile_stepper`), instead
+                of steps alone: steps of h, the last of them shorter, lead there.
             tolerance: relative error of the end of such a step; by default round-off. Many of them add up.
             every: steps between kept states; the one at t_end is kept, too.
             t: initial time.
@@ -157,6 +158,8 @@ class Stepper(Integrator):
         Raises:
             StateError: on wrong shapes, names or numbers.
         """
+        if self.interface.monitor:
+            raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         if h is None and steps is None and t_end is not None:
             work = EnsembleToEnds(
@@ -206,6 +209,9 @@ class Stepper(Integrator):
         By steps of h, or of their own lengths to t_end.
         """
         p = self.momenta_given(q, p, velocity, t, parameters)
+        if self.interface.monitor:
+            goal = _monitored(self.interface.monitor, h, t_end, tolerance)
+            return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
         if h is None and self.interface.energy_parameter:
             raise StateError("in transformed time steps of tau have one length: give h")
         if t_end is not None and h is None:
@@ -225,14 +231,36 @@ class Stepper(Integrator):
         *,
         t_end: float | None = None,
         tolerance: float | None = None,
+        h: float | None = None,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have; give its goal again."""
+        """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have; give its goal again.
+
+        With h only where a monitor chooses the steps.
+        """
+        if self.interface.monitor:
+            goal = _monitored(self.interface.monitor, h, t_end, tolerance)
+            return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+        if h is not None:
+            raise StateError("the bytes of a run hold its h: leave it out")
         if t_end is None:
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
         return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+
+
+def _monitored(monitor: str, h: float | None, t_end: float | None, tolerance: float | None) -> Goal:
+    """Where a run leads whose steps a monitor chooses."""
+    if h is None or t_end is None or tolerance is not None:
+        raise StateError(
+            f"the monitor {monitor} chooses how long steps are: give their length h in the time that it transforms to, "
+            "and t_end, where they lead"
+        )
+    tau = checked_step(h)
+    if tau < 0.0:
+        raise StateError(f"steps of h = {h:g} in the time of a monitor are positive; t_end says where they lead")
+    return Goal(t_end=checked_number(t_end, "t_end"), tau=tau)
 
 
 def _said(trajectory: Trajectory) -> Trajectory:

@@ -1,5 +1,5 @@
 /* Steps that choose their own length, roots of 2 to the power of a rung. Before it: attempt of a solver, which tries a
- * step, MANTISSA, and GROWTH, what a rung up multiplies the error of a curve by. */
+ * step, MANTISSA, and GROWTH, what a rung up multiplies the error of a curve by. After it: advance_to.h. */
 enum {
   OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
   MOST_UP = 4 * OCTAVE, /* rungs, while the first step is looked for */
@@ -121,7 +121,7 @@ static int shorten(run_memory *run, const trial *now)
   return length_of(run->rung) > VANISHING * (MATH(fabs)(now->at.t) + REAL_EPSILON * MATH(fabs)(now->t_end - now->at.t));
 }
 
-/* The step that the run is at, tried shorter and shorter until its error is allowed; 0 if it vanishes. */
+/* The step that the run is at, tried shorter and shorter until its error is allowed or it vanishes. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = LITTLE * now->limits.fewer;
@@ -131,11 +131,11 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
     try_first_step(run, now, options, report);
   while (!(now->error <= now->limits.most * GROWTH)) {
     if (!shorten(run, now))
-      return 0;
+      return STATUS(VANISHED);
     try_step(run, now, least, options, report);
   }
   now->error = larger(now->error, least);
-  return 1;
+  return OK;
 }
 
 /* Chooses the length of the next step. */
@@ -173,42 +173,11 @@ static inline void take_step(run_memory *run, trial *now)
   run->step++;
 }
 
-int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
-    const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
-    solver_report *report, real *workspace)
+/* What steps are chosen by: the error allowed to each, which their equations are then solved for. */
+static void begin_trials(run_memory *run, trial *now, real tolerance, solver_options *standard)
 {
-  solver_options standard = NAME(default_options)();
-  solver_report unread;
-  trial now = {.limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR), .t_end = t_end};
-  const step_data step = {run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
-      NULL};
-  standard.tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);
-  options = options ? options : &standard;
-  report = report ? report : &unread;
-  memset(report, 0, sizeof *report);
-  memcpy(&now.step, &step, sizeof step);
-  load_state(run, &now.at);
-  if ((real)run->direction * (t_end - run->t) < 0)
+  now->limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR);
+  standard->tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);
+  if ((real)run->direction * (now->t_end - run->t) < 0)
     run->guess = 0;
-  run->direction = t_end < run->t ? -1 : 1;
-  while (report->steps < steps && now.at.t != t_end) {
-    const long long before = report->iterations;
-    if (!find_step(run, &now, options, report)) {
-      save_state(&now.at, run);
-      return STATUS(VANISHED);
-    }
-    take_step(run, &now);
-    run->iterations += report->iterations - before;
-    report->steps++;
-    if (run->step % every == 0 || now.at.t == t_end) {
-      const long long stored = report->stored++;
-      t[stored] = now.at.t;
-      memcpy(q + stored * M, now.at.q, sizeof(real) * M);
-      memcpy(p + stored * M, now.at.p, sizeof(real) * M);
-      iterations[stored] = (int)run->iterations;
-      run->iterations = 0;
-    }
-  }
-  save_state(&now.at, run);
-  return OK;
 }

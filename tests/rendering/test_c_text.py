@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import sample_named
+from samples import QUICK_FLAGS, sample_named
+from style import check_style
 
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.errors import MethodError
@@ -146,6 +147,25 @@ def test_compiles_without_a_warning_to_pure_code(method, tmp_path):
 def test_clang_has_no_warning_either(method, tmp_path):
     files = write([source for source, _ in generated(method).values()], tmp_path)
     run([tool("clang"), *C99, "-c", *files], tmp_path)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
+def test_texts_that_are_compiled_here_alone_have_no_warning(name, solver, compiler, tmp_path):
+    """A fallback borrowed and lent, and steps of a density of their own."""
+    system = systems()[name]
+    q = system.coordinates[0].name
+    monitor = f"1/(1 + {q}**2)"
+    stepper = compile_stepper(system, SVI(3), solver=solver, monitor=monitor, prefix="own", flags=QUICK_FLAGS)
+    texts = [stepper.source, stepper.controlled().source, *([stepper.fallback] if stepper.fallback else [])]
+    assert len(texts) == (3 if solver == "auto" else 2)
+    for number, text in enumerate(texts):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        run([tool(compiler), *C99, "-c", *write([text], folder)], folder)
+        check_style(text.amalgamated().code)
+        check_style(text.header)
 
 
 def check_symbols(prefix: str, folder: Path) -> None:

@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sysconfig
 from pathlib import Path
 
 import pytest
+from style import check_style
 
 from scvi_codegen import SVI, LagrangianSystem, compile_stepper, generate_source, problem
 from scvi_codegen.files.templates import template_folder
 from scvi_codegen.rendering.source import Source
 
 FOLDER = Path(__file__).parents[2] / "generated"
-STYLE = Path(__file__).parents[2] / ".clang-format"
 SUPPORT = sorted((template_folder() / "support").glob("*.h"))
-CLANG_FORMAT = Path(sysconfig.get_path("scripts")) / "clang-format"
-
-
-def check_style(text: str) -> None:
-    assert [line for line in text.splitlines() if len(line) > 120] == []
-    assert "\n\n\n" not in text
-    command = [str(CLANG_FORMAT), f"--style=file:{STYLE}", "--assume-filename=integrator.c"]
-    formatted = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
-    assert formatted == text
 
 
 @pytest.mark.parametrize("path", SUPPORT, ids=lambda path: path.name)

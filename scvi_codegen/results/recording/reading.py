@@ -118,6 +118,7 @@ class RecordedRun:
             self._last.memory,
             t_end=goal.t_end if goal else None,
             tolerance=(goal.tolerance or None) if goal else None,
+            h=(goal.tau or None) if goal else None,
             parameters=manifest.parameters,
             options=manifest.options,
         )

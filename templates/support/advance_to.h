@@ -1,0 +1,41 @@
+/* Runs to a time, by steps that choose their own length. Before it: a controller: what a trial of a step is,
+ * begin_trials, find_step, and take_step, which makes the step found the state. */
+
+int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
+    const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
+    solver_report *report, real *workspace)
+{
+  solver_options standard = NAME(default_options)();
+  solver_report unread;
+  trial now = {.t_end = t_end};
+  const step_data step = {run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
+      NULL};
+  begin_trials(run, &now, tolerance, &standard);
+  run->direction = t_end < run->t ? -1 : 1;
+  options = options ? options : &standard;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  memcpy(&now.step, &step, sizeof step);
+  load_state(run, &now.at);
+  while (report->steps < steps && now.at.t != t_end) {
+    const long long before = report->iterations;
+    const int status = find_step(run, &now, options, report);
+    if (status != OK) {
+      save_state(&now.at, run);
+      return status;
+    }
+    take_step(run, &now);
+    run->iterations += report->iterations - before;
+    report->steps++;
+    if (run->step % every == 0 || now.at.t == t_end) {
+      const long long stored = report->stored++;
+      t[stored] = now.at.t;
+      memcpy(q + stored * M, now.at.q, sizeof(real) * M);
+      memcpy(p + stored * M, now.at.p, sizeof(real) * M);
+      iterations[stored] = (int)run->iterations;
+      run->iterations = 0;
+    }
+  }
+  save_state(&now.at, run);
+  return OK;
+}

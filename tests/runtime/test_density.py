@@ -1,0 +1,200 @@
+"""Steps whose density a monitor carries along: the reversible controller of Hairer and Soederlind."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, SystemDefinitionError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SCVI, SVI, Gauss, StoermerVerlet
+from scvi_codegen.models.problems import problem
+from scvi_codegen.results.recording import record_run, resume_run
+from scvi_codegen.runtime.goal import Goal
+
+KEPLER = problem("kepler").system
+E = 0.8
+START = np.array([1.0 - E, 0.0]), np.array([0.0, np.sqrt((1.0 + E) / (1.0 - E))])
+PERIOD = 2.0 * np.pi
+RADIUS = "(q1**2 + q2**2)**(3/4)"
+
+DRIVEN = LagrangianSystem.from_text(
+    name="driven and damped",
+    coordinates=["x"],
+    lagrangian="x_dot**2/2 - x**4/4 + x*cos(2*t)/2",
+    forces={"x": "-x_dot/10"},
+)
+
+
+def kepler(method, monitor="frequency", **more):
+    return compile_stepper(KEPLER, method, monitor=monitor, flags=QUICK_FLAGS, **more)
+
+
+def by_hand(stepper, q, p, tau, steps, rate, control):
+    """The controller, step by step, around an integrator that knows nothing of it."""
+    density, t, states = 0.0, 0.0, []
+    for _ in range(steps):
+        slope = control(t, q, p)
+        density = density + tau * slope if density else 1.0 / rate(t, q, p) + tau / 2.0 * slope
+        q, p = stepper.step(q, p, tau / density, t)
+        t += tau / density
+        states.append([t, *q, *p])
+    return np.array(states)
+
+
+@pytest.mark.parametrize("method", [SVI(3), SCVI(2), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_steps_are_those_of_the_controller(method, solver):
+    run = kepler(method, RADIUS, solver=solver).integrate(*START, h=0.1, t_end=3.0)
+    expected = by_hand(
+        compile_stepper(KEPLER, method, solver=solver, flags=QUICK_FLAGS),
+        *START,
+        0.1,
+        len(run.t) - 2,
+        lambda _, q, __: (q @ q) ** 0.75,
+        lambda _, q, p: -1.5 * (q @ p) / (q @ q),
+    )
+    found = np.column_stack([run.t, run.q, run.p])[1:-1]
+    assert np.abs(found - expected).max() < 1e-12
+    assert run.t[-1] == 3.0
+    assert 0.0 < run.t[-1] - run.t[-2] <= run.lengths[-3] * 1.5
+
+
+def test_the_monitor_may_depend_on_time_where_the_system_does():
+    stepper = compile_stepper(DRIVEN, SVI(3), monitor="1/(1 + x**2 + cos(t)/2)", flags=QUICK_FLAGS)
+    run = stepper.integrate([1.0], [0.0], h=0.2, t_end=8.0)
+
+    def control(t, q, p):
+        return (2.0 * q[0] * p[0] - np.sin(t) / 2.0) / (1.0 + q[0] ** 2 + np.cos(t) / 2.0)
+
+    expected = by_hand(
+        compile_stepper(DRIVEN, SVI(3), flags=QUICK_FLAGS),
+        np.array([1.0]),
+        np.array([0.0]),
+        0.2,
+        len(run.t) - 2,
+        lambda t, q, _: 1.0 / (1.0 + q[0] ** 2 + np.cos(t) / 2.0),
+        control,
+    )
+    assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
+
+
+def test_a_hamiltonian_has_monitors_of_its_momenta():
+    system = hamiltonian_of(KEPLER)
+    stepper = compile_stepper(system, SVI(4), monitor="1/(p_q1**2 + p_q2**2 + 1/(q1**2 + q2**2))", flags=QUICK_FLAGS)
+    run = stepper.integrate(*START, h=0.3, t_end=20 * PERIOD)
+    assert np.abs(run.energy() / run.energy()[0] - 1.0).max() < 1e-7
+    lengths = run.lengths[:-2]
+    near = np.hypot(*run.q[:-2].T) < 0.3
+    assert 4.0 * lengths[near].mean() < lengths[~near].mean()
+
+
+@pytest.mark.parametrize("system", [KEPLER, hamiltonian_of(KEPLER)], ids=["lagrangian", "hamiltonian"])
+def test_a_run_that_turns_goes_back_on_its_own_steps(system):
+    stepper = compile_stepper(system, SVI(4), monitor="frequency", flags=QUICK_FLAGS)
+    run = stepper.start(*START, h=0.1, t_end=100.0)
+    there = run.record(300)
+    run.goal = Goal(t_end=-100.0, tau=0.1)
+    back = run.record(300)
+    assert np.abs(back.t[::-1] - there.t).max() < 1e-11
+    assert np.abs(back.q[::-1] - there.q).max() < 1e-11
+
+
+def test_invariants_are_kept_for_long():
+    run = kepler(SVI(2)).integrate(*START, h=0.1, t_end=500 * PERIOD)
+    error = run.energy() / run.energy()[0] - 1.0
+    turns = error[np.hypot(*run.q.T) > 1.79]
+    line = np.polyfit(np.linspace(0.0, 1.0, len(turns)), turns, 1)
+    assert np.abs(error).max() < 1e-4
+    assert abs(line[0]) < 3e-7
+    assert np.abs(run.momentum_maps() - run.momentum_maps()[0]).max() < 1e-13
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_the_order_is_that_of_the_method(degree):
+    exact = compile_stepper(DRIVEN, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], t_end=4.0).q[-1]
+    stepper = compile_stepper(DRIVEN, SVI(degree), monitor="1/(1 + x**2)", flags=QUICK_FLAGS)
+    errors = [abs(stepper.integrate([1.0], [0.0], h=tau, t_end=4.0).q[-1] - exact)[0] for tau in (0.2, 0.1)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.35)
+
+
+def test_states_between_events_and_portions_of_a_run():
+    stepper = kepler(SVI(8), events="q1*q1_dot + q2*q2_dot")
+    run = stepper.integrate(*START, h=0.2, t_end=3 * PERIOD)
+    assert run.events[0].t == pytest.approx(PERIOD / 2 * np.arange(1, 6), abs=1e-11)
+    exact = compile_stepper(KEPLER, SVI(8), flags=QUICK_FLAGS).integrate(*START, t_end=2.5)
+    assert run.at(2.5)[0] == pytest.approx(exact.q[-1], abs=1e-11)
+    pieces = stepper.start(*START, h=0.2, t_end=3 * PERIOD)
+    for _ in range(3):
+        pieces.record(11)
+    again = pickle.loads(pickle.dumps(pieces))
+    restored = stepper.restore(pieces.save(), h=0.2, t_end=3 * PERIOD)
+    for each in (pieces, again, restored):
+        assert np.array_equal(each.record().q[-1], run.q[-1])
+
+
+def test_backward_and_recorded(tmp_path):
+    stepper = kepler(SVI(6))
+    back = stepper.integrate(START[0], -START[1], h=0.1, t_end=5.0)
+    other = stepper.integrate(*START, h=0.1, t=5.0, t_end=0.0)
+    assert np.abs(back.q - other.q).max() < 1e-13
+    record_run(stepper.start(*START, h=0.1, t_end=5.0), tmp_path / "run")
+    whole = stepper.integrate(*START, h=0.1, t_end=9.0)
+    assert np.array_equal(resume_run(tmp_path / "run", t_end=5.0)[:].q[:-1], whole.q[: len(back.q) - 1])
+
+
+def test_a_fallback_is_borrowed_here_too():
+    pendulum = problem("double-pendulum")
+    start = np.array(pendulum.q), 0.3 * np.array(pendulum.q)
+    runs = [
+        compile_stepper(pendulum.system, SVI(4), monitor="1/(1 + theta1**2/100)", solver=solver).start(
+            *start, h=0.15, t_end=9.0
+        )
+        for solver in ("auto", "newton")
+    ]
+    found = [run.record(20).q[-1] for run in runs]
+    assert found[0] == pytest.approx(found[1], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda s: s.integrate(*START, h=0.1, steps=10), "and t_end"),
+        (lambda s: s.integrate(*START, t_end=1.0), "and t_end"),
+        (lambda s: s.integrate(*START, h=0.1, t_end=1.0, tolerance=1e-9), "and t_end"),
+        (lambda s: s.integrate(*START, h=-0.1, t_end=1.0), "positive"),
+        (lambda s: s.integrate(*START, h=0.1, steps=10, t_end=1.0), "leave out steps"),
+        (lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0), "no ensembles"),
+        (lambda s: s.restore(b"", t_end=1.0), "and t_end"),
+    ],
+)
+def test_what_is_missing_is_said(call, words):
+    with pytest.raises(StateError, match=words):
+        call(kepler(SVI(2)))
+
+
+def test_what_is_no_monitor_is_said():
+    with pytest.raises(SystemDefinitionError, match="unknown name 'z'"):
+        kepler(SVI(2), "z**2").integrate(*START, h=0.1, t_end=1.0)
+
+
+def test_steps_too_long_for_the_monitor_are_refused():
+    with pytest.warns(AccuracyWarning):
+        kepler(SVI(2)).integrate(*START, h=0.7, t_end=PERIOD / 2)
+    with pytest.raises(StepFailedError, match=r"not finite|not converged|strayed"):
+        kepler(SVI(2)).integrate(*START, h=50.0, t_end=PERIOD)
+
+
+def test_momenta_that_velocities_do_not_give_are_no_hindrance():
+    vortices = HamiltonianSystem.from_text(
+        name="q p", coordinates=["x"], momenta=["y"], hamiltonian="x**2*y**2/2 + x**2/2 + y**2/2"
+    )
+    run = compile_stepper(vortices, SVI(3), monitor="1/(1 + x**2 + y**2)", flags=QUICK_FLAGS).integrate(
+        [1.0], [1.0], h=0.1, t_end=10.0
+    )
+    assert np.abs(run.energy() / run.energy()[0] - 1.0).max() < 1e-6
