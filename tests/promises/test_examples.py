@@ -25,6 +25,7 @@ SCRIPTS = (
     "inspect_derivation",
     "kepler_conservation",
     "poincare_section",
+    "which_step",
 )
 ENERGY_ERRORS = {
     "outer_solar_system": 1e-13,
@@ -86,6 +87,17 @@ def test_eccentric_comet_keeps_its_energy(tmp_path):
     assert stretched[3] < 1e-9
     assert regular[3] < 1e-11
     assert regular[4] < 1e-9
+
+
+def test_every_way_to_choose_steps_is_as_good_as_it_says(tmp_path):
+    """Over a thousand periods; in docs/steps.md ten thousand."""
+    rows = [line[28:].split() for line in output_of("which_step", tmp_path).splitlines()[1:]]
+    steps, _, energy, _, error = zip(*(map(float, row) for row in rows), strict=True)
+    fixed, controlled, loose, transformed, reversible = range(5)
+    assert steps[fixed] > 6 * max(steps[controlled:])
+    assert energy[loose] > 1e-10 > 1e-11 > energy[fixed]
+    assert max(energy[way] for way in (controlled, transformed, reversible)) < 2e-12
+    assert max(error[way] for way in (controlled, transformed, reversible)) < 1e-8 < error[fixed]
 
 
 def test_a_comet_that_all_but_hits_the_sun_comes_back(tmp_path):

@@ -1,4 +1,4 @@
-"""The README does what it says, from top to bottom, in a temporary folder with the examples in it.
+"""The README and the pages of docs do what they say, from top to bottom, in a temporary folder with the examples in it.
 
 Blocks marked ``python`` run in one namespace; of those marked ``sh`` or ``console``, every command that begins with
 ``scvi-codegen``.
@@ -24,12 +24,12 @@ MINUTES = "scvi-codegen reproduce all"
 """Takes minutes of processor time."""
 
 
-def runnable() -> Iterator[tuple[str, str]]:
-    """("python", text) or ("command", text) in order; Python text stands on the line it has in the README."""
-    for match in BLOCK.finditer(README):
+def runnable(page: str) -> Iterator[tuple[str, str]]:
+    """("python", text) or ("command", text) in order; Python text stands on the line it has in the page."""
+    for match in BLOCK.finditer(page):
         language, text = match.groups()
         if language == "python":
-            yield "python", "\n" * (README.count("\n", 0, match.start()) + 1) + text
+            yield "python", "\n" * (page.count("\n", 0, match.start()) + 1) + text
         for command in commands(text) if language in ("sh", "console") else ():
             if command.startswith("scvi-codegen "):
                 yield "command", command
@@ -49,9 +49,12 @@ def run_command(command: str) -> None:
     assert result.returncode == 0, f"{command}\n{result.stdout}{result.stderr}"
 
 
-def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
-    found = [(kind, text) for kind, text in runnable() if not text.startswith(MINUTES)]
-    assert {kind for kind, _ in found} == {"python", "command"}, "the README shows both"
+@pytest.mark.parametrize(
+    ("name", "kinds"), [("README.md", {"python", "command"}), ("docs/steps.md", {"python"})], ids=["readme", "steps"]
+)
+def test_a_page_runs_from_top_to_bottom(name, kinds, tmp_path, monkeypatch):
+    found = [pair for pair in runnable((ROOT / name).read_text(encoding="utf-8")) if not pair[1].startswith(MINUTES)]
+    assert {kind for kind, _ in found} == kinds
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -59,7 +62,7 @@ def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
     namespace: dict[str, Any] = {"__name__": "readme"}
     for kind, text in found:
         if kind == "python":
-            exec(compile(text, "README.md", "exec"), namespace)
+            exec(compile(text, name, "exec"), namespace)
         else:
             run_command(text)
 
@@ -67,7 +70,7 @@ def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
 @pytest.mark.full
 def test_the_paper_is_run_again_as_the_readme_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    [command] = [text for kind, text in runnable() if text.startswith(MINUTES)]
+    [command] = [text for kind, text in runnable(README) if text.startswith(MINUTES)]
     run_command(command)
     assert (tmp_path / "paper.html").is_file()
 
