@@ -52,9 +52,9 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 #include "support/lagrangian.h"
 #include "support/energies.h"
 
-enum { KICKS = 2 };
+enum { LEAPS = 2 };
 static const double KICK[2] = {0.5, 0.5};
-static const double DRIFT[1] = {1.0};
+static const double DRIFT[2] = {1.0, 0.0};
 static const double KICK_ABSCISSA[2] = {0.0, 1.0};
 
 /* L_q at u = q. Operations: 3 *, 1 neg, 1 sin. */
@@ -71,6 +71,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 
+#include "support/drift_by_masses.h"
 #include "support/splitting.h"
 
 #include "support/no_error.h"

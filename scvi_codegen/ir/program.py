@@ -167,7 +167,7 @@ class Program:
     def action(self) -> bool:
         """Whether there is a discrete Lagrangian."""
         if self.splitting:
-            return len(self.splitting.drifts) == 1
+            return self.splitting.acts
         return self.newton and self.acts
 
     @property

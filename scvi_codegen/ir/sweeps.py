@@ -240,23 +240,30 @@ class HamiltonianSweep(PointSweep):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Splitting:
-    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., kick s.
+    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., those of weight 0 left out.
 
     Attributes:
-        kicks: (s + 1,) p += h kicks[n] L_q.
-        drifts: (s,) q += h drifts[n] M^-1 p.
-        abscissae: (s + 1,) c_n of the kicks.
+        kicks: (n,) p += h kicks[n] L_q.
+        drifts: (n,) q += h drifts[n] v.
+        abscissae: (n,) c_n of the kicks.
         force: L_q at (q, t).
-        mass: constant diagonal (no arguments).
+        drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
+        by_masses: which of both.
     """
 
     kicks: tuple[Number, ...]
     drifts: tuple[Number, ...]
     abscissae: tuple[Number, ...]
     force: Kernel
-    mass: Kernel
+    drift: Kernel
+    by_masses: bool
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Both."""
-        return (self.force, self.mass)
+        return (self.force, self.drift)
+
+    @property
+    def acts(self) -> bool:
+        """Whether it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
+        return self.by_masses and sum(x != 0 for x in self.drifts) == 1

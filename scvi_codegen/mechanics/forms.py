@@ -176,6 +176,16 @@ class Forms:
         still = all(p.xreplace(at_rest) == 0 for p in self.momentum)
         return still and not jacobian(self.force, self.system.velocities)
 
+    @cached_property
+    def split(self) -> bool:
+        """Whether H = T(p) + V(q, t), as seen in the structure of its derivatives; forces may depend on q and t."""
+        system = self.system
+        if not system.auxiliaries or system.time in set().union(*(v.free_symbols for v in self.legendre)):
+            return False
+        return not jacobian(self.legendre, system.coordinates) and not jacobian(
+            self.force, (*system.velocities, *system.auxiliaries)
+        )
+
     def rates(self, count: int) -> tuple[Expr, ...]:
         """First dL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""
         system = self.system

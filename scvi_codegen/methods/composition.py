@@ -24,7 +24,18 @@ from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, S
 from scvi_codegen.tables.basis import identity_matrix
 from scvi_codegen.tables.precision import Vector, mp
 
-__all__ = ["Composition", "kicks_and_drifts"]
+__all__ = [
+    "DRIFT_KICK_DRIFT",
+    "KICK_DRIFT_KICK",
+    "Composition",
+    "check_sequence",
+    "kicks_and_drifts",
+    "leapfrog_system",
+    "sequence_of",
+]
+
+KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
+"""Of a leapfrog step: forces at both ends, which neighbours share, or in the middle."""
 
 FIRST_HALVES = {
     2: (),
@@ -61,27 +72,46 @@ FIRST_HALVES = {
 """gamma_1, gamma_2, .. up to the middle one, which makes the sum 1; by order."""
 
 
+def check_sequence(sequence: str) -> None:
+    """Raise :class:`MethodError` for another one."""
+    if sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
+        raise MethodError(f"a leapfrog step is a '{KICK_DRIFT_KICK}' or a '{DRIFT_KICK_DRIFT}', not {sequence!r}")
+
+
+def sequence_of(sequence: str) -> Specification:
+    """What a specification says of it: nothing of the usual one."""
+    return {} if sequence == KICK_DRIFT_KICK else {"sequence": sequence}
+
+
 @dataclass(frozen=True, slots=True)
 class Composition(Method):
     """Composition of Stoermer-Verlet steps, for L = sum m_i v_i^2 / 2 - V(q, t) with constant masses.
 
     Args:
         order: 2 (Stoermer-Verlet itself), 8 (17 stages, Kahan & Li) or 10 (35 stages, Sofroniou & Spaletta).
+        sequence: of each step: ``"kick-drift-kick"`` or ``"drift-kick-drift"``.
 
     Raises:
         MethodError: for another order, or when used for a system that is not separable.
     """
 
     composition_order: int
+    sequence: str = KICK_DRIFT_KICK
 
     def __post_init__(self) -> None:
+        check_sequence(self.sequence)
         if checked_count(self.composition_order, "the order", least=2, error=MethodError) not in FIRST_HALVES:
             raise MethodError(f"there are compositions of order 2, 8 and 10, not {self.composition_order!r}")
 
     @classmethod
-    def of(cls, order: int) -> Composition:
+    def of(cls, order: int, sequence: str = KICK_DRIFT_KICK) -> Composition:
         """The composition of an order."""
-        return cls(order)
+        return cls(order, sequence)
+
+    @property
+    def drifts_first(self) -> bool:
+        """As the sequence says."""
+        return self.sequence == DRIFT_KICK_DRIFT
 
     @property
     def exactness(self) -> Exactness:
@@ -102,7 +132,7 @@ class Composition(Method):
     @property
     def name(self) -> str:
         """``composition-<order>``."""
-        return f"composition-{self.composition_order}"
+        return f"composition-{self.composition_order}{f'-{self.sequence}' * self.drifts_first}"
 
     @property
     def title(self) -> str:
@@ -127,66 +157,78 @@ class Composition(Method):
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {"method": "composition", "order": self.composition_order}
+        return {"method": "composition", "order": self.composition_order, **sequence_of(self.sequence)}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Unknowns: the velocities V_k of the drifts; explicit, row after row."""
-        twin = lagrangian_twin(system)
-        if twin is None or not forms_of(twin).separable:
-            raise MethodError(
-                f"{self.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses; "
-                f"'{system.name}' is not: use an SVI"
-            )
-        gamma = self.fractions
-        size = len(gamma)
-        return StageSystem(
-            blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k in range(1, size + 1)),
-            rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k in range(1, size + 1)),
-            families=(_kick_family(twin, gamma), _drift_family(twin, gamma)),
-            end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (gamma,))),
-            end_momentum=mp.one,
-            end_numbers=("q1", "p1"),
-            extrapolation=identity_matrix(size),
-        )
+        return leapfrog_system(system, self)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """The same equations: the paper does not use the method."""
         return self.stage_system(system)
 
 
-def _kick_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
-    """L_q at the s + 1 positions before, between and after the drifts; it kicks all velocities that follow."""
-    size = len(gamma)
-    drifted = tuple(tuple(x if k < n else mp.zero for k, x in enumerate(gamma)) for n in range(size + 1))
-    before = tuple(tuple(int(n <= k) for k in range(size)) for n in range(size + 1))
+def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
+    """The leapfrog steps of a method one after the other; unknowns are the velocities V_k of the drifts.
+
+    Raises:
+        MethodError: for a system that is not separable.
+    """
+    twin = lagrangian_twin(system)
+    if twin is not None and forms_of(twin).separable:
+        system = twin
+    elif not forms_of(system).split:
+        raise MethodError(
+            f"{method.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, or "
+            f"H = T(p) + V(q, t); '{system.name}' is not: use an SVI"
+        )
+    kicks, drifts = kicks_and_drifts(method)
+    moving = [k for k, x in enumerate(drifts) if x]
+    return StageSystem(
+        blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k, _ in enumerate(moving, start=1)),
+        rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k, _ in enumerate(moving, start=1)),
+        families=(_kick_family(system, kicks, drifts), _drift_family(system, drifts)),
+        end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (tuple(drifts[k] for k in moving),))),
+        end_momentum=mp.one,
+        end_numbers=("q1", "p1"),
+        extrapolation=identity_matrix(len(moving)),
+    )
+
+
+def _kick_family(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> PointFamily:
+    """L_q at the positions before, between and after the drifts; it kicks all velocities that follow."""
+    points, moving = ([k for k, x in enumerate(each) if x] for each in (kicks, drifts))
+    drifted = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in points)
+    before = tuple(tuple(int(n <= k) for k in moving) for n in points)
     return PointFamily(
         name="kick",
         abscissae=tuple(mp.fsum(line) for line in drifted),
-        weights=kicks_and_drifts(gamma)[0],
-        weight_names=tuple(f"w_{n}" for n in range(size + 1)),
+        weights=tuple(kicks[n] for n in points),
+        weight_names=tuple(f"w_{n}" for n in points),
         gathers=(
             Gather(
                 arguments=system.coordinates,
-                table=Table.joined(Table.constant(size + 1, 1, 1), Table.named("a", drifted)),
+                table=Table.joined(Table.constant(len(points), 1, 1), Table.named("a", drifted)),
                 power=0,
             ),
         ),
         scatters=(
             Scatter(
                 results=forms_of(system).force,
-                table=Table.joined(Table.named("", before), Table.constant(size + 1, 1, 1)),
+                table=Table.joined(Table.named("", before), Table.constant(len(points), 1, 1)),
                 power=1,
             ),
         ),
     )
 
 
-def _drift_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
-    """L_v at the velocity of each of the s drifts, which is its momentum."""
-    size = len(gamma)
+def _drift_family(system: MechanicalSystem, drifts: Vector) -> PointFamily:
+    """L_v at the velocity of each drift, which is its momentum."""
+    moving = [k for k, x in enumerate(drifts) if x]
+    size = len(moving)
     return PointFamily(
         name="drift",
-        abscissae=tuple(mp.fsum(gamma[:n]) for n in range(size)),
+        abscissae=tuple(mp.fsum(drifts[:k]) for k in moving),
         weights=(mp.one,) * size,
         weight_names=("",) * size,
         gathers=(
@@ -206,7 +248,11 @@ def _drift_family(system: MechanicalSystem, gamma: Vector) -> PointFamily:
     )
 
 
-def kicks_and_drifts(fractions: Vector) -> tuple[Vector, Vector]:
-    """(s + 1,) weights of the kicks and (s,) of the drifts between them."""
-    padded = (mp.zero, *fractions, mp.zero)
-    return tuple((a + b) / 2 for a, b in pairwise(padded)), fractions
+def kicks_and_drifts(method: Method) -> tuple[Vector, Vector]:
+    """Weights of the kicks and of the drifts of a method, as many: kick 0, drift 0, kick 1, .., the last drift 0.
+
+    Where drifts come first, so do kick 0 with weight 0 and all drifts.
+    """
+    padded = (mp.zero, *method.fractions, mp.zero)
+    halves = tuple((a + b) / 2 for a, b in pairwise(padded))
+    return ((mp.zero, *method.fractions), halves) if method.drifts_first else (halves, (*method.fractions, mp.zero))

@@ -92,6 +92,11 @@ class Method(ABC):
         return ()
 
     @property
+    def drifts_first(self) -> bool:
+        """Whether each of these leapfrog steps is a drift, a kick and a drift, not a kick, a drift and a kick."""
+        return False
+
+    @property
     def implicit(self) -> bool:
         """Whether there are equations to solve; not for methods that are nothing but leapfrog steps."""
         return True

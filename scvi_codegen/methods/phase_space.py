@@ -28,7 +28,7 @@ __all__ = ["with_auxiliaries"]
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
 """The paper's numbers of the shooting method in phase space."""
-BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E"}
+BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E", "drift": "P"}
 """Of the momenta at the points of a family."""
 
 
@@ -73,7 +73,7 @@ def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_
     free |= family.scalar.free_symbols if family.scalar is not None else set()
     points = family.abscissae
     guesses = {
-        system.auxiliaries: next_step(points),
+        system.auxiliaries: identity_matrix(len(points)) if family.name == "drift" else next_step(points),
         auxiliary_multipliers(system): identity_matrix(len(points)),
     }
     for symbols, guess in guesses.items():

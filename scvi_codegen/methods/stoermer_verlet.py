@@ -6,6 +6,13 @@ from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.composition import (
+    DRIFT_KICK_DRIFT,
+    KICK_DRIFT_KICK,
+    check_sequence,
+    leapfrog_system,
+    sequence_of,
+)
 from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.galerkin_stages import galerkin_system
 from scvi_codegen.methods.method import Method, Specification
@@ -27,18 +34,33 @@ class StoermerVerlet(Method):
     """Stoermer-Verlet: the two-stage Lobatto IIIA-IIIB pair, order 2, symplectic, symmetric.
 
     For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the
-    trapezoidal rule; for other Lagrangians it is implicit. Source: Hairer, Lubich & Wanner, Geometric Numerical
-    Integration, II.2.
+    trapezoidal rule; for H = T(p) + V(q, t) it is explicit, too; for other systems it is implicit. Source: Hairer,
+    Lubich & Wanner, Geometric Numerical Integration, II.2.
+
+    Args:
+        sequence: ``"kick-drift-kick"``, or ``"drift-kick-drift"``: explicit alone, with forces in the middle of steps.
     """
+
+    sequence: str = KICK_DRIFT_KICK
+
+    def __post_init__(self) -> None:
+        check_sequence(self.sequence)
+
+    @property
+    def drifts_first(self) -> bool:
+        """As the sequence says."""
+        return self.sequence == DRIFT_KICK_DRIFT
 
     @property
     def name(self) -> str:
         """``stoermer-verlet``."""
-        return "stoermer-verlet"
+        return f"stoermer-verlet{f'-{self.sequence}' * self.drifts_first}"
 
     @property
     def title(self) -> str:
         """One line for people."""
+        if self.drifts_first:
+            return "Stoermer-Verlet (drift, kick, drift)"
         return "Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages)"
 
     @property
@@ -73,10 +95,12 @@ class StoermerVerlet(Method):
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {"method": "stoermer-verlet"}
+        return {"method": "stoermer-verlet", **sequence_of(self.sequence)}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """The pair written by its generating function, unknowns V_1, V_2."""
+        """The pair written by its generating function, unknowns V_1, V_2; of drifts first their velocities."""
+        if self.drifts_first:
+            return leapfrog_system(system, self)
         tableau = lobatto_iiia(2)
         return galerkin_system(
             system,

@@ -70,7 +70,8 @@ def _compensated(subject: Subject) -> bool:
 
 def _carries(subject: Subject) -> bool:
     """Whether the artefact has sweeps or leapfrog steps, to which carries are handed."""
-    leaps = bool(subject.method.fractions) and forms_of(subject.moved).separable
+    forms = forms_of(subject.moved)
+    leaps = bool(subject.method.fractions) and (forms.separable or forms.split)
     return leaps or subject.stepper.interface.has_fallback
 
 

@@ -24,6 +24,7 @@ SCRIPTS = (
     "import_generated_stepper",
     "inspect_derivation",
     "kepler_conservation",
+    "logarithmic_hamiltonian",
     "poincare_section",
     "which_step",
 )
@@ -103,6 +104,13 @@ def test_every_way_to_choose_steps_is_as_good_as_it_says(tmp_path):
 def test_a_comet_that_all_but_hits_the_sun_comes_back(tmp_path):
     errors = [float(line.split()[-1]) for line in output_of("collisions_in_space", tmp_path).splitlines()[1:]]
     assert max(errors) < 1e-11
+
+
+def test_leapfrog_keeps_an_ellipse_by_its_logarithm(tmp_path):
+    rows = [line.split() for line in output_of("logarithmic_hamiltonian", tmp_path).splitlines()[1:]]
+    _, away, period = zip(*(map(float, row) for row in rows), strict=True)
+    assert max(away) < 1e-14
+    assert period[0] / period[2] == pytest.approx(16.0, rel=0.2)
 
 
 def test_curves_and_quadratures_win_where_they_say(tmp_path):

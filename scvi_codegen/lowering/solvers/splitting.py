@@ -17,15 +17,24 @@ __all__ = ["splitting_of"]
 
 def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """The sequence of kicks and drifts, or ``None`` where the method is implicit."""
-    twin = lagrangian_twin(system) if method.fractions else None
-    if twin is None or not forms_of(twin).separable:
+    if not method.fractions:
         return None
-    kicks, drifts = kicks_and_drifts(method.fractions)
-    forms = forms_of(twin)
+    twin = lagrangian_twin(system)
+    by_masses = twin is not None and forms_of(twin).separable
+    if not by_masses and not forms_of(system).split:
+        return None
+    moved = twin if twin is not None and by_masses else system
+    forms = forms_of(moved)
+    kicks, drifts = kicks_and_drifts(method)
+    if by_masses:
+        drift = system_kernel(moved, "mass", forms.mass.values(), of=(), purpose="The constant masses.")
+    else:
+        drift = system_kernel(moved, "drift_velocity", forms.legendre, of=moved.auxiliaries, purpose="H_p at u = p.")
     return Splitting(
         kicks=lower_vector(kicks),
         drifts=lower_vector(drifts),
         abscissae=lower_vector(tuple(mp.fsum(drifts[:n]) for n in range(len(kicks)))),
-        force=system_kernel(twin, "force", forms.force, of=twin.coordinates, purpose="L_q at u = q."),
-        mass=system_kernel(twin, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        force=system_kernel(moved, "force", forms.force, of=moved.coordinates, purpose="L_q at u = q."),
+        drift=drift,
+        by_masses=by_masses,
     )

@@ -1,0 +1,139 @@
+"""Leapfrog steps in both sequences, of Lagrangians and of H = T(p) + V(q, t): explicit, and what they should be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import MethodError, StepFailedError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods import SVI, Composition, StoermerVerlet, method_from_specification
+from scvi_codegen.models.problems import problem
+
+DRIFTS_FIRST = "drift-kick-drift"
+RELATIVISTIC = HamiltonianSystem.from_text(
+    name="relativistic oscillator",
+    coordinates=["x", "y"],
+    hamiltonian="sqrt(1 + p_x**2 + p_y**2) + k*(x**2 + 2*y**2)/2 + x*y**2/3 - x*cos(t)/5",
+    parameters={"k": 1.5},
+)
+DUFFING = LagrangianSystem.from_text(
+    name="driven", coordinates=["x"], lagrangian="m*x_dot**2/2 - x**4/4 + x*cos(t)", parameters={"m": 2.0}
+)
+
+
+def compiled(system, method, solver="auto"):
+    return compile_stepper(system, method, solver=solver, flags=QUICK_FLAGS)
+
+
+def force(t, q):
+    x, y = q
+    return np.array([-1.5 * x - y**2 / 3.0 + np.cos(t) / 5.0, -3.0 * y - 2.0 * x * y / 3.0])
+
+
+def velocity(p):
+    return p / np.sqrt(1.0 + p @ p)
+
+
+def leapfrog(sequence, t, h, q, p):
+    if sequence == DRIFTS_FIRST:
+        q = q + h / 2 * velocity(p)
+        p = p + h * force(t + h / 2, q)
+        return q + h / 2 * velocity(p), p
+    p = p + h / 2 * force(t, q)
+    q = q + h * velocity(p)
+    return q, p + h / 2 * force(t + h, q)
+
+
+@pytest.mark.parametrize("sequence", ["kick-drift-kick", DRIFTS_FIRST])
+@pytest.mark.parametrize("make", [StoermerVerlet, lambda sequence: Composition(2, sequence)], ids=["verlet", "of two"])
+def test_a_step_is_a_leapfrog_step(sequence, make):
+    stepper = compiled(RELATIVISTIC, make(sequence))
+    assert "_slope" not in stepper.source.code
+    q, p, t = np.array([0.7, -0.4]), np.array([1.2, 0.3]), 0.2
+    run = stepper.integrate(q, p, h=0.1, steps=50, t=t)
+    for k in range(50):
+        q, p = leapfrog(sequence, t + k * 0.1, 0.1, q, p)
+    assert np.abs(run.q[-1] - q).max() < 1e-13
+    assert np.abs(run.p[-1] - p).max() < 1e-13
+
+
+@pytest.mark.parametrize("system", [RELATIVISTIC, DUFFING], ids=["hamiltonian", "lagrangian"])
+@pytest.mark.parametrize("sequence", ["kick-drift-kick", DRIFTS_FIRST])
+@pytest.mark.parametrize("make", [StoermerVerlet, lambda sequence: Composition(8, sequence)], ids=["verlet", "eight"])
+def test_explicit_steps_solve_the_equations(system, sequence, make):
+    m = system.dimension
+    q, p = np.array([0.7, -0.4])[:m], np.array([1.2, 0.3])[:m]
+    explicit, newton = (compiled(system, make(sequence), solver) for solver in ("explicit", "newton"))
+    for h in (0.1, -0.3):
+        assert np.abs(np.subtract(explicit.step(q, p, h, 0.4), newton.step(q, p, h, 0.4))).max() < 1e-14
+
+
+@pytest.mark.parametrize("order", [2, 8, 10])
+def test_orders(order):
+    start, end = (np.array([0.7, -0.4]), np.array([1.2, 0.3])), 4.0
+    exact = compiled(RELATIVISTIC, SVI(8)).integrate(*start, h=0.02, steps=200).q[-1]
+    stepper = compiled(RELATIVISTIC, Composition(order, DRIFTS_FIRST))
+    coarse, fine = (np.abs(stepper.integrate(*start, h=end / n, steps=n).q[-1] - exact).max() for n in (5, 20))
+    assert np.log2(coarse / fine) / 2.0 > order - 0.5
+
+
+def test_the_map_is_symplectic_and_symmetric():
+    stepper = compiled(RELATIVISTIC, StoermerVerlet(DRIFTS_FIRST))
+    state, eps = np.array([0.7, -0.4, 1.2, 0.3]), 1e-5
+
+    def step(z, h=0.3, t=0.0):
+        return np.concatenate(stepper.step(z[:2], z[2:], h, t))
+
+    jacobian = np.array([(step(state + eps * e) - step(state - eps * e)) / (2 * eps) for e in np.eye(4)]).T
+    J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+    assert np.abs(jacobian.T @ J @ jacobian - J).max() < 1e-9
+    assert np.abs(step(step(state), -0.3, 0.3) - state).max() < 1e-15
+
+
+def test_a_logarithmic_hamiltonian_keeps_the_ellipse():
+    """Of Mikkola and Tanikawa, and Preto and Tremaine: second order in time alone, the orbit is exact."""
+    system = HamiltonianSystem.from_text(
+        name="logarithmic",
+        coordinates=["x", "y", "s"],
+        momenta=["u", "v", "b"],
+        hamiltonian="log((u**2 + v**2)/2 + b) + log(x**2 + y**2)/2",
+    )
+    e = 0.999
+    q, p = np.array([1 + e, 0.0, 0.0]), np.array([0.0, np.sqrt((1 - e) / (1 + e)), 0.5])
+    run = compiled(system, StoermerVerlet(DRIFTS_FIRST)).integrate(q, p, h=0.1, steps=2000)
+    radius = np.hypot(*run.q[:, :2].T)
+    assert np.abs(radius - e * run.q[:, 0] - (1 - e * e)).max() < 1e-11
+    assert np.diff(run.q[:, 2]).min() > 0.0
+    assert run.q[-1, 2] > 10 * np.pi
+
+
+def test_what_is_not_separable_is_refused():
+    with pytest.raises(MethodError, match="needs a separable system"):
+        compiled(problem("double-pendulum").system, StoermerVerlet(DRIFTS_FIRST))
+    timed = HamiltonianSystem.from_text(name="timed", coordinates=["x"], hamiltonian="p_x**4*cos(t) + p_x**2 + x**2")
+    with pytest.raises(MethodError, match="needs a separable system"):
+        compiled(timed, Composition(8))
+    with pytest.raises(MethodError, match="'kick-drift-kick' or a 'drift-kick-drift', not 'kick'"):
+        StoermerVerlet("kick")
+
+
+def test_there_is_no_discrete_lagrangian_of_drifts_first():
+    stepper = compiled(DUFFING, StoermerVerlet(DRIFTS_FIRST))
+    with pytest.raises(MethodError, match="no discrete Lagrangian"):
+        stepper.discrete_lagrangian([0.1], [0.2], 0.1)
+
+
+def test_where_the_velocity_is_no_number_the_step_fails():
+    falling = HamiltonianSystem.from_text(name="root", coordinates=["x"], hamiltonian="p_x*sqrt(p_x) + x")
+    with pytest.raises(StepFailedError, match="not finite"):
+        compiled(falling, StoermerVerlet(DRIFTS_FIRST)).integrate([0.0], [1.0], h=0.5, steps=20)
+
+
+@pytest.mark.parametrize("method", [StoermerVerlet(DRIFTS_FIRST), Composition(8, DRIFTS_FIRST), Composition(10)])
+def test_a_specification_says_the_sequence(method):
+    assert method_from_specification(method.specification()) == method
+    assert method.name.endswith(DRIFTS_FIRST) == method.drifts_first
