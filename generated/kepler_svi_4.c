@@ -20,6 +20,7 @@ enum {
   MOST_ITERATIONS = INT_MAX, /* whatever the options say */
   MAX_ITERATIONS = 50, /* unless options say otherwise */
   MAPS = 1, /* quantities that symmetries conserve */
+  SUMS = 1, /* integrals along the curve of a step */
   BAND = 1, /* coordinates that meet are at most so many places apart */
   MASS_ENTRIES = 2, /* of the Legendre transform that are not zero */
   MEMORY = 16, /* numbers kept from step to step */
@@ -290,25 +291,28 @@ static const double EXTRAPOLATION[4][4] = {
 #include "support/even_time.h"
 #include "support/run.h"
 
-/* h^1 sum_n w_n lagrangian along the curve given by z. */
-static double quadrature_sum(const step_data *step, const double *z)
+/* Adds h^1 sum_n w_n lagrangian along the curve given by z. */
+static void add_quadrature_sums(const step_data *step, const double *z, double *sum)
 {
   const double h = step->h;
-  double *u = step->scratch, sum = 0;
+  double *u = step->scratch, own[SUMS] = {0};
   gather(QUADRATURE_GATHER_0[0], 4, h, z, 2, u + 0, 4, 1);
   offset(step, 4, u + 0, 4);
   gather(QUADRATURE_GATHER_1[0], 4, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 4; n++) {
-    double value[1];
+    double value[SUMS];
     lagrangian(u + n * 4, step->t, step->parameters, value);
-    sum += QUADRATURE_WEIGHT[n] * value[0];
+    for (int k = 0; k < SUMS; k++)
+      own[k] += QUADRATURE_WEIGHT[n] * value[k];
   }
-  return h * sum;
+  for (int k = 0; k < SUMS; k++)
+    sum[k] += h * own[k];
 }
 
-static double action_along(const step_data *step, const double *z)
+static void sums_along(const step_data *step, const double *z, double *sum)
 {
-  return quadrature_sum(step, z);
+  memset(sum, 0, sizeof(double) * SUMS);
+  add_quadrature_sums(step, z, sum);
 }
 
 #include "support/discrete_legendre.h"

@@ -20,6 +20,7 @@ enum {
   POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
   MOST_ITERATIONS = INT_MAX, /* whatever the options say */
   MAX_ITERATIONS = 50, /* unless options say otherwise */
+  SUMS = 1, /* integrals along the curve of a step */
   BAND = 0, /* coordinates that meet are at most so many places apart */
   MASS_ENTRIES = 1, /* of the Legendre transform that are not zero */
   MEMORY = 4, /* numbers kept from step to step */
@@ -204,23 +205,26 @@ static const double EXTRAPOLATION[1][1] = {{1.0}};
 #include "support/even_time.h"
 #include "support/run.h"
 
-/* h^1 sum_n w_n lagrangian along the curve given by z. */
-static double quadrature_sum(const step_data *step, const double *z)
+/* Adds h^1 sum_n w_n lagrangian along the curve given by z. */
+static void add_quadrature_sums(const step_data *step, const double *z, double *sum)
 {
   const double h = step->h;
-  double *u = step->scratch, sum = 0;
+  double *u = step->scratch, own[SUMS] = {0};
   quadrature_points(step, z, u);
   for (int n = 0; n < 2; n++) {
-    double value[1];
+    double value[SUMS];
     lagrangian(u + n * 2, step->t, step->parameters, value);
-    sum += QUADRATURE_WEIGHT[n] * value[0];
+    for (int k = 0; k < SUMS; k++)
+      own[k] += QUADRATURE_WEIGHT[n] * value[k];
   }
-  return h * sum;
+  for (int k = 0; k < SUMS; k++)
+    sum[k] += h * own[k];
 }
 
-static double action_along(const step_data *step, const double *z)
+static void sums_along(const step_data *step, const double *z, double *sum)
 {
-  return quadrature_sum(step, z);
+  memset(sum, 0, sizeof(double) * SUMS);
+  add_quadrature_sums(step, z, sum);
 }
 
 #include "support/discrete_legendre.h"

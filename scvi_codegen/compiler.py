@@ -260,6 +260,7 @@ def describe(
         has_fallback=borrows or (program.newton and program.sweep is not None),
         momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
         monitor="" if monitor is None else str(monitor),
+        exchange_names=program.exchanges,
         energy_parameter=system.clock.energy.name if system.clock else "",
     )
 

@@ -56,7 +56,8 @@ class Family:
     Attributes:
         arguments: what the gathers give, m each.
         value, slope: the kernel, and the kernel with its derivatives.
-        action: what is summed to the discrete Lagrangian with h^(1 + action_power), or ``None``.
+        integrand: what is summed along the curve with h^(1 + integrand_power), or ``None``: to the discrete Lagrangian,
+            or, where forces act, to what they give.
     """
 
     name: str
@@ -68,8 +69,8 @@ class Family:
     value: Kernel
     slope: Kernel
     blocks: tuple[SlopeBlock, ...]
-    action: Kernel | None
-    action_power: int
+    integrand: Kernel | None
+    integrand_power: int
 
     @property
     def points(self) -> int:

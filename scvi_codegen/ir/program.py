@@ -100,6 +100,7 @@ class Program:
         numbers: the paper's, of equations for a few unknowns, and of those for q1 and p1; ``""`` where
             it has none.
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
+        exchanges: names of what forces give: energy, and momentum maps; none without forces.
     """
 
     prefix: str
@@ -134,6 +135,7 @@ class Program:
     stage_curve: StageCurve | None
     numbers: tuple[str, str, str]
     integrals: Integrals | None = None
+    exchanges: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -158,10 +160,11 @@ class Program:
     def kernels(self) -> tuple[Kernel, ...]:
         """Every kernel, in the order of emission."""
         pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
-        actions = {family.action.name: family.action for family in self.families if self.newton and family.action}
+        along = [family.integrand for family in self.families if self.newton and family.integrand]
+        sums = {kernel.name: kernel for kernel in along}
         maps = (self.momentum_kernel,) if self.momentum_kernel else ()
         integrands = (self.integrals.kernel,) if self.integrals else ()
-        return (*pairs, self.legendre, *({self.energy.name: self.energy} | actions).values(), *maps, *integrands)
+        return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands)
 
     @property
     def action(self) -> bool:
@@ -169,6 +172,13 @@ class Program:
         if self.splitting:
             return self.splitting.acts
         return self.newton and self.acts
+
+    @property
+    def sums(self) -> int:
+        """How many numbers are summed along a curve that Newton's iteration gives: the action, or the exchanges."""
+        if not self.newton:
+            return 0
+        return len(self.exchanges) if self.exchanges else int(self.action)
 
     @property
     def memory(self) -> int:

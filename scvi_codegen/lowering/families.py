@@ -10,6 +10,7 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.sites import Sites
+from scvi_codegen.mechanics.exchanges import exchanges
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -56,8 +57,8 @@ def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) 
             purpose=f"The same, and the non-zero derivatives with respect to {u}.",
         ),
         blocks=blocks,
-        action=_action(system, family, u) if family.in_action and has_action(system) else None,
-        action_power=family.scalar_power,
+        integrand=_integrand(system, family, u) if family.in_action else None,
+        integrand_power=family.scalar_power,
     )
 
 
@@ -75,8 +76,13 @@ def _results(family: PointFamily, names: tuple[str, ...]) -> str:
     return " and ".join(slopes) if len(family.scatters) == len(names) else "L_v"
 
 
-def _action(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel:
-    """The scalar of a family; that of the values is called after the function it is."""
+def _integrand(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel | None:
+    """What is summed along the curve: what forces give, else the scalar of a family where that is an action."""
+    if given := exchanges(system):
+        rates, purpose = [each.rate for each in given], f"What forces give per unit of time, at {u}."
+        return system_kernel(system, "exchanges", rates, of=family.arguments, purpose=purpose)
+    if not has_action(system):
+        return None
     assert family.scalar is not None
     k = family.scalar_power
     rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"

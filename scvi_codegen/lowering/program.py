@@ -29,6 +29,7 @@ from scvi_codegen.lowering.families import has_action, lowered_family
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.sites import sites_of
+from scvi_codegen.mechanics.exchanges import exchanges
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -106,6 +107,7 @@ def lower(
         polynomial_curves=polynomial,
         stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
         integrals=_integrals(system, method, stages),
+        exchanges=_exchanges(system, stages),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
 
@@ -152,6 +154,12 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
             "an SVI, or a Runge-Kutta method in phase space"
         )
     return Integrals(kernel=kernel, weights=lower_vector(stages.shape.weights))
+
+
+def _exchanges(system: MechanicalSystem, stages: StageSystem) -> tuple[str, ...]:
+    """What forces give, by names, where a method integrates along a curve."""
+    integrates = any(family.in_action for family in stages.families)
+    return tuple(each.name for each in exchanges(system)) if integrates else ()
 
 
 def _legendre_kernel(system: MechanicalSystem) -> Kernel:

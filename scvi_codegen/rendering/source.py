@@ -111,6 +111,7 @@ class Interface:
         map_names, map_formulas: of the momentum maps, what symmetries conserve.
         map_exact: whether the method is known to conserve them exactly, to round-off.
         momentum_names: of a Hamiltonian; see :attr:`momenta`.
+        exchange_names: of what forces give in a step, energy and momentum maps; none without forces.
         energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
         monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
     """
@@ -133,6 +134,7 @@ class Interface:
     has_fallback: bool = False
     energy_parameter: str = ""
     monitor: str = ""
+    exchange_names: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:

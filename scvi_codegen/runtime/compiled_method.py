@@ -117,6 +117,11 @@ class CompiledMethod:
         return np.array(self.interface.defaults, dtype=float)
 
     @property
+    def impulse_names(self) -> tuple[str, ...]:
+        """Names of the momentum maps of L alone that forces change, in the order of :meth:`Trajectory.impulses`."""
+        return self.interface.exchange_names[1:]
+
+    @property
     def momentum_map_names(self) -> tuple[str, ...]:
         """What symmetries of the system conserve: ``"angular momentum"``, ``"boost of x"``."""
         return self.interface.map_names

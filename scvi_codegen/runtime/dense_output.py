@@ -28,7 +28,15 @@ from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.memory import Memory
 
-__all__ = ["checked_times", "grid_tolerance", "lengths_at", "states_and_steps_at", "states_at", "times_of_run"]
+__all__ = [
+    "checked_times",
+    "grid_tolerance",
+    "lengths_at",
+    "states_and_steps_at",
+    "states_at",
+    "times_of_run",
+    "whole_steps",
+]
 
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0
@@ -57,9 +65,9 @@ def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array,
         return *_run_to_each(states, left, times, states.goal), times
     _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
-    whole = _whole_steps(times - t, np.nan_to_num(states.lengths[left], nan=np.inf))
+    whole = whole_steps(times - t, np.nan_to_num(states.lengths[left], nan=np.inf))
     between = np.flatnonzero(whole)
-    _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
+    _takewhole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
     _take_parts(states, t, times - t, q, p)
     return q, p, times
 
@@ -82,7 +90,7 @@ def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal:
     return q, p
 
 
-def _whole_steps(spans: Array, h: Array) -> NDArray[np.int64]:
+def whole_steps(spans: Array, h: Array) -> NDArray[np.int64]:
     """Steps of h that fit into spans; one that only rounding makes too long fits."""
     ratio = spans / h
     nearest = np.rint(ratio)
@@ -90,7 +98,7 @@ def _whole_steps(spans: Array, h: Array) -> NDArray[np.int64]:
     return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
 
 
-def _take_whole_steps(
+def _takewhole_steps(
     states: KeptStates,
     left: NDArray[np.intp],
     whole: NDArray[np.int64],

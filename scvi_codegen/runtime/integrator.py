@@ -232,6 +232,51 @@ class Integrator(CompiledMethod):
         """F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
         return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
 
+    def exchanged(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """A step, and what forces give in it: energy first, then what each of ``impulse_names`` receives.
+
+        Integrals of f . v and f . xi along the step's own curve by the method's own quadrature: (q1, p1, given), (m,),
+        (m,) and (1 + k,). J1 - J0 is what is given to J, to round-off for SVI and their kin (forced Noether theorem).
+
+        Raises:
+            MethodError: where no forces act, and for methods that do not integrate along a curve.
+            StepFailedError: if Newton's iteration does not converge.
+        """
+        if not self.interface.exchange_names:
+            raise MethodError(
+                f"{self.interface.method} keeps no account of forces on {self.interface.system}: SVI, SCVI and Gauss "
+                "methods do, and StoermerVerlet with the solver 'newton', where forces act"
+            )
+        q0, p0 = self._vector(q, "q"), self._vector(p, "p")
+        q1, p1, given = np.empty_like(q0), np.empty_like(p0), np.empty(len(self.interface.exchange_names))
+        binding = self.binding.with_function("exchanges")
+        report = binding.new("report *")
+        status = binding.function("exchanges")(
+            checked_number(t, "the time t"),
+            checked_step(h),
+            binding.pointer(q0),
+            binding.pointer(p0),
+            binding.pointer(self._parameters(parameters)),
+            binding.options(options),
+            binding.pointer(q1),
+            binding.pointer(p1),
+            binding.pointer(given),
+            report,
+            binding.workspace(),
+        )
+        if status:
+            raise step_failure(status, report, step=0, h=h)
+        return q1, p1, given
+
     def step_positions(
         self,
         q_previous: ArrayLike,

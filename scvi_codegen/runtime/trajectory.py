@@ -21,6 +21,7 @@ from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
+from scvi_codegen.runtime.exchanges import exchanged_until
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 from scvi_codegen.runtime.quantities import quantities
 
@@ -88,6 +89,26 @@ class Trajectory(KeptStates):
         """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
         values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
         return relative_changes(values, sizes)
+
+    def work(self) -> Array:
+        """(n,) work of the forces since the first state: sum h b_i f . v along the steps' own curves.
+
+        E_n - E_0 - W_n is of the order of the method where L does not depend on time; of SCVI, whose curve is of order
+        s + 1, of that.
+
+        Raises:
+            MethodError: where no forces act, and for methods that do not integrate along a curve.
+            StateError: if the states do not stand at whole steps.
+        """
+        return exchanged_until(self)[:, 0]
+
+    def impulses(self) -> Array:
+        """(n, k) what forces gave since the first state to what L alone would conserve, ``stepper.impulse_names``.
+
+        J_n - J_0 is that, to round-off for SVI and their kin, to order s + 1 for SCVI. Raises as
+        :meth:`work`.
+        """
+        return exchanged_until(self)[:, 1:]
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """The states as :mod:`scvi_codegen.files.export` writes them."""

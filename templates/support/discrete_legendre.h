@@ -1,5 +1,5 @@
-/* The discrete Lagrangian and its Legendre transforms. Before it: newton.h, and action, which sums the Lagrangian along
- * the curve given by z. */
+/* The discrete Lagrangian and its Legendre transforms. Before it: newton.h, and sums_along, which sums the Lagrangian
+ * along the curve given by z. */
 
 SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)
@@ -26,6 +26,6 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
     p0[i] = start_p[i];
     p1[i] = start_p[i] + increment[i];
   }
-  *action = action_along(&step, data.z);
+  sums_along(&step, data.z, action);
   return OK;
 }

@@ -1,0 +1,100 @@
+"""What forces give: work beside the energy, impulses beside the momentum maps, by curves and by quadrature."""
+
+import numpy as np
+import pytest
+
+from scvi_codegen import (
+    SCVI,
+    SVI,
+    Gauss,
+    HamiltonianSystem,
+    LagrangianSystem,
+    MethodError,
+    RadauIIA,
+    StateError,
+    StoermerVerlet,
+    compile_stepper,
+)
+
+DRAG = {"x": "-c*x_dot*sqrt(x_dot**2 + y_dot**2) + w*cos(3*t)", "y": "-c*y_dot*sqrt(x_dot**2 + y_dot**2)"}
+
+
+@pytest.fixture(scope="module")
+def thrown():
+    """A body in the plane about a centre, with drag by the square of its speed and a push that is periodic."""
+    return LagrangianSystem.from_text(
+        name="thrown",
+        lagrangian="(x_dot**2 + y_dot**2)/2 + k/sqrt(x**2 + y**2)",
+        coordinates=["x", "y"],
+        parameters={"k": 1.0, "c": 0.05, "w": 0.1},
+        forces=DRAG,
+    )
+
+
+def balance(stepper, h, span=2.0, **options):
+    run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=h, steps=round(span / h), **options)
+    energy, work = run.energy(), run.work()
+    angular = run.q[:, 0] * run.p[:, 1] - run.q[:, 1] * run.p[:, 0]
+    return np.abs(energy - energy[0] - work).max(), np.abs(angular - angular[0] - run.impulses()[:, 0]).max()
+
+
+@pytest.mark.parametrize("method", [SVI(2), Gauss(3), StoermerVerlet()], ids=lambda method: method.name)
+def test_impulses_are_exact_and_work_is_of_the_order_of_the_method(thrown, method):
+    stepper = compile_stepper(thrown, method, solver="newton")
+    assert stepper.impulse_names == ("angular momentum",)
+    coarse, fine = balance(stepper, 0.05), balance(stepper, 0.025)
+    assert max(coarse[1], fine[1]) < 2e-14
+    assert np.log2(coarse[0] / fine[0]) > method.order - 0.4
+
+
+def test_shooting_keeps_the_account_to_the_order_of_its_curve(thrown):
+    stepper = compile_stepper(thrown, SCVI(2))
+    coarse, fine = balance(stepper, 0.1), balance(stepper, 0.05)
+    assert np.log2(coarse[0] / fine[0]) > 2.8
+    assert np.log2(coarse[1] / fine[1]) > 2.8
+
+
+def test_hamiltonians_sweeps_and_parameters(thrown):
+    """The same account from H; sweeps borrow the iteration; parameters and time are those of the run."""
+    hamiltonian = HamiltonianSystem.from_text(
+        name="thrown",
+        hamiltonian="(p_x**2 + p_y**2)/2 - k/sqrt(x**2 + y**2)",
+        coordinates=["x", "y"],
+        parameters={"k": 1.0, "c": 0.05, "w": 0.1},
+        forces={"x": "-c*p_x*sqrt(p_x**2 + p_y**2) + w*cos(3*t)", "y": "-c*p_y*sqrt(p_x**2 + p_y**2)"},
+    )
+    values = {"c": 0.2, "w": 0.4}
+    found = []
+    for system in (thrown, hamiltonian):
+        run = compile_stepper(system, SVI(3)).integrate(
+            [1.0, 0.0], [0.0, 1.1], h=0.02, steps=60, t=0.7, parameters=values
+        )
+        found.append((run.work(), run.impulses()))
+    assert np.abs(found[0][0] - found[1][0]).max() < 1e-12
+    assert np.abs(found[0][1] - found[1][1]).max() < 1e-12
+    t, v = run.t, run.velocity
+    speed = np.hypot(*v.T)
+    power = -0.2 * speed**3 + 0.4 * np.cos(3 * t) * v[:, 0]
+    weights = np.full(len(t), 2.0)
+    weights[1:-1:2], weights[[0, -1]] = 4.0, 1.0
+    assert run.work()[-1] == pytest.approx(float(weights @ power) * 0.02 / 3.0, abs=1e-7)  # Simpson's rule
+
+
+def test_steps_between_and_steps_that_choose_their_length(thrown):
+    stepper = compile_stepper(thrown, SVI(4))
+    start = ([1.0, 0.0], [0.0, 1.1])
+    every, some = (stepper.integrate(*start, h=0.05, steps=40, every=n) for n in (1, 8))
+    assert np.abs(some.work() - every.work()[::8]).max() < 1e-13
+    free = stepper.integrate(*start, t_end=2.0)
+    assert np.abs(free.energy() - free.energy()[0] - free.work()).max() < 1e-12
+    with pytest.raises(StateError, match="every=1"):
+        stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
+
+
+def test_who_keeps_no_account(thrown):
+    free = LagrangianSystem.from_text(name="oscillator", lagrangian="x_dot**2/2 - x**2/2", coordinates=["x"])
+    with pytest.raises(MethodError, match="no account of forces"):
+        compile_stepper(free, SVI(2)).integrate([1.0], [0.0], h=0.1, steps=2).work()
+    stepper = compile_stepper(thrown, RadauIIA(2))
+    with pytest.raises(MethodError, match="SVI, SCVI and Gauss"):
+        stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
