@@ -99,7 +99,7 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
-    method = as_method(method)
+    method = as_method(method, system)
     key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries), str(monitor))
 
     @cache
@@ -175,7 +175,7 @@ def generate_source(
         MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
             text for a microcontroller.
     """
-    method = as_method(method)
+    method = as_method(method, system)
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
@@ -261,6 +261,7 @@ def describe(
         momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
         monitor="" if monitor is None else str(monitor),
         exchange_names=program.exchanges,
+        constraints=program.constraints.formulas if program.constraints else (),
         energy_parameter=system.clock.energy.name if system.clock else "",
     )
 

@@ -149,7 +149,7 @@ def advise(
         MethodError: if the degree is to be chosen of a method that has none.
         BuildError: without a C compiler.
     """
-    method = as_method(method)
+    method = as_method(method, system)
     if system.clock is not None:
         raise MethodError(f"the step of '{system.name}' is one of transformed time, of which there is no advice: try h")
     length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import SVI
+from scvi_codegen.methods import default_method
 from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -70,7 +70,7 @@ def known_digits(system: MechanicalSystem, trajectory: Trajectory, *, most: int)
     times = trajectory.t[chosen]
     nudged = trajectory.q[0] * (1.0 + NUDGE * np.cos(np.arange(trajectory.q.shape[1])))
     try:
-        second = compile_stepper(system, SVI(8)).integrate(
+        second = compile_stepper(system, default_method(system)).integrate(
             nudged,
             trajectory.p[0],
             t=float(times[0]),

@@ -18,7 +18,7 @@ from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.kinds import SWITCH, of, takes
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import SVI, Method, as_method
+from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.dense_output import times_of_run
@@ -98,7 +98,7 @@ def solve_motion(
         t_span: two times.
         y0: (2 m,) initial positions, then momenta; (m,) positions alone beside ``velocity``.
         velocity: (m,) initial velocities, in place of momenta.
-        method: or its name, ``"svi:6"``; by default ``SVI(8)``.
+        method: or its name, ``"svi:6"``; by default ``SVI(8)``, of constraints SVI(6) with Lobatto's points.
         h: longest step of one length, taken a little shorter so that whole steps fill the span.
         tolerance: in place of ``h``: the error |q - q_exact| / |q| at the end, for which :func:`advise` chooses it.
             Where the run breaks the promise, ``success`` is False.
@@ -133,7 +133,7 @@ def solve_motion(
         stepper = system
         p = stepper.momenta_given(q, given, velocity, start, parameters)
     else:
-        method = SVI(8) if method is None else as_method(method)
+        method = default_method(system) if method is None else as_method(method, system)
         system = system if monitor is None else reparametrise(system, monitor)
         stepper = compile_stepper(system, method)
         p = stepper.momenta_given(q, given, velocity, start, parameters)

@@ -164,7 +164,7 @@ def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = F
             (22).
         radicals: replace table entries by radicals where they have a short form.
     """
-    method = as_method(method)
+    method = as_method(method, system)
     check_regular(method, system)
     stages = with_auxiliaries(system, method.paper_form(system))
     writer = _Writer(system, stages)

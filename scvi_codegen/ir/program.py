@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from scvi_codegen.ir.constraints import Constraints
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
@@ -77,6 +78,7 @@ class Program:
         blocks: number of unknowns B at each site.
         families: points and kernels of the equations that Newton's iteration solves; none without it.
         places: (sites,) the place of each site in matrices, chosen so that those that meet are near each other.
+        mass_places: (m,) the same of coordinates alone.
         bandwidth: how many places they are apart at most.
         momentum_rows: (B,) coefficient of p0 in each row.
         end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
@@ -101,6 +103,7 @@ class Program:
             it has none.
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
         exchanges: names of what forces give: energy, and momentum maps; none without forces.
+        constraints: what keeps the motion on them, or ``None``.
     """
 
     prefix: str
@@ -113,6 +116,7 @@ class Program:
     blocks: int
     families: tuple[Family, ...]
     places: tuple[int, ...]
+    mass_places: tuple[int, ...]
     bandwidth: int
     momentum_rows: tuple[Number, ...]
     end_position: tuple[Number, ...]
@@ -136,6 +140,7 @@ class Program:
     numbers: tuple[str, str, str]
     integrals: Integrals | None = None
     exchanges: tuple[str, ...] = ()
+    constraints: Constraints | None = None
 
     @property
     def dimension(self) -> int:
@@ -164,7 +169,8 @@ class Program:
         sums = {kernel.name: kernel for kernel in along}
         maps = (self.momentum_kernel,) if self.momentum_kernel else ()
         integrands = (self.integrals.kernel,) if self.integrals else ()
-        return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands)
+        bound = (self.constraints.kernel, self.constraints.motion) if self.constraints else ()
+        return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands, *bound)
 
     @property
     def action(self) -> bool:
@@ -190,8 +196,12 @@ class Program:
 
     @property
     def remembers_factors(self) -> bool:
-        """Whether Newton's iteration begins a step with the factors of the one before: not if new ones cost little."""
-        return self.newton and not self.splitting and self.unknowns >= WORTH_REMEMBERING
+        """Whether Newton's iteration begins a step with the factors of the one before: not if new ones cost little.
+
+        Nor with constraints, whose slopes turn with the motion: old factors then contract tenfold an iteration.
+        """
+        worth = self.unknowns >= WORTH_REMEMBERING and not self.constraints
+        return self.newton and not self.splitting and worth
 
     @property
     def point(self) -> int:

@@ -25,6 +25,7 @@ from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program, StageCurve
 from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.ir.sweeps import Splitting
+from scvi_codegen.lowering.constraints import lowered_constraints
 from scvi_codegen.lowering.families import has_action, lowered_family
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
@@ -69,8 +70,9 @@ def lower(
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
     mass = forms_of(system).legendre_slopes
     families = tuple(lowered_family(system, family, sites) for family in stages.families) if newton else ()
+    constraints = lowered_constraints(system)
     met = [*mass, *_meetings(families)]
-    order = (*places([pair for pair in met if max(pair) < m], m), *range(m, sites.count))
+    order = places(met, sites.count)
     polynomial = method.exactness.curve != 0
     return Program(
         prefix=prefix,
@@ -83,6 +85,7 @@ def lower(
         blocks=len(blocks),
         families=families,
         places=order,
+        mass_places=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
         bandwidth=bandwidth(met, order),
         momentum_rows=lower_vector(tuple(row.momentum for row in rows)),
         end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[m]]).entries[0]),
@@ -108,6 +111,7 @@ def lower(
         stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
         integrals=_integrals(system, method, stages),
         exchanges=_exchanges(system, stages),
+        constraints=constraints,
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
 
@@ -123,10 +127,11 @@ def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str,
 
 def _stage_curve(stages: StageSystem) -> StageCurve | None:
     """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations."""
-    shape, count = stages.shape, len(stages.blocks)
-    if isinstance(shape, Velocities) and 1 < len(shape.blocks) == len(set(shape.blocks)) == count:
-        degree = count - 1
+    shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
+    if isinstance(shape, Velocities) and 1 < len(shape.blocks) == len(set(shape.blocks)) and _moves(stages, shape):
+        degree = len(shape.blocks) - 1
         highest = tuple((4 * degree - 2) * x for x in legendre_functional(shape.blocks, degree))
+        highest += (mp.zero,) * (count - len(highest))
         bends = [(0, degree), (0, count // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
         power = 2 * degree
@@ -138,6 +143,12 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     else:
         return None
     return StageCurve(highest=lower_vector(highest), bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
+
+
+def _moves(stages: StageSystem, shape: Velocities) -> bool:
+    """Whether the velocities, the first blocks, are all that moves positions, and momenta are no unknowns."""
+    own = len(shape.blocks)
+    return all(block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks))
 
 
 def _distinct(points: Vector) -> bool:

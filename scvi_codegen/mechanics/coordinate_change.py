@@ -63,6 +63,7 @@ def change_coordinates(
         lagrangian=system.lagrangian.xreplace(replaced),
         clock=clock,
         forces=_projected(system, positions, replaced, variables),
+        constraints=tuple(g.xreplace(replaced) for g in system.constraints),
     )
 
 

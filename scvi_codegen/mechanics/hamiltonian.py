@@ -192,6 +192,8 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     >>> hamiltonian_of(oscillator).hamiltonian
     k*x**2/2 + p_x**2/(2*m)
     """
+    if system.constraints:
+        raise SystemDefinitionError(f"'{system.name}' has constraints, which are kept where a Lagrangian is given")
     names = _default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
     if len(names) != system.dimension:
         raise SystemDefinitionError(

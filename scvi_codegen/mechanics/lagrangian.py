@@ -13,7 +13,8 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.formulas.translation import Translation
-from scvi_codegen.kinds import MAPPING, NAMES, TEXT, takes
+from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, takes
+from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate, generalised_forces
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -51,6 +52,8 @@ class LagrangianSystem(MechanicalSystem):
         self._check("Lagrangian", self.velocities, "a velocity")
         _check_velocities(self)
         _check_mass_matrix(self)
+        if self.constraints:
+            check_constraints(self)
 
     @property
     def auxiliaries(self) -> tuple[Symbol, ...]:
@@ -71,6 +74,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters=MAPPING,
         forces=MAPPING,
         dissipation=TEXT,
+        constraints=TEXTS,
     )
     def from_text(
         cls,
@@ -81,6 +85,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
+        constraints: Sequence[str] = (),
     ) -> LagrangianSystem:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -91,6 +96,8 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
+            constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``
+                (:mod:`scvi_codegen.mechanics.constraints`).
 
         >>> oscillator = LagrangianSystem.from_text(
         ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",
@@ -111,6 +118,7 @@ class LagrangianSystem(MechanicalSystem):
             defaults=tuple(number(parameter, value) for parameter, value in values.items()),
             lagrangian=parse_expression(lagrangian, symbols),
             forces=_forces(variables, forces, dissipation, lambda text: parse_expression(text, symbols)),
+            constraints=constraints_of(constraints, lambda text: parse_expression(text, symbols)),
         )
 
     @classmethod
@@ -125,6 +133,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[Symbol | str, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
         dissipation: Expr | None = None,
+        constraints: Sequence[Expr] = (),
     ) -> LagrangianSystem:
         """Take L from a SymPy expression, in plain symbols or in functions of time.
 
@@ -141,13 +150,15 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by symbol or by name.
             forces: expression by coordinate, as the coordinate is given or by its name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
+            constraints: expressions in coordinates and time that stay 0.
         """
         if not isinstance(lagrangian, Expr):
             raise SystemDefinitionError(
                 f"the Lagrangian is a {type(lagrangian).__name__}, not a SymPy expression (text goes to from_text)"
             )
         given = named_parameters(parameters)
-        beside = tuple(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0))
+        bound = tuple(sympy.sympify(g) for g in constraints)
+        beside = (*(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0)), *bound)
         translation = Translation(
             lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given)
         )
@@ -164,24 +175,26 @@ class LagrangianSystem(MechanicalSystem):
                 dissipation,
                 lambda given: translation.apply(sympy.sympify(given), "forces"),
             ),
+            constraints=constraints_of(bound, lambda given: translation.apply(given, "constraints")),
         )
 
     @classmethod
     def from_lagranges_method(
         cls, method: LagrangesMethod, *, name: str, parameters: Mapping[Symbol | str, float] | None = None
     ) -> LagrangianSystem:
-        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces, without constraints.
+        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces and holonomic constraints.
 
         Forces and torques of its ``forcelist`` act through the velocities of their points, the angular velocities of
         their frames, projected on the coordinates: f_i = sum F . dv/dq_dot_i.
 
         Raises:
-            SystemDefinitionError: if it has constraints; they are refused, never dropped.
+            SystemDefinitionError: if it has nonholonomic constraints; they are refused, never dropped.
         """
-        if len(method.coneqs):
+        bound = [sympy.sympify(g) for g in method._hol_coneqs]  # no public name either
+        if len(method.coneqs) > len(bound):
             raise SystemDefinitionError(
-                "this LagrangesMethod has constraints (hol_coneqs or nonhol_coneqs), which are not supported: use as "
-                "many independent coordinates as there are degrees of freedom"
+                "this LagrangesMethod has constraints on velocities (nonhol_coneqs), which are not supported: only "
+                "holonomic ones are, g(q, t) = 0"
             )
         lagrangian = method._L[0]  # LagrangesMethod has no public name for it
         return cls.from_sympy(
@@ -190,6 +203,7 @@ class LagrangianSystem(MechanicalSystem):
             coordinates=list(method.q),
             parameters=parameters,
             forces=generalised_forces(method),
+            constraints=bound,
         )
 
     def _repr_latex_(self) -> str:

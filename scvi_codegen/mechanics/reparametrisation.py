@@ -70,6 +70,10 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             f"forces act on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
             "controlled steps (t_end=...), or compile_stepper(..., monitor=...), the reversible controller"
         )
+    if system.constraints:
+        raise SystemDefinitionError(
+            f"'{system.name}' has constraints, which motions in transformed time do not keep: take controlled steps"
+        )
     level = _free_symbol(system)
     rate = monitor_function(system, monitor)
     named = replace(

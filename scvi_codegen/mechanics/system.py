@@ -71,6 +71,7 @@ class MechanicalSystem(ABC):
         clock: how time runs, if not evenly.
         forces: m forces beside those of the function (:mod:`scvi_codegen.mechanics.forces`), in (q, v, t) of a
             Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
+        constraints: what a Lagrangian's motion keeps at 0, in (q, t) (:mod:`scvi_codegen.mechanics.constraints`).
     """
 
     name: str
@@ -80,6 +81,7 @@ class MechanicalSystem(ABC):
     defaults: tuple[float, ...]
     clock: Clock | None = None
     forces: tuple[Expr, ...] = ()
+    constraints: tuple[Expr, ...] = ()
 
     @property
     @abstractmethod
@@ -143,7 +145,8 @@ class MechanicalSystem(ABC):
             " ".join(symbol.name for symbol in symbols),
             repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
             sympy.srepr(self.clock.rate) if self.clock else "",
-            *map(sympy.srepr, self.forces),
+            *map(sympy.srepr, (*self.forces, *self.constraints)),
+            str(len(self.constraints)),
         )
 
     def to_text(self) -> str:
@@ -183,6 +186,8 @@ class MechanicalSystem(ABC):
         for q, force in zip(self.coordinates, self.forces, strict=False):
             if force != 0:
                 yield f"force on {q.name}", plain(format_expression(force))
+        for g in self.constraints:
+            yield "constraint", plain(f"{format_expression(g)} = 0")
 
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""
@@ -214,6 +219,7 @@ class MechanicalSystem(ABC):
         known = [*self.coordinates, *arguments, self.time, *self.parameters]
         named = zip(self.coordinates, self.forces, strict=False)
         formulas = {what: self.formula, **{f"force on {q.name}": force for q, force in named}}
+        formulas |= {f"constraint {k}": g for k, g in enumerate(self.constraints, 1)}
         for where, formula in formulas.items():
             problem = unsupported_part(formula)
             if problem:

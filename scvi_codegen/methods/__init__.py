@@ -8,6 +8,7 @@ from typing import Any
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI
@@ -46,6 +47,8 @@ __all__ = [
     "SpectralCollocation",
     "StoermerVerlet",
     "as_method",
+    "default_method",
+    "fitted",
     "method_from_specification",
     "sized",
     "specification_of",
@@ -78,8 +81,10 @@ DEFAULT_SIZE = 8
 """Where the name has none and the method needs one."""
 
 
-def as_method(method: Method | str) -> Method:
+def as_method(method: Method | str, system: MechanicalSystem | None = None) -> Method:
     """A method as it is, or of a name as the command line takes it: ``"svi"`` (degree 8), ``"svi:6"``, ``"gauss:3"``.
+
+    With the points that the constraints of a system want.
 
     Raises:
         MethodError: for an unknown name, a number that is none or that the method does not take, and other types.
@@ -88,7 +93,20 @@ def as_method(method: Method | str) -> Method:
         return method
     if not isinstance(method, str):
         raise MethodError(f"a method is wanted, as SVI(8), or a name such as 'svi:8', not {method!r}")
-    return method_from_specification(sized(specification_of(method)))
+    return method_from_specification(fitted(sized(specification_of(method)), system))
+
+
+def default_method(system: MechanicalSystem) -> Method:
+    """SVI(8); of a system with constraints, which hold at Lobatto's points, SVI(6) with these."""
+    return as_method("svi:6", system) if system.constraints else SVI(8)
+
+
+def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
+    """With Lobatto's points, one more than the degree, for an SVI of constraints whose quadrature is not said."""
+    wants = system is not None and system.constraints and specification.get("method") == "svi"
+    if not wants or "quadrature" in specification or "degree" not in specification:
+        return specification
+    return {**specification, "quadrature": f"gauss-lobatto:{int(specification['degree']) + 1}"}
 
 
 def specification_of(name: str) -> dict[str, Any]:

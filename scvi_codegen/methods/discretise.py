@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.methods.stage_system import StageSystem
@@ -11,11 +12,11 @@ __all__ = ["discretise"]
 
 
 def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
-    """The equations as compiled, with the momenta at the points among the unknowns where a Hamiltonian is given.
+    """The equations as compiled, with momenta at the points where a Hamiltonian is given, multipliers for constraints.
 
     Raises:
         MethodError: for a system that the method does not serve.
     """
     stages = method.stage_system(system)
     check_regular(method, system)
-    return with_auxiliaries(system, stages)
+    return with_constraints(system, with_auxiliaries(system, stages), method.name)

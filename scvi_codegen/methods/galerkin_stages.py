@@ -77,6 +77,8 @@ def galerkin_system(
     )
     if rounded:
         end_position, position, weights = unit_sum(end_position), dyadic(position), unit_sum(weights)
+        if abscissae[-1] == 1:
+            position = (*position[:-1], end_position)
         shape = replace(exact, position=position, end=end_position, weights=weights, unrounded=exact)
     gathers = _curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(

@@ -66,7 +66,7 @@ class Model:
 
     def __post_init__(self) -> None:
         check_kind(SYSTEM, self.system, "system", ModelFileError)
-        object.__setattr__(self, "method", as_method(self.method))
+        object.__setattr__(self, "method", as_method(self.method, self.system))
         _check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
         _check_one_of("h (step)", self.h, "tolerance", self.tolerance)
         _check_one_of("span", self.span, "steps", self.steps)

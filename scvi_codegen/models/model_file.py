@@ -8,6 +8,7 @@
                                                         # time; without a step tolerance = 0
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
+    # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
 
     [forces]                                            # on coordinates; left out: 0
     q = "F*cos(w*t)"
@@ -25,7 +26,7 @@
     q_dot = [0.0]                                       # velocities, or p = [...] for momenta, not both
     t = 0.0                                             # left out: 0
 
-    [method]                                            # left out: SVI(8)
+    [method]                                            # left out: SVI(8); with constraints SVI(6)
     method = "svi"                                      # then its arguments: degree, quadrature, nodes, ...
     degree = 8
 
@@ -65,7 +66,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
+from scvi_codegen.methods import ARGUMENTS, Method, fitted, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD, Model, check_length, real
 from scvi_codegen.models.problems import Problem, problem
 
@@ -75,7 +76,8 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-SYSTEM_KEYS = ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "catalogue", "monitor")
+FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "constraints")
+SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "catalogue", "monitor")
 RUN_KEYS = ("step", "tolerance", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "parameters", "initial", "method", "run")
@@ -163,6 +165,8 @@ def _document(model: Model) -> dict[str, Any]:
     forces = zip(names, system.forces, strict=False)
     if acting := {name: _wrapped(format_expression(force)) for name, force in forces if force != 0}:
         document["forces"] = acting
+    if system.constraints:
+        document["system"]["constraints"] = [format_expression(g) for g in system.constraints]
     if clock:
         document["system"]["monitor"] = clock.monitor
     if system.parameters:
@@ -199,8 +203,7 @@ def _read_model(document: Document, given: Document) -> Model:
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
         document = _laid_over(_motion(Model.from_problem(entry), names), document)
-    base = _spelt_out(document.get("method", DEFAULT_METHOD.specification()))
-    chosen = _changed_method(base, _spelt_out(given.get("method", {})))
+    chosen = _chosen_method(document, given)
     document = {**_laid_over(document, given), "method": chosen}
     if entry is None:
         _check_complete(document)
@@ -210,7 +213,17 @@ def _read_model(document: Document, given: Document) -> Model:
         monitor = _text(document["system"], "monitor", "[system]")
         system = _in_section("[system]", lambda: reparametrise(system, monitor))
     state = _read_state(document["initial"], system)
-    return Model(system=system, method=_read_method(document["method"]), **state, **_read_run(document["run"]))
+    method = _read_method(fitted(document["method"], system))
+    return Model(system=system, method=method, **state, **_read_run(document["run"]))
+
+
+def _chosen_method(document: Document, given: Document) -> Section:
+    """The method of a file, or the default one, with what is laid over it."""
+    default: Section = DEFAULT_METHOD.specification()
+    if document.get("system", {}).get("constraints"):
+        default = {"method": "svi", "degree": 6}
+    base = _spelt_out(document.get("method", default))
+    return _changed_method(base, _spelt_out(given.get("method", {})))
 
 
 def _with_own_step(layer: Document) -> Document:
@@ -274,7 +287,7 @@ def _check_complete(document: Document) -> None:
 def _check_used(document: Document, parameters: Section) -> None:
     """Refuse a parameter laid over a system that knows none of that name."""
     section = document["system"]
-    formulas = [section.get(key, "") for key in ("lagrangian", "hamiltonian", "dissipation")]
+    formulas = [section.get(key, "") for key in FORMULAS]
     formula = " ".join(map(str, (*formulas, *document.get("forces", {}).values())))
     for name in parameters:
         if name not in re.findall(r"\w+", formula):
@@ -301,6 +314,8 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
     common["forces"] = {key: _text(forces, key, "[forces]") for key in forces}
     if "hamiltonian" in section:
+        if "constraints" in section:
+            raise ModelFileError("[system] has constraints beside a hamiltonian: they are kept with a lagrangian")
         if "dissipation" in section:
             raise ModelFileError("[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]")
         common["hamiltonian"] = _text(section, "hamiltonian", "[system]")
@@ -310,6 +325,7 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
         raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
     common["lagrangian"] = _text(section, "lagrangian", "[system]")
     common["dissipation"] = _text(section, "dissipation", "[system]") if "dissipation" in section else None
+    common["constraints"] = _names(section, "constraints") if "constraints" in section else ()
     return _in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 

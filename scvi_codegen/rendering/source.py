@@ -112,6 +112,7 @@ class Interface:
         map_exact: whether the method is known to conserve them exactly, to round-off.
         momentum_names: of a Hamiltonian; see :attr:`momenta`.
         exchange_names: of what forces give in a step, energy and momentum maps; none without forces.
+        constraints: formulas of what the motion keeps at 0.
         energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
         monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
     """
@@ -135,6 +136,7 @@ class Interface:
     energy_parameter: str = ""
     monitor: str = ""
     exchange_names: tuple[str, ...] = ()
+    constraints: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:

@@ -117,6 +117,11 @@ class CompiledMethod:
         return np.array(self.interface.defaults, dtype=float)
 
     @property
+    def constraints(self) -> tuple[str, ...]:
+        """Formulas g of the constraints g(q, t) = 0, in the order of multipliers."""
+        return self.interface.constraints
+
+    @property
     def impulse_names(self) -> tuple[str, ...]:
         """Names of the momentum maps of L alone that forces change, in the order of :meth:`Trajectory.impulses`."""
         return self.interface.exchange_names[1:]

@@ -25,6 +25,7 @@ from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step, empty_array, real_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runtime.inputs import Array, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
@@ -38,6 +39,7 @@ __all__ = [
     "EnsembleParameters",
     "LaneBlock",
     "checked_ensemble",
+    "consistent_ensemble",
     "integrate_ensemble",
     "momenta_of_each",
     "parameters_of_each",
@@ -348,6 +350,17 @@ def momenta_of_each(
     values = parameters_of_each(stepper, parameters, len(positions))
     states = zip(positions, velocities, values, strict=True)
     return np.array([stepper.momentum(position, v, at, value) for position, v, value in states])
+
+
+def consistent_ensemble(
+    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
+) -> tuple[Array, Array]:
+    """Initial states put on the constraints, each with its parameters (:func:`consistent`)."""
+    at, (positions, momenta) = checked_number(t, "the time t"), checked_ensemble(stepper, q, p)
+    values = parameters_of_each(stepper, parameters, len(positions))
+    found = [consistent(stepper, q, p, at, own) for q, p, own in zip(positions, momenta, values, strict=True)]
+    q0, p0 = (np.array(part) for part in zip(*found, strict=True))
+    return q0, p0
 
 
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
@@ -20,8 +21,9 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
+from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.ensemble import integrate_ensemble, momenta_of_each
+from scvi_codegen.runtime.ensemble import consistent_ensemble, integrate_ensemble, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
@@ -161,6 +163,8 @@ class Stepper(Integrator):
         if self.interface.monitor:
             raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
         p = momenta_of_each(self, q, p, velocity, t, parameters)
+        if self.interface.constraints:
+            q, p = consistent_ensemble(self, q, p, t, parameters)
         if h is None and steps is None and t_end is not None:
             work = EnsembleToEnds(
                 self,
@@ -209,6 +213,8 @@ class Stepper(Integrator):
         By steps of h, or of their own lengths to t_end.
         """
         p = self.momenta_given(q, p, velocity, t, parameters)
+        if self.interface.constraints:
+            q, p = consistent(self, q, p, t, parameters)
         if self.interface.monitor:
             goal = _monitored(self.interface.monitor, h, t_end, tolerance)
             return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
@@ -224,6 +230,43 @@ class Stepper(Integrator):
         if tolerance is not None:
             raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
         return Run.started(self, q, p, h=h, t=t, parameters=parameters, options=options)
+
+    def project(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        velocity: ArrayLike | None = None,
+        t: float = 0.0,
+        parameters: Parameters = None,
+    ) -> tuple[Array, Array]:
+        """The nearest state (q, p) that meets the constraints, in the metric of the masses; at rest without p.
+
+        Raises:
+            MethodError: for a system without constraints.
+            StateError: if none is found, or constraints depend on each other there.
+        """
+        momenta = self.momenta_given(
+            q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
+        )
+        q1, p1, _ = projected(self, q, momenta, t, parameters)
+        return q1, p1
+
+    def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """The lambda with which g_q^T lambda are the forces that keep a state on its constraints: (c,), or (n, c).
+
+        d/dt L_v = L_q + f + g_q^T lambda: of ``x**2 + y**2 = l**2`` the tension of the rod is -2 l lambda. It is what
+        the state itself says, as exact as the state.
+        """
+        found = multipliers(self, q, p, t, parameters)
+        return found[0] if np.ndim(q) == 1 else found
+
+    def constraint_values(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """How far states are off: g, and its rate g_q v + g_t; (c,) each, or (n, c)."""
+        g, rate = constraint_values(self, q, p, t, parameters)
+        return (g[0], rate[0]) if np.ndim(q) == 1 else (g, rate)
 
     def restore(
         self,

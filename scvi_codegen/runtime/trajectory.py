@@ -18,6 +18,7 @@ from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled import checked_units, to_dataset
 from scvi_codegen.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR
+from scvi_codegen.runtime.constraints import constraint_values, multipliers
 from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
@@ -109,6 +110,19 @@ class Trajectory(KeptStates):
         :meth:`work`.
         """
         return exchanged_until(self)[:, 1:]
+
+    def multipliers(self) -> Array:
+        """(n, c) multipliers of the constraints: g_q^T lambda are the forces that keep the states on them.
+
+        Raises:
+            MethodError: for a system without constraints.
+        """
+        return multipliers(self.stepper, self.q, self.p, self.t, self.parameters)
+
+    def constraint_values(self) -> tuple[Array, Array]:
+        """(n, c) values of the constraints, and of their rates, at the states: zeros but for rounding."""
+        g, rate = constraint_values(self.stepper, self.q, self.p, self.t, self.parameters)
+        return g, rate
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """The states as :mod:`scvi_codegen.files.export` writes them."""

@@ -79,7 +79,9 @@ def verify(
         MethodError: if the method does not take the system, or has no such solver.
         StateError: if only one of q and p is given, or no state is found.
     """
-    method = as_method(method)
+    method = as_method(method, system)
+    if system.constraints:
+        raise MethodError(f"certificates of motions on constraints are not made: '{system.name}' has some")
     if system.clock is not None:
         raise MethodError(f"certificates of motions in transformed time are not made: '{system.name}' has none")
     began = time.perf_counter()

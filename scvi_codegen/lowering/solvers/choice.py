@@ -39,6 +39,8 @@ FIXED_POINTS: tuple[Solver, ...] = (
 
 def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
     """The fixed-point iteration of the stage equations of a system, or ``None`` where there is none."""
+    if system.constraints:
+        return None
     problem = StepProblem(system, stages.shape)
     return next((sweep for solver in FIXED_POINTS if (sweep := solver(problem)) is not None), None)
 

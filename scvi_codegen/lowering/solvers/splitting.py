@@ -17,7 +17,7 @@ __all__ = ["splitting_of"]
 
 def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """The sequence of kicks and drifts, or ``None`` where the method is implicit."""
-    if not method.fractions:
+    if not method.fractions or system.constraints:
         return None
     twin = lagrangian_twin(system)
     by_masses = twin is not None and forms_of(twin).separable

@@ -12,6 +12,7 @@ from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.kinds import FORMULAS, TEXT, takes
+from scvi_codegen.mechanics.constraints import with_reactions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.ansatz import combined, gauge_columns, polynomial_in
 from scvi_codegen.mechanics.symmetry.gauge import integrated, is_total_derivative
@@ -96,7 +97,7 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
     q, p, t = system.coordinates, system.momentum_symbols, system.time
     if not conserved(system, motion, [G]):
         slopes = gradient(G, (*q, *p, t))
-        velocities = motion.transformed if motion.hamiltonian else motion.arguments[len(q) :]
+        velocities = motion.transformed if motion.hamiltonian else motion.arguments[len(q) : 2 * len(q)]
         moved = (*velocities, *motion.forces, sympy.S.One)
         rate = sympy.Add(*(slope * moved[i] for i, slope in slopes.items())).xreplace(motion.numbers)
         rate = rate if motion.hamiltonian else rate.xreplace(dict(zip(p, motion.transformed, strict=True)))
@@ -168,11 +169,12 @@ def _cut(change: Expr) -> str:
 
 
 def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
-    """L_q . xi + L_v . dxi/dt, and the work of forces; of a Hamiltonian the rate of p . xi."""
+    """L_q . xi + L_v . dxi/dt, and the work of forces and multipliers; of a Hamiltonian the rate of p . xi."""
     p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
     terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
-    terms += [force * component for force, component in zip(system.forces, xi, strict=False)]
+    forces = with_reactions(system, system.forces or (sympy.S.Zero,) * system.dimension)
+    terms += [force * component for force, component in zip(forces, xi, strict=True)]
     return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
 
 

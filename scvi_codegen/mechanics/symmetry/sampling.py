@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.tape import Tape, evaluate
+from scvi_codegen.mechanics.constraints import constraint_multipliers, with_reactions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
@@ -58,10 +59,11 @@ class Rates:
     """How a system moves: v and L_q, or H_p and -H_q, as expressions of ``arguments``, time and ``constants``.
 
     Attributes:
-        arguments: (q, v) of a Lagrangian, (q, p) of a Hamiltonian.
+        arguments: (q, v) of a Lagrangian, (q, p) of a Hamiltonian, then multipliers of constraints, which are as if
+            anything: what is conserved is so whatever they are.
         momenta: symbols of p.
         transformed: p of a Lagrangian, v of a Hamiltonian.
-        forces: dp/dt.
+        forces: dp/dt, g_q^T lambda of constraints included.
         hamiltonian: which of both.
         time: t.
         constants: default value by parameter; long numbers of the formula are parameters here.
@@ -111,7 +113,8 @@ class Rates:
     def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any]) -> Sample:
         m = len(self.momenta)
         transformed, forces = (tuple(map(value, given)) for given in (self.transformed, self.forces))
-        q, second = (tuple(values[argument] for argument in part) for part in (self.arguments[:m], self.arguments[m:]))
+        halves = (self.arguments[:m], self.arguments[m : 2 * m])
+        q, second = (tuple(values[argument] for argument in half) for half in halves)
         p, v = (second, transformed) if self.hamiltonian else (transformed, second)
         values |= dict(zip(self.momenta, p, strict=True))
         return Sample(t=values[self.time], state=(*q, *p), rates=(*v, *forces), value=value)
@@ -124,13 +127,13 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
 def rates_of(system: MechanicalSystem) -> Rates:
     """The motion of a system, long numbers replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
-    forces = forms_of(system).force
+    forces = with_reactions(system, forms_of(system).force)
     numbers = _long_numbers((*transformed, *forces))
     if numbers:
         replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}
         transformed, forces = (tuple(e.xreplace(replaced) for e in part) for part in (transformed, forces))
     return Rates(
-        arguments=arguments,
+        arguments=(*arguments, *constraint_multipliers(system)),
         momenta=system.momentum_symbols,
         transformed=transformed,
         forces=forces,

@@ -1,0 +1,142 @@
+"""Stage equations of a system with holonomic constraints g(q, t) = 0: multipliers at points, and the end's momentum.
+
+With Lobatto's points c_0 = 0 < .. < c_s = 1 as points of the quadrature, stationary is the discrete action with a
+multiplier at each,
+
+    h sum_n b_n [L(q_n, v_n) + lambda_n . g(q_n)],            g(q_n) = 0 for n = 1 .. s
+
+(g(q_0) = 0 is the end of the step before). lambda_s enters p1 alone, and puts it on the tangent space: with v the
+velocity that belongs to p1,
+
+    p1 = L_v(q1, v),                                          g_q v + g_t = 0.
+
+That is the pair of Lobatto IIIA and IIIB: order 2s in positions and momenta, symmetric, symplectic on the constrained
+phase space, RATTLE for s = 1. With Gauss's points constraints would hold nowhere but there, and the order would fall.
+
+Sources: L. Jay, SIAM J. Numer. Anal. 33 (1996); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 3.5; T.
+Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import sympy
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.constraints import constraint_multipliers, constraint_rates, with_reactions
+from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.tables.basis import identity_matrix
+from scvi_codegen.tables.precision import Matrix, mp
+
+__all__ = ["with_constraints"]
+
+
+def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
+    """The stage equations with the constraints of the system; the same without any.
+
+    Raises:
+        MethodError: unless the method, of this name, is an SVI of degree s with s + 1 points, both ends among them.
+    """
+    if not system.constraints:
+        return stages
+    _check_points(system, stages, name)
+    family, count = stages.families[0], len(system.constraints)
+    nothing, points = (mp.zero, mp.zero), len(family.abscissae)
+    multipliers = tuple(
+        Block(name=f"lambda_{n}", power=1, straight=nothing, moves=False, size=count) for n in range(points)
+    )
+    velocity = Block(name="v_1", power=1, straight=(mp.zero, mp.one), moves=False)
+    conditions = [("g", "stage")] * (points - 1) + [("hidden", "stage")]
+    return replace(
+        stages,
+        blocks=(*stages.blocks, velocity, *multipliers),
+        rows=(
+            *stages.rows,
+            Row(number="end", kind="stage", momentum=-stages.end_momentum),
+            *(Row(number=number, kind=kind, momentum=mp.zero, size=count) for number, kind in conditions),
+        ),
+        families=(_held(system, family), _end(system, stages, points)),
+        end_position=Table.joined(stages.end_position, Table.constant(1, 1 + points)),
+        extrapolation=stages.extrapolation and _extrapolation(stages.extrapolation, family.abscissae),
+    )
+
+
+def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> None:
+    family, s = stages.families[0], len(stages.blocks)
+    ends = (family.abscissae[0], family.abscissae[-1]) == (0, 1)
+    if ends and len(stages.families) == 1 and len(family.abscissae) == s + 1 and family.in_action:
+        return
+    raise MethodError(
+        f"{name} does not keep the constraints of '{system.name}', which hold at the points of a quadrature: one more "
+        "than the degree, both ends of the step among them. Take SVI(4, 'gauss-lobatto:5'), of order 8, or so; "
+        "SVI(1, 'gauss-lobatto:2') is RATTLE"
+    )
+
+
+def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
+    """The quadrature with multipliers: L + lambda . g in place of L, and g itself in rows of its own."""
+    assert family.scalar is not None
+    points, factors = len(family.abscissae), constraint_multipliers(system)
+    columns, rows = len(family.gathers[0].table.entries[0]), len(family.scatters[0].table.entries[0]) - 1
+    none, one = Table.constant(points, 1 + points), Table.constant(points, 1)
+    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in family.gathers]
+    place = Table.joined(Table.constant(points, columns), one, Table.identity(points))
+    gathers.append(Gather(arguments=factors, table=place, power=-1))
+    scatters = [replace(scatter, table=_with_end(scatter.table, rows, points)) for scatter in family.scatters]
+    scatters[0] = replace(scatters[0], results=with_reactions(system, scatters[0].results))
+    conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
+    held = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
+    scatters.append(Scatter(results=system.constraints, table=held, power=-1, scale=scatters[0].scale))
+    products = [factor * g for factor, g in zip(factors, system.constraints, strict=True)]
+    return replace(
+        family,
+        gathers=tuple(gathers),
+        scatters=tuple(scatters),
+        scalar=sympy.Add(family.scalar, *products),
+        computes="L_q + g_q^T lambda, L_v and g",
+    )
+
+
+def _with_end(table: Table, rows: int, points: int) -> Table:
+    """A table of scatters with the row of p1 once more, of other sign, in that of L_v = p1; nothing for constraints."""
+    last = table.columns([rows])
+    negative = Table(
+        entries=tuple((-line[0],) for line in last.entries),
+        names=tuple((f"-{line[0]}" if line[0] else "",) for line in last.names),
+    )
+    return Table.joined(table.columns(range(rows)), negative, Table.constant(len(table.entries), points), last)
+
+
+def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> PointFamily:
+    """L_v(q1, v) and the rates of the constraints at the end of the step."""
+    size, rows = len(stages.blocks), len(stages.rows)
+    others, column = Table.constant(1, 1 + points), [[0] * (1 + size) + [1] + [0] * points]
+    momentum = [[0] * rows + [1] + [0] * (points + 1)]
+    hidden = [[0] * (rows + points) + [1, 0]]
+    return PointFamily(
+        name="end",
+        abscissae=(mp.one,),
+        weights=(mp.one,),
+        weight_names=("",),
+        gathers=(
+            Gather(arguments=system.coordinates, table=Table.joined(stages.end_position, others), power=0),
+            Gather(arguments=system.velocities, table=Table.named("", column), power=-1),
+        ),
+        scatters=(
+            Scatter(results=forms_of(system).momentum, table=Table.named("", momentum), power=0),
+            Scatter(results=constraint_rates(system), table=Table.named("", hidden), power=0),
+        ),
+        computes="Momenta L_v and the rates of the constraints",
+    )
+
+
+def _extrapolation(own: Matrix, abscissae: tuple[mp.mpf, ...]) -> Matrix:
+    """Velocities at the points as without constraints; that of the end, and multipliers, stay what they were."""
+    size, points = len(own), len(abscissae)
+    lines = [(*line, *(mp.zero,) * (1 + points)) for line in own]
+    lines.append((*(mp.zero,) * size, mp.one, *(mp.zero,) * points))
+    lines += [(*(mp.zero,) * (size + 1), *line) for line in identity_matrix(points)]
+    return tuple(lines)

@@ -1,0 +1,112 @@
+"""States on the constraints g(q, t) = 0 of a system: how far they are off, the nearest that is on, what holds them."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
+from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.options import STATUS
+from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_states, checked_vector
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["consistent", "constraint_values", "multipliers", "projected"]
+
+TYPED, NEAR = 1e-6, 1e-2
+"""Relative distances: of numbers as people type them, moved without a word; beyond which a state is refused."""
+
+
+def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
+    """(2, n, c): g, and g_q v + g_t, of states."""
+    times, positions, momenta = _of_constrained(stepper, q, p, t)
+    values = np.empty((2, len(times), len(stepper.constraints)))
+    _call(stepper, "constraint_values", times, positions, momenta, parameters, *values)
+    return values
+
+
+def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
+    """(n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states."""
+    times, positions, momenta = _of_constrained(stepper, q, p, t)
+    values = np.empty((len(times), len(stepper.constraints)))
+    _call(stepper, "multipliers", times, positions, momenta, parameters, values)
+    return values
+
+
+def projected(
+    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters
+) -> tuple[Array, Array, float]:
+    """The nearest state on the constraints, in the metric of the masses, and how far it is, relative to |q| and |p|.
+
+    Raises:
+        StateError: if none is found, or constraints depend on each other there.
+    """
+    q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
+    _of_constrained(stepper, q0, p0, t)
+    binding, q1, p1 = stepper.binding, np.empty_like(q0), np.empty_like(p0)
+    values = checked_parameters(stepper.interface, parameters)
+    status = binding.function("project")(
+        checked_number(t, "the time t"), *map(binding.pointer, (q0, p0, values, q1, p1)), binding.workspace()
+    )
+    if status:
+        _refuse(stepper, status, q0)
+    moved = max(_relative(q1 - q0, np.concatenate([q0, q1])), _relative(p1 - p0, np.concatenate([p0, p1])))
+    return q1, p1, moved
+
+
+def consistent(
+    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters
+) -> tuple[Array, Array]:
+    """An initial state put on the constraints: silently by what rounding and typing explain, else with a warning.
+
+    Raises:
+        StateError: if it is far off.
+    """
+    q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
+    q1, p1, moved = projected(stepper, q0, p0, t, parameters)
+    if moved <= 64 * np.finfo(float).eps:
+        return q0, p0
+    if moved <= TYPED:
+        return q1, p1
+    g, rate = constraint_values(stepper, q0, p0, t, parameters)[:, 0]
+    k, j = int(np.abs(g).argmax()), int(np.abs(rate).argmax())
+    said = (
+        f"the initial state is {moved:.1e} (relative) off the constraints: {stepper.constraints[k]} = {g[k]:.3g}, and "
+        f"the rate of {stepper.constraints[j]} is {rate[j]:.3g}, not 0"
+    )
+    if moved > NEAR:
+        raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
+    warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=4)
+    return q1, p1
+
+
+def _of_constrained(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
+    if not stepper.constraints:
+        raise MethodError(f"{stepper.interface.system} has no constraints")
+    return checked_states(stepper.interface, q, p, t)
+
+
+def _call(
+    stepper: Integrator, name: str, times: Array, q: Array, p: Array, parameters: Parameters, *results: Array
+) -> None:
+    pointer = stepper.binding.pointer
+    values = checked_parameters(stepper.interface, parameters)
+    status = stepper.binding.function(name)(
+        len(times), *map(pointer, (times, q, p, values, *results)), stepper.binding.workspace()
+    )
+    if status:
+        _refuse(stepper, status, q)
+
+
+def _refuse(stepper: Integrator, status: int, q: Array) -> None:
+    hint = "; do constraints say the same there, or contradict each other?" if "singular" in STATUS[status] else ""
+    raise StateError(
+        f"the constraints {', '.join(stepper.constraints)} at q = {q} cannot be met ({STATUS[status]}{hint})"
+    )
+
+
+def _relative(change: Array, beside: Array) -> float:
+    size = float(np.abs(beside).max())
+    return float(np.abs(change).max()) / size if size > 0.0 else 0.0

@@ -1,0 +1,165 @@
+/* States on the constraints g(q, t) = 0, and the multipliers that keep them there. Before it: legendre.h, newton.h, the
+ * kernels constraints and constrained_motion, and CONSTRAINT_ENTRY, the places of the slopes g_q. */
+
+#define MOST_PROJECTIONS 32
+
+/* Factors of the matrix [L_vv, g_q^T; g_q, 0] of a state, and room for a right-hand side. */
+typedef struct {
+  real *matrix, *pivot, *x;
+} saddle;
+
+static saddle saddle_in(real *workspace)
+{
+  const band shape = band_of(SITES, 1);
+  saddle at;
+  at.matrix = workspace + SCRATCH + MEMORY;
+  at.pivot = at.matrix + band_size(&shape);
+  at.x = at.pivot + SITES;
+  return at;
+}
+
+/* The factors at u = (q, v), and g. */
+static int factorise_saddle(real t, const real *u, const real *parameters, const saddle *at, real *g)
+{
+  const band shape = band_of(SITES, 1);
+  real p[M], mass[MASS_ENTRIES], slope[CONSTRAINT_ENTRIES];
+  legendre(u, t, parameters, p, mass);
+  constraints(u, t, parameters, g, slope);
+  memset(at->matrix, 0, sizeof(real) * band_size(&shape));
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    at->matrix[shape.first + PLACE[MASS_ENTRY[e][1]] * shape.stride + PLACE[MASS_ENTRY[e][0]]] = mass[e];
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+    const int row = PLACE[M + CONSTRAINT_ENTRY[e][0]], column = PLACE[CONSTRAINT_ENTRY[e][1]];
+    at->matrix[shape.first + column * shape.stride + row] = slope[e];
+    at->matrix[shape.first + row * shape.stride + column] = slope[e];
+  }
+  if (!all_finite(g, CONSTRAINTS) || !all_finite(at->matrix, (int)band_size(&shape)))
+    return NOT_FINITE;
+  return factorise(at->matrix, &shape, at->pivot) ? OK : SINGULAR;
+}
+
+/* x and y with L_vv x + g_q^T y = a (0 if NULL), g_q x = b. */
+static void solve_saddle(const saddle *at, const real *a, const real *b, real *x, real *y)
+{
+  const band shape = band_of(SITES, 1);
+  for (int i = 0; i < M; i++)
+    at->x[PLACE[i]] = a ? a[i] : 0;
+  for (int k = 0; k < CONSTRAINTS; k++)
+    at->x[PLACE[M + k]] = b[k];
+  back_substitute(at->matrix, &shape, at->pivot, at->x);
+  for (int i = 0; i < M; i++)
+    x[i] = at->x[PLACE[i]];
+  for (int k = 0; k < CONSTRAINTS; k++)
+    y[k] = at->x[PLACE[M + k]];
+}
+
+static real largest_of(const real *x)
+{
+  real largest = 0;
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, MATH(fabs)(x[i]));
+  return largest;
+}
+
+/* g and g_q v + g_t at a state, and the velocity. */
+static int constrained(real t, const real *q, const real *p, const real *parameters, real *u, real *g, real *rate,
+    real *workspace)
+{
+  real value[M + 2 * CONSTRAINTS], slope[CONSTRAINT_ENTRIES];
+  const int status = NAME(velocity)(t, q, p, parameters, u + M, workspace);
+  if (status != OK)
+    return status;
+  memcpy(u, q, sizeof(real) * M);
+  constraints(u, t, parameters, g, slope);
+  constrained_motion(u, t, parameters, value);
+  memcpy(rate, value + M, sizeof(real) * CONSTRAINTS);
+  return all_finite(g, CONSTRAINTS) && all_finite(rate, CONSTRAINTS) ? OK : NOT_FINITE;
+}
+
+int NAME(constraint_values)(long long count, const real *t, const real *q, const real *p, const real *parameters,
+    real *g, real *rate, real *workspace)
+{
+  real u[2 * M];
+  for (long long k = 0; k < count; k++) {
+    const int status = constrained(t[k], q + k * M, p + k * M, parameters, u, g + k * CONSTRAINTS,
+        rate + k * CONSTRAINTS, workspace);
+    if (status != OK)
+      return status;
+  }
+  return OK;
+}
+
+/* The nearest q, by steps of Gauss and Newton in the metric of the masses; then p less what would leave the tangent
+ * space. An update that does not shrink any more is rounding. */
+int NAME(project)(real t, const real *q0, const real *p0, const real *parameters, real *q1, real *p1, real *workspace)
+{
+  const saddle at = saddle_in(workspace);
+  real q[M], p[M], u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], last = (real)INFINITY;
+  real slope[CONSTRAINT_ENTRIES];
+  int status = NAME(velocity)(t, q0, p0, parameters, u + M, workspace), k = 0;
+  memcpy(q, q0, sizeof q);
+  memcpy(p, p0, sizeof p);
+  for (; status == OK && last > 0; k++) {
+    real size;
+    memcpy(u, q, sizeof q);
+    status = factorise_saddle(t, u, parameters, &at, g);
+    if (status != OK)
+      return status;
+    for (int j = 0; j < CONSTRAINTS; j++)
+      g[j] = -g[j];
+    solve_saddle(&at, NULL, g, update, y);
+    size = largest_of(update);
+    if (!(0 * size == 0))
+      return NOT_FINITE;
+    if (!(size < last) && last <= REAL(1e-8) * largest_of(q))
+      break;
+    if (k >= MOST_PROJECTIONS)
+      return NOT_CONVERGED;
+    for (int i = 0; i < M; i++)
+      q[i] += update[i];
+    last = size;
+  }
+  for (int twice = 0; status == OK && twice < 3; twice++) { /* once where the kinetic energy is quadratic; rounding */
+    status = constrained(t, q, p, parameters, u, g, rate, workspace);
+    if (status == OK)
+      status = factorise_saddle(t, u, parameters, &at, g);
+    if (status != OK)
+      return status;
+    for (int j = 0; j < CONSTRAINTS; j++)
+      rate[j] = -rate[j];
+    solve_saddle(&at, NULL, rate, update, y);
+    constraints(u, t, parameters, g, slope);
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+      p[CONSTRAINT_ENTRY[e][1]] -= slope[e] * y[CONSTRAINT_ENTRY[e][0]];
+  }
+  if (status != OK)
+    return status;
+  memcpy(q1, q, sizeof q);
+  memcpy(p1, p, sizeof p);
+  return OK;
+}
+
+/* lambda of d/dt L_v = L_q + f + g_q^T lambda at states: L_vv a - g_q^T lambda = F, g_q a = - what rates grow by. */
+int NAME(multipliers)(long long count, const real *t, const real *q, const real *p, const real *parameters,
+    real *multiplier, real *workspace)
+{
+  const saddle at = saddle_in(workspace);
+  for (long long k = 0; k < count; k++) {
+    real u[2 * M], value[M + 2 * CONSTRAINTS], g[CONSTRAINTS], a[M], *y = multiplier + k * CONSTRAINTS;
+    int status = NAME(velocity)(t[k], q + k * M, p + k * M, parameters, u + M, workspace);
+    memcpy(u, q + k * M, sizeof(real) * M);
+    if (status == OK)
+      status = factorise_saddle(t[k], u, parameters, &at, g);
+    if (status != OK)
+      return status;
+    constrained_motion(u, t[k], parameters, value);
+    for (int j = 0; j < CONSTRAINTS; j++)
+      value[M + CONSTRAINTS + j] = -value[M + CONSTRAINTS + j];
+    solve_saddle(&at, value, value + M + CONSTRAINTS, a, y);
+    for (int j = 0; j < CONSTRAINTS; j++)
+      y[j] = -y[j];
+    if (!all_finite(y, CONSTRAINTS))
+      return NOT_FINITE;
+  }
+  return OK;
+}

@@ -1,0 +1,255 @@
+"""Holonomic constraints: orders against minimal coordinates, what is kept, and what keeps it."""
+
+import numpy as np
+import pytest
+import sympy
+from numpy.testing import assert_allclose
+from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
+
+from scvi_codegen import (
+    SCVI,
+    SVI,
+    AccuracyWarning,
+    Gauss,
+    LagrangianSystem,
+    MethodError,
+    StateError,
+    StoermerVerlet,
+    SystemDefinitionError,
+    change_coordinates,
+    compile_stepper,
+    hamiltonian_of,
+    reparametrise,
+    symmetries,
+)
+
+G = 9.81
+
+
+def lobatto(s):
+    return SVI(s, f"gauss-lobatto:{s + 1}")
+
+
+def rod(**more):
+    return LagrangianSystem.from_text(
+        name="rod",
+        coordinates=["x", "y"],
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 - m*g*y",
+        parameters={"m": 2.0, "g": G, "l": 1.5, **more.pop("parameters", {})},
+        constraints=["x**2 + y**2 = l**2"],
+        **more,
+    )
+
+
+def on_circle(angle):
+    return 1.5 * np.array([np.sin(angle), -np.cos(angle)])
+
+
+@pytest.fixture(scope="module")
+def swung():
+    """Angle and rate after 1.2 time units of the pendulum, from 1.3 at rest, by its angle."""
+    angle = LagrangianSystem.from_text(
+        name="angle", coordinates=["a"], lagrangian="l**2*a_dot**2/2 + g*l*cos(a)", parameters={"g": G, "l": 1.5}
+    )
+    run = compile_stepper(angle, SVI(8)).integrate([1.3], [0.0], h=0.01, steps=120)
+    return float(run.q[-1, 0]), float(run.velocity[-1, 0])
+
+
+@pytest.mark.parametrize("s", [1, 2, 3, 4])
+def test_the_order_is_2s_and_constraints_hold_to_rounding(s, swung):
+    stepper, errors = compile_stepper(rod(), lobatto(s)), []
+    for steps in (12, 24):
+        run = stepper.integrate(on_circle(1.3), [0.0, 0.0], h=1.2 / steps, steps=steps)
+        exact_p = 2.0 * 1.5 * swung[1] * np.array([np.cos(swung[0]), np.sin(swung[0])])
+        errors.append(max(np.abs(run.q[-1] - on_circle(swung[0])).max(), np.abs(run.p[-1] - exact_p).max()))
+        g, rate = run.constraint_values()
+        assert np.abs(g).max() < 2e-15
+        assert np.abs(rate).max() < 4e-14
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * s, abs=0.25)
+
+
+def test_degree_1_is_rattle():
+    """RATTLE written down for the rod: two kicks, a drift, and multipliers that two quadratic equations give."""
+    stepper, h, m, l2 = compile_stepper(rod(), lobatto(1)), 0.05, 2.0, 2.25
+    q, p = on_circle(0.7), 0.3 * np.array([np.cos(0.7), np.sin(0.7)])
+    for _ in range(20):
+        half = p + h / 2 * np.array([0.0, -m * G])
+        free = q + h / m * half
+        a, b, c = h**4 / m**2 * (q @ q), h**2 / m * 2 * (free @ q), free @ free - l2
+        x = (-b + np.sqrt(b**2 - 4 * a * c)) / (2 * a)  # q1 = free + h^2/m x q, the small root
+        q1, half = free + h**2 / m * x * q, half + h * x * q
+        p1 = half + h / 2 * np.array([0.0, -m * G])
+        p1 -= q1 * (q1 @ p1) / (q1 @ q1)
+        found = stepper.step(q, p, h)
+        assert_allclose(found[0], q1, atol=1e-15)
+        assert_allclose(found[1], p1, atol=1e-13)
+        q, p = q1, p1
+
+
+def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():
+    """The area dq ^ dp of two directions along the constrained phase space, by steps from four neighbours."""
+    stepper, eps = compile_stepper(rod(), lobatto(2)), 1e-5
+
+    def state(angle, rate):
+        return on_circle(angle), 2.0 * 1.5 * rate * np.array([np.cos(angle), np.sin(angle)])
+
+    def area(after):
+        (a, b), (c, d) = ((after(*x) - after(*y)) / (2 * eps) for x, y in SIDES)
+        return a @ d - b @ c
+
+    SIDES = [((1.0 + eps, 0.4), (1.0 - eps, 0.4)), ((1.0, 0.4 + eps), (1.0, 0.4 - eps))]
+    before = area(lambda *at: np.array(state(*at)))
+    after = area(lambda *at: np.array(stepper.step(*state(*at), 0.2)))
+    assert before == pytest.approx(2.0 * 2.25, rel=1e-8)
+    assert after == pytest.approx(before, rel=1e-8)
+
+
+def test_energy_is_bounded_and_momenta_are_kept():
+    """A spherical pendulum of two rods: energy without drift over 20,000 steps, the angular momentum to rounding."""
+    system = LagrangianSystem.from_text(
+        name="two rods in space",
+        coordinates=["x1", "y1", "z1", "x2", "y2", "z2"],
+        lagrangian="(x1_dot**2 + y1_dot**2 + z1_dot**2 + x2_dot**2 + y2_dot**2 + z2_dot**2)/2 - 9.81*(z1 + z2)",
+        constraints=["x1**2 + y1**2 + z1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 + (z2 - z1)**2 = 1"],
+    )
+    assert [each.name for each in symmetries(system)] == ["angular momentum z"]
+    stepper = compile_stepper(system, lobatto(3))
+    run = stepper.integrate(
+        [0.6, 0, -0.8, 1.2, 0, -1.6], velocity=[0, 0.9, 0, 0, 1.5, 0], h=0.05, steps=20000, every=20
+    )
+    energy = run.energy() - run.energy()[0]
+    assert np.abs(energy).max() < 1e-7
+    assert np.abs(energy[500:]).max() < 1.5 * np.abs(energy[:500]).max()
+    assert np.abs(run.momentum_errors()).max() < 1e-13
+    assert max(np.abs(part).max() for part in run.constraint_values()) < 1e-13
+
+
+def test_multipliers_are_the_tension_of_the_rod():
+    run = compile_stepper(rod(), lobatto(4)).integrate(on_circle(1.3), [0.0, 0.0], h=0.05, steps=40)
+    speed2 = (run.velocity**2).sum(axis=1)
+    tension = 2.0 * (speed2 / 1.5 - G * run.q[:, 1] / 1.5)
+    assert_allclose(-2.0 * 1.5 * run.multipliers()[:, 0], tension, rtol=1e-13)
+
+
+def test_constraints_that_depend_on_time_forces_and_coupled_masses():
+    """A bead on a turning straight wire (r'' = w^2 r - c r'), with coordinates that mix in the kinetic energy."""
+    system = LagrangianSystem.from_text(
+        name="wire",
+        coordinates=["u", "v"],
+        lagrangian="((u_dot + v_dot)**2 + (u_dot - v_dot)**2)/2",
+        parameters={"w": 0.8, "c": 0.3},
+        constraints=["(u + v)*sin(w*t) - (u - v)*cos(w*t)"],
+        dissipation="c*((u_dot + v_dot)**2 + (u_dot - v_dot)**2)/2",
+    )
+    t = sympy.Symbol("t")
+    errors = []
+    a, b = sympy.symbols("a b")
+    root = sympy.sqrt(sympy.Rational(9, 400) * 1 + sympy.Rational(64, 100) * 0 + sympy.Rational(64, 100))
+    slow, fast = -sympy.Rational(3, 20) - root, -sympy.Rational(3, 20) + root
+    found = sympy.solve([a + b - 1, slow * a + fast * b], [a, b])
+    radius = float((found[a] * sympy.exp(slow * t) + found[b] * sympy.exp(fast * t)).subs(t, 2))
+    for steps in (10, 20):
+        run = compile_stepper(system, lobatto(2)).integrate(
+            [0.5, 0.5], velocity=[0.4, -0.4], h=2.0 / steps, steps=steps
+        )
+        x, y = run.q[-1].sum(), run.q[-1, 0] - run.q[-1, 1]
+        errors.append(abs(np.hypot(x, y) - radius))
+        assert max(np.abs(part).max() for part in run.constraint_values()) < 1e-14
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
+
+
+def test_initial_states_are_projected_or_refused():
+    stepper = compile_stepper(rod(), lobatto(2))
+    run = stepper.integrate([1.0606602, -1.0606602], [0.0, 0.0], h=0.1, steps=1)  # as typed
+    assert np.abs(run.constraint_values()[0]).max() < 1e-15
+    with pytest.warns(AccuracyWarning, match=r"moved to the nearest"):
+        stepper.integrate([1.061, -1.061], [0.0, 0.0], h=0.1, steps=1)
+    with pytest.raises(StateError, match=r"-l\*\*2 \+ x\*\*2 \+ y\*\*2 = -1\.25, .*stepper\.project"):
+        stepper.integrate([1.0, 0.0], [0.0, 0.0], h=0.1, steps=1)
+    q, p = stepper.project([1.0, 0.0], [3.0, 4.0])
+    assert_allclose(q, [1.5, 0.0], atol=1e-15)
+    assert_allclose(p, [0.0, 4.0], atol=1e-15)
+    with pytest.raises(StateError, match="cannot be met"):
+        stepper.project([0.0, 0.0])
+    ensemble = stepper.integrate_ensemble([on_circle(0.3), on_circle(0.4)], np.zeros((2, 2)), h=0.1, steps=5)
+    assert np.isfinite(ensemble.q).all()
+
+
+def test_parts_of_steps_events_and_chosen_steps():
+    stepper = compile_stepper(rod(), lobatto(4))
+    run = stepper.integrate(on_circle(1.3), [0.0, 0.0], h=0.05, steps=40, events="x")
+    q, p = run.at([0.333, 1.234])
+    assert np.abs(stepper.constraint_values(q, p)[0]).max() < 1e-14
+    assert len(run.events[0]) >= 1
+    assert np.abs(run.events[0].q[:, 0]).max() < 1e-12
+
+
+def test_from_sympy_and_from_lagranges_method():
+    x, y = dynamicsymbols("x y")
+    t, m, length = dynamicsymbols._t, sympy.Symbol("m"), sympy.Symbol("l")
+    L = m * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 - m * sympy.Float("9.81") * y
+    g = x**2 + y**2 - length**2
+    values = {"m": 2.0, "l": 1.5}
+    one = LagrangianSystem.from_sympy(name="rod", lagrangian=L, coordinates=[x, y], parameters=values, constraints=[g])
+    other = LagrangianSystem.from_lagranges_method(
+        LagrangesMethod(L, [x, y], hol_coneqs=[g]), name="rod", parameters=values
+    )
+    assert one == other
+    assert one.constraints == rod().with_parameters(m=2.0).constraints
+    with pytest.raises(SystemDefinitionError, match="nonhol_coneqs"):
+        LagrangianSystem.from_lagranges_method(
+            LagrangesMethod(L, [x, y], nonhol_coneqs=[x.diff(t) - y * y.diff(t)]), name="rod", parameters=values
+        )
+
+
+@pytest.mark.parametrize(
+    ("constraints", "said"),
+    [
+        (["x**2 + y**2 = l**2", "2*x**2 + 2*y**2 - 2*l**2"], "leave nothing"),
+        (["x_dot + y"], "has the velocity x_dot in it"),
+        (["l - t"], "no coordinate in the constraint"),
+        (["x = y = l"], "more than one '='"),
+        (["z - x"], "'z'"),
+        ("x - y", "list of texts"),
+    ],
+)
+def test_what_is_no_constraint(constraints, said):
+    with pytest.raises(SystemDefinitionError, match=said):
+        LagrangianSystem.from_text(
+            name="plane",
+            coordinates=["x", "y"],
+            lagrangian="(x_dot**2 + y_dot**2)/2",
+            parameters={"l": 1.0},
+            constraints=constraints,
+        )
+
+
+def test_a_constraint_said_twice_is_named():
+    with pytest.raises(SystemDefinitionError, match=r"'x\*z - 1' says nothing|'2\*x\*z - 2' says nothing"):
+        LagrangianSystem.from_text(
+            name="space",
+            coordinates=["x", "y", "z"],
+            lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2",
+            constraints=["x*z = 1", "2*x*z = 2"],
+        )
+
+
+@pytest.mark.parametrize(
+    "method", [SVI(2), Gauss(2), SCVI(2), StoermerVerlet(), SVI(2, "gauss-lobatto:4")], ids=lambda one: one.name
+)
+def test_methods_that_do_not_keep_constraints_are_refused(method):
+    with pytest.raises(MethodError, match=r"SVI\(4, 'gauss-lobatto:5'\)"):
+        compile_stepper(rod(), method)
+
+
+def test_what_constraints_do_not_go_with():
+    with pytest.raises(SystemDefinitionError, match="constraints"):
+        reparametrise(rod(), "frequency")
+    with pytest.raises(SystemDefinitionError, match="constraints"):
+        hamiltonian_of(rod())
+    polar = change_coordinates(rod(), {"x": "r*sin(a)", "y": "-r*cos(a)"}, coordinates=["r", "a"])
+    run = compile_stepper(polar, lobatto(3)).integrate([1.5, 1.3], velocity=[0.0, 0.0], h=0.05, steps=24)
+    assert np.abs(run.q[:, 0] - 1.5).max() < 1e-15
+    free = LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2")
+    with pytest.raises(MethodError, match="no constraints"):
+        compile_stepper(free, SVI(2)).multipliers([0.0], [1.0])
