@@ -86,6 +86,7 @@ static const int NODE_SLOPE_4[2][2] = {{0, 0}, {1, 1}};
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
 static const int PLACE[SITES] = {0, 1};
+#define MASS_PLACE PLACE
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
 INVERSE_ROOT(1, (inverse));

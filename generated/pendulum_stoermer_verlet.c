@@ -26,6 +26,7 @@ enum {
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
 static const int PLACE[M] = {0};
+#define MASS_PLACE PLACE
 static const int MASS_ENTRY[1][2] = {{0, 0}};
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */

@@ -43,6 +43,7 @@ static const double QUADRATURE_WEIGHT[2] = {0.5, 0.5};
 
 /* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
 static const int PLACE[SITES] = {0};
+#define MASS_PLACE PLACE
 static const int MASS_ENTRY[1][2] = {{0, 0}};
 
 /* L_q and L_v at u = (q, v). Operations: 6 *, 1 neg, 1 sin. */

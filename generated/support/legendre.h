@@ -1,5 +1,6 @@
 /* The Legendre transform and its inverse, of velocities where a Lagrangian is given, of momenta where a Hamiltonian is.
- * Before it: the kernel legendre, y = L_v (H_p) at u = (q, x) and its slopes dy/dx, and MASS_ENTRY, their places. */
+ * Before it: the kernel legendre, y = L_v (H_p) at u = (q, x) and its slopes dy/dx, MASS_ENTRY, their places, and
+ * MASS_PLACE, that of each coordinate in the matrix. */
 
 #define TRANSFORM_ROUNDING (64 * REAL_EPSILON) /* a misfit of this part of y may be rounding of its terms */
 
@@ -11,7 +12,7 @@ static void transform_and_slopes(real t, const real *u, const real *parameters, 
   legendre(u, t, parameters, y, slope);
   memset(mass, 0, sizeof(real) * band_size(&shape));
   for (int e = 0; e < MASS_ENTRIES; e++)
-    mass[shape.first + PLACE[MASS_ENTRY[e][1]] * shape.stride + PLACE[MASS_ENTRY[e][0]]] = slope[e];
+    mass[shape.first + MASS_PLACE[MASS_ENTRY[e][1]] * shape.stride + MASS_PLACE[MASS_ENTRY[e][0]]] = slope[e];
 }
 
 /* max |value - y|. */
@@ -52,14 +53,14 @@ static int invert_from(real t, real *u, const real *y, const real *parameters, r
     if (!factorise(mass, &shape, pivot))
       return SINGULAR;
     for (int i = 0; i < M; i++) {
-      update[PLACE[i]] = y[i] - value[i];
+      update[MASS_PLACE[i]] = y[i] - value[i];
       roundoff = larger(roundoff, TRANSFORM_ROUNDING * MATH(fabs)(y[i]));
     }
     back_substitute(mass, &shape, pivot, update);
     memcpy(start, u + M, sizeof(real) * M);
     do {
       for (int i = 0; i < M; i++)
-        u[M + i] = start[i] + scale * update[PLACE[i]];
+        u[M + i] = start[i] + scale * update[MASS_PLACE[i]];
       transform_and_slopes(t, u, parameters, value, mass);
       nearer = all_finite(value, M) ? largest_misfit(value, y) : (real)INFINITY;
       scale /= 2;

@@ -3,6 +3,7 @@
 
 #define STOPPED_SHRINKING REAL(0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
 #define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* what is left of positions that a force has stiffly settled */
+#define STALLS (SITES > M ? 2 : 1) /* in turn: with kept factors multipliers and positions settle one after the other */
 #define KEEP_CHANGE REAL(1e-2) /* factors are kept while updates are below this part of the state */
 #define KEEP_RATE REAL(0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
 
@@ -86,11 +87,11 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
     measure(moved, change, size_p);
 }
 
-/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
- * longer shrinking. A stiff force makes of the rounding of positions much more in the momenta: there positions alone
- * are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they must have done so
- * once, and twice to tell round-off from slow progress. */
-static int has_converged(const solver_options *options, const movement *moved, real last, int trials)
+/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and
+ * no longer shrinking (stalls). A stiff force makes of the rounding of positions much more in the momenta: there
+ * positions alone are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they
+ * must have done so once, and twice to tell round-off from slow progress. */
+static int has_converged(const solver_options *options, const movement *moved, int stalls, int trials)
 {
   if (trials < 2)
     return 0;
@@ -98,8 +99,7 @@ static int has_converged(const solver_options *options, const movement *moved, r
     return moved->absolute < options->tolerance;
   if (moved->relative <= options->tolerance)
     return 1;
-  return trials > 2 && moved->relative >= STOPPED_SHRINKING * last &&
-      (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
+  return trials > 2 && stalls >= STALLS && (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
 }
 
 /* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
@@ -142,7 +142,7 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
   const band shape = band_of(SITES, q1 ? B + 1 : B);
   real size_q[M], size_p[SITES], change[M], last = (real)INFINITY;
   movement moved = no_movement();
-  int trials = 0;
+  int trials = 0, stalls = 0;
   memset(increment, 0, sizeof(real) * M);
   for (int k = 0;; k++) {
     evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
@@ -158,7 +158,8 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
     if (k > 0) {
       measure(&moved, change, size_p);
       report->change = options->absolute ? moved.absolute : moved.relative;
-      if (has_converged(options, &moved, last, trials))
+      stalls = moved.relative >= STOPPED_SHRINKING * last ? stalls + 1 : 0;
+      if (has_converged(options, &moved, stalls, trials))
         return OK;
       last = moved.relative;
     }
@@ -169,7 +170,7 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
       return SINGULAR;
     moved = no_movement();
     apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
-    *keep = has_converged(options, &moved, last, trials) ||
+    *keep = has_converged(options, &moved, stalls + (moved.relative >= STOPPED_SHRINKING * last), trials) ||
         (moved.overall < KEEP_CHANGE && moved.relative < KEEP_RATE * last);
     report->iterations++;
   }

@@ -25,13 +25,14 @@ from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry
 from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import SWITCH, takes
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.collocation import SpectralCollocation
-from scvi_codegen.methods.method import Method, check_regular
-from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.methods.discretise import paper_equations
+from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import Block, PointFamily, StageSystem, Table
 from scvi_codegen.tables.precision import Number
 
@@ -124,6 +125,8 @@ class StepEquations:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
         yield f"{'H' if self.system.auxiliaries else 'L'} = {self.system.to_text()}"
+        for g in self.system.constraints:
+            yield f"0 = {format_expression(g)}"
         yield f"known: {', '.join(s.name for s in (*q, *p, self.time, self.step))}"
         yield f"unknown: {', '.join(s.name for s in self.unknowns)}"
 
@@ -165,8 +168,7 @@ def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = F
         radicals: replace table entries by radicals where they have a short form.
     """
     method = as_method(method, system)
-    check_regular(method, system)
-    stages = with_auxiliaries(system, method.paper_form(system))
+    stages = paper_equations(system, method)
     writer = _Writer(system, stages)
     equations = writer.equations()
     end_position, end_momentum = writer.end_state()
@@ -202,8 +204,9 @@ class _Writer:
         self.v = tuple(self._symbol(f"{name}_dot_k") for name in names)
         self.time = self._symbol(f"{system.time.name}_k")
         self.unknowns = [
-            tuple(self._symbol(f"{block.name}_{name}" if len(names) > 1 else block.name) for name in names)
+            tuple(self._symbol(f"{block.name}_{part}" if len(parts) > 1 else block.name) for part in parts)
             for block in stages.blocks
+            for parts in [names if block.size is None else range(1, block.size + 1)]
         ]
         self.values: dict[sympy.Symbol, Number] = {}
 
@@ -219,7 +222,7 @@ class _Writer:
         return tuple(
             Equation(row.number, row.kind, sympy.Add(*rows[r][i]))
             for r, row in enumerate(self.stages.rows)
-            for i in range(self.system.dimension)
+            for i in range(len(rows[r]))
         )
 
     def end_state(self) -> tuple[tuple[Equation, ...], tuple[Equation, ...]]:
@@ -238,15 +241,19 @@ class _Writer:
         for block, symbols in zip(self.stages.blocks, self.unknowns, strict=True):
             rest, moving = (_rational(x) for x in block.straight)
             for i, symbol in enumerate(symbols):
-                moved = moving * self.step ** (1 - block.power) * self.v[i]
-                guess[symbol] = rest * self.q[i] + moved + block.momentum * self.p[i]
+                still = block.size is not None
+                moved = 0 if still else moving * self.step ** (1 - block.power) * self.v[i]
+                guess[symbol] = sympy.S.Zero if still else rest * self.q[i] + moved + block.momentum * self.p[i]
         return guess
 
     def _rows(self) -> list[list[list[sympy.Expr]]]:
-        m = self.system.dimension
+        sizes = self.stages.row_sizes(self.system.dimension)
         momenta = [*(row.momentum for row in self.stages.rows), self.stages.end_momentum]
         powers = [*(row.power for row in self.stages.rows), 0]
-        rows: list[list[list[sympy.Expr]]] = [[[_rational(c) * self.p[i]] for i in range(m)] for c in momenta]
+        rows: list[list[list[sympy.Expr]]] = [
+            [[_rational(c) * self.p[i]] if c else [] for i in range(size)]
+            for c, size in zip(momenta, sizes, strict=True)
+        ]
         for family in self.stages.families:
             for n in range(len(family.abscissae)):
                 self._scatter(family, n, powers, rows)
@@ -280,12 +287,13 @@ class _Writer:
     def _gathered(self, table: Table, n: int, *, power: int, scale: sympy.Rational) -> tuple[sympy.Expr, ...]:
         columns: list[tuple[Block | None, tuple[sympy.Symbol, ...]]] = [(None, self.q)]
         columns += list(zip(self.stages.blocks, self.unknowns, strict=True))
-        sums: list[list[sympy.Expr]] = [[] for _ in self.q]
+        sums: list[list[sympy.Expr]] = []
         for b, (block, symbols) in enumerate(columns):
             coefficient = self._entry(table, n, b)
             if coefficient == 0:
                 continue
             factor = scale * coefficient * self.step ** (power + (block.power if block else 0))
+            sums = sums or [[] for _ in symbols]
             for i, symbol in enumerate(symbols):
                 sums[i].append(factor * symbol)
         return tuple(sympy.Add(*terms) for terms in sums)
@@ -297,6 +305,8 @@ class _Writer:
         """The symbol of an entry (``name/2``: half a named one), its value recorded; nameless are small integers."""
         if not name:
             return sympy.Integer(int(value))
+        if name.startswith("-"):
+            return -self._named(name[1:], -value)
         base, _, divisor = name.partition("/")
         symbol = self._symbol(base)
         self.values[symbol] = value * int(divisor or 1)

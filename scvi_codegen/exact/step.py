@@ -21,8 +21,8 @@ from scvi_codegen.exact.motion import Numbers, exact_motion, numbers
 from scvi_codegen.exact.newton import NotConvergedError, Solve, newton
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -262,10 +262,10 @@ def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
 @lru_cache(maxsize=64)
 def derived_step(system: MechanicalSystem, method: Method) -> DerivedStep:
     """The paper's equations of a method for a system, derived once a process."""
-    return DerivedStep(system, with_auxiliaries(system, method.paper_form(system)))
+    return DerivedStep(system, paper_equations(system, method))
 
 
 @lru_cache(maxsize=64)
 def compiled_equations(system: MechanicalSystem, method: Method) -> DerivedStep:
     """The same map in the unknowns of the compiled code."""
-    return DerivedStep(system, with_auxiliaries(system, method.stage_system(system)))
+    return DerivedStep(system, discretise(system, method))

@@ -106,7 +106,7 @@ def fitted(specification: Specification, system: MechanicalSystem | None) -> Spe
     wants = system is not None and system.constraints and specification.get("method") == "svi"
     if not wants or "quadrature" in specification or "degree" not in specification:
         return specification
-    return {**specification, "quadrature": f"gauss-lobatto:{int(specification['degree']) + 1}"}
+    return {**specification, "quadrature": f"gauss-lobatto:{int(str(specification['degree'])) + 1}"}
 
 
 def specification_of(name: str) -> dict[str, Any]:

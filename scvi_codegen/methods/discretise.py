@@ -8,7 +8,7 @@ from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["discretise"]
+__all__ = ["discretise", "paper_equations"]
 
 
 def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
@@ -20,3 +20,9 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
     stages = method.stage_system(system)
     check_regular(method, system)
     return with_constraints(system, with_auxiliaries(system, stages), method.name)
+
+
+def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
+    """The same equations as the paper prints them. Raises as :func:`discretise`."""
+    check_regular(method, system)
+    return with_constraints(system, with_auxiliaries(system, method.paper_form(system)), method.name)

@@ -15,6 +15,7 @@ from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["consistent", "constraint_values", "multipliers", "projected"]
 
+MOST_SHOWN = 4
 TYPED, NEAR = 1e-6, 1e-2
 """Relative distances: of numbers as people type them, moved without a word; beyond which a state is refused."""
 
@@ -102,9 +103,9 @@ def _call(
 
 def _refuse(stepper: Integrator, status: int, q: Array) -> None:
     hint = "; do constraints say the same there, or contradict each other?" if "singular" in STATUS[status] else ""
-    raise StateError(
-        f"the constraints {', '.join(stepper.constraints)} at q = {q} cannot be met ({STATUS[status]}{hint})"
-    )
+    shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
+    near = np.array2string(q, threshold=2 * MOST_SHOWN)
+    raise StateError(f"the constraints {shown} cannot be met near q = {near} ({STATUS[status]}{hint})")
 
 
 def _relative(change: Array, beside: Array) -> float:

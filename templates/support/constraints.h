@@ -1,7 +1,8 @@
 /* States on the constraints g(q, t) = 0, and the multipliers that keep them there. Before it: legendre.h, newton.h, the
  * kernels constraints and constrained_motion, and CONSTRAINT_ENTRY, the places of the slopes g_q. */
 
-#define MOST_PROJECTIONS 32
+#define MOST_PROJECTIONS 100
+#define SETTLED REAL(1e-6) /* of a state, what an update may still want that rounding does not let come nearer */
 
 /* Factors of the matrix [L_vv, g_q^T; g_q, 0] of a state, and room for a right-hand side. */
 typedef struct {
@@ -89,52 +90,85 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
   return OK;
 }
 
-/* The nearest q, by steps of Gauss and Newton in the metric of the masses; then p less what would leave the tangent
- * space. An update that does not shrink any more is rounding. */
-int NAME(project)(real t, const real *q0, const real *p0, const real *parameters, real *q1, real *p1, real *workspace)
+/* The sum of squares of g; infinity where it is not finite. */
+static real misfit(real t, const real *q, const real *parameters, real *g)
 {
-  const saddle at = saddle_in(workspace);
-  real q[M], p[M], u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], last = (real)INFINITY;
-  real slope[CONSTRAINT_ENTRIES];
-  int status = NAME(velocity)(t, q0, p0, parameters, u + M, workspace), k = 0;
-  memcpy(q, q0, sizeof q);
-  memcpy(p, p0, sizeof p);
-  for (; status == OK && last > 0; k++) {
-    real size;
-    memcpy(u, q, sizeof q);
-    status = factorise_saddle(t, u, parameters, &at, g);
+  real slope[CONSTRAINT_ENTRIES], sum = 0;
+  constraints(q, t, parameters, g, slope);
+  for (int k = 0; k < CONSTRAINTS; k++)
+    sum += g[k] * g[k];
+  return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
+}
+
+/* q moved to g = 0 by steps of Gauss and Newton in the metric of the masses at u = (q, v), halved while they do not
+ * lead nearer, until rounding moves it no nearer. */
+static int project_position(real t, real *u, const real *parameters, const saddle *at)
+{
+  real g[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
+  real left = misfit(t, u, parameters, g);
+  memcpy(nearest, u, sizeof nearest);
+  for (int k = 0; k < MOST_PROJECTIONS; k++) {
+    const int status = factorise_saddle(t, u, parameters, at, g);
+    real scale = 1, size, now;
     if (status != OK)
       return status;
     for (int j = 0; j < CONSTRAINTS; j++)
       g[j] = -g[j];
-    solve_saddle(&at, NULL, g, update, y);
+    solve_saddle(at, NULL, g, update, y);
     size = largest_of(update);
     if (!(0 * size == 0))
-      return NOT_FINITE;
-    if (!(size < last) && last <= REAL(1e-8) * largest_of(q))
-      break;
-    if (k >= MOST_PROJECTIONS)
-      return NOT_CONVERGED;
-    for (int i = 0; i < M; i++)
-      q[i] += update[i];
-    last = size;
+      return SINGULAR;
+    do {
+      for (int i = 0; i < M; i++)
+        u[i] = nearest[i] + scale * update[i];
+      now = misfit(t, u, parameters, g);
+      scale /= 2;
+    } while (!(now < left) && scale * size > REAL_EPSILON * largest_of(nearest));
+    if (!(now < left)) {
+      memcpy(u, nearest, sizeof nearest);
+      return size <= SETTLED * largest_of(nearest) ? OK : NOT_CONVERGED;
+    }
+    left = now;
+    memcpy(nearest, u, sizeof nearest);
   }
-  for (int twice = 0; status == OK && twice < 3; twice++) { /* once where the kinetic energy is quadratic; rounding */
-    status = constrained(t, q, p, parameters, u, g, rate, workspace);
+  return NOT_CONVERGED;
+}
+
+/* p less what leaves the tangent space; twice, for rounding and kinetic energies that are not quadratic. */
+static int project_momentum(real t, const real *q, real *p, const real *parameters, const saddle *at, real *workspace)
+{
+  real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], slope[CONSTRAINT_ENTRIES];
+  for (int k = 0; k < 3; k++) {
+    int status = constrained(t, q, p, parameters, u, g, rate, workspace);
     if (status == OK)
-      status = factorise_saddle(t, u, parameters, &at, g);
+      status = factorise_saddle(t, u, parameters, at, g);
     if (status != OK)
       return status;
     for (int j = 0; j < CONSTRAINTS; j++)
       rate[j] = -rate[j];
-    solve_saddle(&at, NULL, rate, update, y);
+    solve_saddle(at, NULL, rate, update, y);
     constraints(u, t, parameters, g, slope);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
       p[CONSTRAINT_ENTRY[e][1]] -= slope[e] * y[CONSTRAINT_ENTRY[e][0]];
   }
+  return all_finite(p, M) ? OK : NOT_FINITE;
+}
+
+/* The nearest state that meets the constraints. */
+int NAME(project)(real t, const real *q0, const real *p0, const real *parameters, real *q1, real *p1, real *workspace)
+{
+  const saddle at = saddle_in(workspace);
+  real u[2 * M], p[M];
+  int status = NAME(velocity)(t, q0, p0, parameters, u + M, workspace);
+  memcpy(u, q0, sizeof(real) * M);
+  memcpy(p, p0, sizeof p);
+  if (status == OK)
+    status = project_position(t, u, parameters, &at);
+  if (status == OK)
+    status = project_momentum(t, u, p, parameters, &at, workspace);
   if (status != OK)
     return status;
-  memcpy(q1, q, sizeof q);
+  memcpy(q1, u, sizeof(real) * M);
   memcpy(p1, p, sizeof p);
   return OK;
 }

@@ -87,10 +87,10 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
     measure(moved, change, size_p);
 }
 
-/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and no
- * longer shrinking (stalls). A stiff force makes of the rounding of positions much more in the momenta: there positions
- * alone are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they must have done so
- * once, and twice to tell round-off from slow progress. */
+/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and
+ * no longer shrinking (stalls). A stiff force makes of the rounding of positions much more in the momenta: there
+ * positions alone are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they
+ * must have done so once, and twice to tell round-off from slow progress. */
 static int has_converged(const solver_options *options, const movement *moved, int stalls, int trials)
 {
   if (trials < 2)

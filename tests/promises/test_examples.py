@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.optimize import brentq
 
 from scvi_codegen.cli import main
 from scvi_codegen.models.model_file import load_model
@@ -20,6 +21,7 @@ SCRIPTS = (
     "collisions_in_space",
     "curves_and_quadratures",
     "eccentric_comet",
+    "hanging_chain",
     "custom_sympy_system",
     "import_generated_stepper",
     "inspect_derivation",
@@ -155,3 +157,14 @@ def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} == {
         f"section_{name}.png" for name in ("regular", "mixed", "chaotic")
     }
+
+
+def test_hanging_chain_comes_to_rest_as_a_catenary(tmp_path):
+    output = output_of("hanging_chain", tmp_path)
+    assert float(re.search(r"off their length by (\S+)", output)[1]) < 1e-16
+    a = brentq(lambda a: 2.0 * a * np.sinh(0.5 / a) - 1.2, 0.1, 10.0)
+    sag, tension = (float(re.search(rf"{what} (\S+?),", output)[1]) for what in ("sag", "tension"))
+    assert sag == pytest.approx(a * (np.cosh(0.5 / a) - 1.0), abs=2e-4)
+    assert tension == pytest.approx(9.81 * a / 1.2, rel=1e-3)
+    carried, weight = re.search(r"carry (\S+) of the weight (\S+)", output).groups()
+    assert float(carried) == pytest.approx(float(weight), abs=1e-5)

@@ -93,8 +93,8 @@ def _is_transposed(table: Table) -> bool:
 
 
 def _parts(name: str, points: int, *, transposed: bool) -> tuple[str, int | None, int]:
-    """Prefix, index of the column (``None`` without one), divisor of a name such as ``DD_1_0`` or ``D_1_0/2``."""
-    base, _, divisor = name.partition("/")
+    """Prefix, index of the column (``None`` without one), divisor of a name: ``DD_1_0``, ``D_1_0/2``, ``-D_1_0``."""
+    base, _, divisor = name.removeprefix("-").partition("/")
     prefix, *indices = base.split("_")
     index = int(indices[0 if transposed else -1]) if len(indices) == 2 or points == 1 else None
-    return prefix, index, int(divisor or 1)
+    return prefix, index, (-1 if name.startswith("-") else 1) * int(divisor or 1)

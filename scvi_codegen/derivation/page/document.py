@@ -20,8 +20,8 @@ from scvi_codegen.derivation.page.stage_equations import (
 from scvi_codegen.display.page.blocks import Section
 from scvi_codegen.display.page.environment import page_template, style_sheet
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.method import Method, check_regular
-from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.rendering.outline import functions_of
 from scvi_codegen.rendering.text import render
 from scvi_codegen.version import __version__
@@ -58,7 +58,7 @@ def derivation_html(
 def _sections(system: MechanicalSystem, method: Method, solver: str, start: Start | None) -> Iterator[Section]:
     program = program_of(system, method, solver=solver, prefix=c_identifier(system.name))
     functions = functions_of(render(program).amalgamated().code)
-    stages = with_auxiliaries(system, method.paper_form(system))
+    stages = paper_equations(system, method)
     derived = written_out(system, method, stages)
     yield system_section(system)
     yield motion_section(system)

@@ -10,6 +10,7 @@ from sympy import Symbol
 from scvi_codegen.derivation.page.elision import formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.mechanics.constraints import with_reactions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -31,6 +32,11 @@ def system_section(system: MechanicalSystem) -> Section:
         contents += [
             Paragraph("Forces act beside it; where L_q stands below, L_q + f is meant:"),
             *formulas(acting, "force"),
+        ]
+    if system.constraints:
+        contents += [
+            Paragraph("Constraints hold; their multipliers lambda act beside L_q as the forces g_q^T lambda:"),
+            *formulas([Formula(g, Symbol(f"g_{k}")) for k, g in enumerate(system.constraints, 1)], "constraint"),
         ]
     if system.parameters:
         rows = tuple((symbol, value) for symbol, value in system.constants.items())
@@ -56,7 +62,8 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
         "The Euler-Lagrange equations (2), d/dt dL/dv - dL/dq = 0, by the chain rule. They are linear in the "
         "accelerations; neither the derivation nor the C solves for these."
     )
-    yield from formulas([Formula(value, sympy.S.Zero, "2") for value in forms_of(system).euler_lagrange], "equation")
+    motion = [-f for f in with_reactions(system, [-residual for residual in forms_of(system).euler_lagrange])]
+    yield from formulas([Formula(value, sympy.S.Zero, "2") for value in motion], "equation")
 
 
 def _hamilton(system: MechanicalSystem) -> Iterator[Content]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sympy import Symbol
 
 from scvi_codegen.lowering.families import argument_name
+from scvi_codegen.mechanics.constraints import constraint_rates
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter
@@ -36,6 +37,8 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Sym
 
 def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
     """What a scatter takes from the kernel at a point; of a scalar's gradient, scatters are parallel to gathers."""
+    if system.constraints and scatter.results in (system.constraints, constraint_rates(system)):
+        return Symbol(f"{'g' if scatter.results == system.constraints else 'g_dot'}_{place}")
     if family.scalar is None:
         forms = forms_of(system)
         known = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}

@@ -1,0 +1,89 @@
+"""The C text of constrained systems: without a warning, in style, the same in 60 digits, alone with its own main."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from style import check_style
+
+from scvi_codegen import (
+    SVI,
+    LagrangianSystem,
+    Model,
+    compile_stepper,
+    derive,
+    generate_package,
+    generate_source,
+    load_package,
+)
+from scvi_codegen.exact.step import compiled_equations, derived_step
+from scvi_codegen.models.model_file import dump_model, parse_model
+
+STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
+LINKAGE = LagrangianSystem.from_text(
+    name="four-bar linkage",
+    coordinates=["x1", "y1", "x2", "y2"],
+    lagrangian="m*(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2 + x1_dot*x2_dot/2)/2 - m*g*(y1 + y2)",
+    parameters={"m": 1.0, "g": 9.81, "a": 1.0, "b": 2.0, "c": 1.5, "d": 2.0},
+    constraints=["x1**2 + y1**2 = a**2", "(x2 - x1)**2 + (y2 - y1)**2 = b**2", "(x2 - d)**2 + y2**2 = c**2"],
+    forces={"x2": "-0.1*x2_dot + sin(t)"},
+)
+NEAR = [0.0, 1.0, 1.94, 1.5]
+
+
+def lobatto(s):
+    return SVI(s, f"gauss-lobatto:{s + 1}")
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_compiles_without_a_warning(compiler, tmp_path):
+    for controlled in (False, True):
+        source = generate_source(LINKAGE, lobatto(3), controlled=controlled, amalgamate=True)[0]
+        (tmp_path / f"{source.prefix}.h").write_text(source.header)
+        (tmp_path / "all.c").write_text(source.code)
+        check_style(source.code)
+        found = subprocess.run([compiler, *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True)
+        assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.parametrize("s", [1, 2, 3])
+def test_steps_are_those_of_the_equations_in_60_digits(s):
+    stepper = compile_stepper(LINKAGE, lobatto(s))
+    q, p = stepper.project(NEAR)
+    q, p = stepper.integrate(q, p, h=0.02, steps=7).q[-1], stepper.integrate(q, p, h=0.02, steps=7).p[-1]
+    found = stepper.step(q, p, 0.05, 0.3)
+    for equations in (derived_step(LINKAGE, lobatto(s)), compiled_equations(LINKAGE, lobatto(s))):
+        exact = equations(q, p, 0.05, 0.3)
+        assert_allclose(found[0], np.array(exact.q, dtype=float), atol=4e-16)
+        assert_allclose(found[1], np.array(exact.p, dtype=float), atol=4e-15)
+
+
+def test_derivation_shows_multipliers():
+    derived = derive(LINKAGE, lobatto(1))
+    names = [symbol.name for symbol in derived.unknowns]
+    assert names[-6:] == [f"lambda_{n}_{k}" for n in (0, 1) for k in (1, 2, 3)]
+    text = derived.to_text()
+    assert "0 = -a**2 + x1**2 + y1**2" in text
+    assert sum(line.startswith("  (hidden)") for line in text.splitlines()) == 3
+
+
+def test_model_files_choose_points_that_fit():
+    stepper = compile_stepper(LINKAGE, "svi:3")
+    q, _ = stepper.project(NEAR)
+    model = Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
+    assert model.method == lobatto(3)
+    assert parse_model(dump_model(model)) == model
+    text = dump_model(model).partition("[method]")[0]
+    assert parse_model(f"{text}\n[run]\nspan = 1.0\n").method == lobatto(6)
+
+
+def test_packages_run_alone(tmp_path):
+    stepper = compile_stepper(LINKAGE, "svi:3")
+    q, _ = stepper.project(NEAR)
+    model = Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
+    generate_package(model, tmp_path / "linkage")
+    loaded = load_package(tmp_path / "linkage")
+    one, other = (each.integrate(q, np.zeros(4), h=0.01, steps=20) for each in (stepper, loaded))
+    assert np.abs(one.q - other.q).max() < 1e-14
+    assert np.abs(other.multipliers() - one.multipliers()).max() < 1e-10
