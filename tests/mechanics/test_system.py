@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
-from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
