@@ -132,7 +132,7 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
         degree = len(shape.blocks) - 1
         highest = tuple((4 * degree - 2) * x for x in legendre_functional(shape.blocks, degree))
         highest += (mp.zero,) * (count - len(highest))
-        bends = [(0, degree), (0, count // 2)]
+        bends = [(0, degree), (0, (degree + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
         power = 2 * degree
     elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):

@@ -3,7 +3,7 @@
 
 #define STOPPED_SHRINKING REAL(0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
 #define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* what is left of positions that a force has stiffly settled */
-#define STALLS (SITES > M ? 2 : 1) /* in turn: with kept factors multipliers and positions settle one after the other */
+#define STALLS (SITES > M ? 2 : 1) /* with kept factors positions and multipliers settle one after the other */
 #define KEEP_CHANGE REAL(1e-2) /* factors are kept while updates are below this part of the state */
 #define KEEP_RATE REAL(0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
 
@@ -87,10 +87,17 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
     measure(moved, change, size_p);
 }
 
-/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or at round-off level and
- * no longer shrinking (stalls). A stiff force makes of the rounding of positions much more in the momenta: there
- * positions alone are at round-off, and momenta are known no better. Kept factors shrink updates only so fast: they
- * must have done so once, and twice to tell round-off from slow progress. */
+/* Whether an update at round-off level shrinks no longer. A stiff force makes of the rounding of positions much more in
+ * the momenta: there positions alone are at round-off, and momenta are known no better. */
+static int has_stalled(const movement *moved, real last)
+{
+  return moved->relative >= STOPPED_SHRINKING * last &&
+      (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
+}
+
+/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or has stalled at round-off
+ * level. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off from slow
+ * progress. */
 static int has_converged(const solver_options *options, const movement *moved, int stalls, int trials)
 {
   if (trials < 2)
@@ -99,7 +106,7 @@ static int has_converged(const solver_options *options, const movement *moved, i
     return moved->absolute < options->tolerance;
   if (moved->relative <= options->tolerance)
     return 1;
-  return trials > 2 && stalls >= STALLS && (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
+  return trials > 2 && stalls >= STALLS;
 }
 
 /* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
@@ -158,7 +165,7 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
     if (k > 0) {
       measure(&moved, change, size_p);
       report->change = options->absolute ? moved.absolute : moved.relative;
-      stalls = moved.relative >= STOPPED_SHRINKING * last ? stalls + 1 : 0;
+      stalls += has_stalled(&moved, last);
       if (has_converged(options, &moved, stalls, trials))
         return OK;
       last = moved.relative;
@@ -170,7 +177,7 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
       return SINGULAR;
     moved = no_movement();
     apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
-    *keep = has_converged(options, &moved, stalls + (moved.relative >= STOPPED_SHRINKING * last), trials) ||
+    *keep = has_converged(options, &moved, stalls + has_stalled(&moved, last), trials) ||
         (moved.overall < KEEP_CHANGE && moved.relative < KEEP_RATE * last);
     report->iterations++;
   }

@@ -66,7 +66,7 @@ ROUNDOFF = (
     (
         "carry subtracted from momenta",
         "kepler/composition",
-        "solve",
+        "drift",
         r"\(step->carry_p\[i\] \+",
         "(-step->carry_p[i] +",
     ),
@@ -294,10 +294,10 @@ MUTATIONS = (
         lambda original: lambda a, b: original(a, b) if len(a) == 1 else a,
     ),
     here(
-        "A for A^2 in the multipliers",
+        "the curve of the points 1e-8 off",
         case("double/scvi"),
         shooting_stages,
-        "cardinal_integrals",
+        "matrix_product",
         of_entries(lambda x: x * (1 + mp.mpf("1e-8"))),
     ),
     function(

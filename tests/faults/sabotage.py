@@ -108,10 +108,10 @@ def _sabotaged(apply: Callable[[Sabotage], None] | None) -> Iterator[Sabotage]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "remembered_text", lambda *arguments: arguments[-1]())
         sabotage = Sabotage(patch)
-        if apply is not None:
-            apply(sabotage)
-            _empty_caches()
         try:
+            if apply is not None:
+                apply(sabotage)
+                _empty_caches()
             yield sabotage
         finally:
             patch.undo()

@@ -43,13 +43,20 @@ def sanitizer_library(name: str) -> str:
     return path
 
 
+def files_named(*names: str) -> list[str]:
+    """The test files of these names, wherever they stand."""
+    found = [sorted((ROOT / "tests").glob(f"*/test_{name}.py")) for name in names]
+    assert all(found)
+    return [str(path.relative_to(ROOT)) for paths in found for path in paths]
+
+
 @pytest.mark.full
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="flags of x86-64")
 @pytest.mark.parametrize("level", ["x86-64", "x86-64-v3"])
 def test_steppers_work_on_lesser_processors(tmp_path, level):
     if level == "x86-64-v3" and "avx2" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2")
-    files = [f"tests/*/test_{name}.py" for name in ("stepper", "ensemble", "identities", "structure")]
+    files = files_named("stepper", "ensemble", "identities", "structure", "constraints")
     run_stepper_tests(tmp_path, f"-march={level}", *files)
 
 
@@ -58,7 +65,7 @@ def test_steppers_work_on_lesser_processors(tmp_path, level):
 def test_sanitizers_find_nothing(tmp_path):
     libraries = " ".join(map(sanitizer_library, ("libasan.so", "libubsan.so")))
     options = "detect_leaks=0:allocator_may_return_null=1"  # the interpreter keeps what it has; too much is refused
-    files = ("tests/test_stepper.py", "tests/test_fuzz_steppers.py")
+    files = files_named("stepper", "fuzz_steppers", "constraints")
     run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
 
 

@@ -164,7 +164,7 @@ print("ready", flush=True)
 sys.stdin.readline()
 entry = sc.problem(sys.argv[1])
 stepper = sc.compile_stepper(entry.system, sc.SVI(3))
-run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.1, steps=100)
+run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.002, steps=100)
 print(run.q[-1].tobytes().hex(), run.p[-1].tobytes().hex())
 """
 

@@ -375,6 +375,7 @@ static int check_PREFIX(void)
   return status;
 }
 """
+TO_MOMENTA = "status |= PREFIX_momentum(0.1, q, v, parameters, p, workspace);"
 LEGENDRE = """status |= PREFIX_discrete_legendre(0.1, 0.05, q, q1, parameters, NULL, p, p1, e, NULL, workspace);"""
 
 
@@ -387,10 +388,12 @@ MAPS = """double maps[kept * COUNT], sizes[kept * COUNT];
 
 def driver(interfaces: Sequence[Interface]) -> str:
     """A C program that calls everything each integrator exports."""
-    text = "#include <stdlib.h>\n" + "".join(f'#include "{i.prefix}.h"\n' for i in interfaces)
+    text = "#include <stdlib.h>\n#include <string.h>\n" + "".join(f'#include "{i.prefix}.h"\n' for i in interfaces)
     for i in interfaces:
         body = DRIVER.replace("LEGENDRE", LEGENDRE if i.has_action else "")
         body = body.replace("MAPS", MAPS.replace("COUNT", str(len(i.map_names))) if i.map_names else "")
+        if i.system == "hyperbolic":  # velocities say nothing of momenta
+            body = body.replace(TO_MOMENTA, "memcpy(p, v, sizeof(double) * m);")
         values = ", ".join(map(repr, i.defaults)) or "0.0"
         text += body.replace("PREFIX", i.prefix).replace("CAPITALS", i.prefix.upper()).replace("DEFAULTS", values)
     calls = " + ".join(f"check_{i.prefix}()" for i in interfaces)

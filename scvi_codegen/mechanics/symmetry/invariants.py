@@ -270,7 +270,7 @@ def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[
         return None
     if not all(values.all() for _, values in factors):
         return None
-    logs = [np.ones(len(entries)), *(np.log(np.abs(values)) for _, values in factors)]
+    logs = [np.ones(len(entries)), *(np.zeros(len(entries)) + np.log(np.abs(values)) for _, values in factors)]
     solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]
     halves = np.rint(2.0 * solution[1:])
     if np.abs(halves).max(initial=0.0) > 2 * HIGHEST_POWER:
