@@ -185,7 +185,13 @@ MUTATIONS = (
         "value[0] = 1.001*",
         within="quadrature_value",
     ),
-    text("half of the discrete action", case("pendulum/svi"), r"sum \+= ", "sum += 0.5 * ", within="quadrature_sum"),
+    text(
+        "half of the discrete action",
+        case("pendulum/svi"),
+        r"own\[k\] \+= ",
+        "own[k] += 0.5 * ",
+        within="add_quadrature_sums",
+    ),
     text(
         "momenta of a run advanced by dq",
         case("kepler/svi-3"),
