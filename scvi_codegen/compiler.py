@@ -262,6 +262,7 @@ def describe(
         monitor="" if monitor is None else str(monitor),
         exchange_names=program.exchanges,
         constraints=program.constraints.formulas if program.constraints else (),
+        inputs=system.inputs,
         energy_parameter=system.clock.energy.name if system.clock else "",
     )
 

@@ -11,11 +11,12 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate, generalised_forces
+from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -75,6 +76,7 @@ class LagrangianSystem(MechanicalSystem):
         forces=MAPPING,
         dissipation=TEXT,
         constraints=TEXTS,
+        inputs=NAMES,
     )
     def from_text(
         cls,
@@ -86,6 +88,7 @@ class LagrangianSystem(MechanicalSystem):
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
         constraints: Sequence[str] = (),
+        inputs: Sequence[str] = (),
     ) -> LagrangianSystem:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -98,6 +101,8 @@ class LagrangianSystem(MechanicalSystem):
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
             constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``
                 (:mod:`scvi_codegen.mechanics.constraints`).
+            inputs: names of functions of time that are given as data with each run
+                (:mod:`scvi_codegen.mechanics.inputs`).
 
         >>> oscillator = LagrangianSystem.from_text(
         ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",
@@ -105,20 +110,27 @@ class LagrangianSystem(MechanicalSystem):
         >>> oscillator.lagrangian, oscillator.forces
         (-k*x**2/2 + m*x_dot**2/2, (-c*x_dot + cos(t),))
         """
-        values = dict(parameters or {})
-        check_names(coordinates, tuple(values))
+        values = {**(parameters or {}), **input_parameters(inputs)}
+        check_names(coordinates, (*values, *inputs))
         velocities = [coordinate + DOT for coordinate in coordinates]
-        symbols = {symbol_name: symbol(symbol_name) for symbol_name in [*coordinates, *velocities, TIME, *values]}
+        names = [*coordinates, *velocities, TIME, *values, *inputs]
+        symbols = {symbol_name: symbol(symbol_name) for symbol_name in names}
         variables = tuple(symbols[coordinate] for coordinate in coordinates)
+        driven = input_formulas(inputs, symbols[TIME])
+
+        def read(text: str) -> Expr:
+            return parse_expression(text, symbols).xreplace(driven)
+
         return cls(
             name=name,
             coordinates=variables,
             time=symbols[TIME],
             parameters=tuple(symbols[parameter] for parameter in values),
             defaults=tuple(number(parameter, value) for parameter, value in values.items()),
-            lagrangian=parse_expression(lagrangian, symbols),
-            forces=_forces(variables, forces, dissipation, lambda text: parse_expression(text, symbols)),
-            constraints=constraints_of(constraints, lambda text: parse_expression(text, symbols)),
+            lagrangian=read(lagrangian),
+            forces=_forces(variables, forces, dissipation, read),
+            constraints=constraints_of(constraints, read),
+            inputs=tuple(inputs),
         )
 
     @classmethod
@@ -134,6 +146,7 @@ class LagrangianSystem(MechanicalSystem):
         forces: Mapping[Expr | str, Expr] | None = None,
         dissipation: Expr | None = None,
         constraints: Sequence[Expr] = (),
+        inputs: Sequence[Symbol | str] = (),
     ) -> LagrangianSystem:
         """Take L from a SymPy expression, in plain symbols or in functions of time.
 
@@ -151,31 +164,39 @@ class LagrangianSystem(MechanicalSystem):
             forces: expression by coordinate, as the coordinate is given or by its name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
             constraints: expressions in coordinates and time that stay 0.
+            inputs: symbols of functions of time that are given as data with each run.
         """
         if not isinstance(lagrangian, Expr):
             raise SystemDefinitionError(
                 f"the Lagrangian is a {type(lagrangian).__name__}, not a SymPy expression (text goes to from_text)"
             )
-        given = named_parameters(parameters)
+        own = tuple(given_name(each) for each in inputs)
+        given = named_parameters(parameters) | input_parameters(own)
         bound = tuple(sympy.sympify(g) for g in constraints)
         beside = (*(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0)), *bound)
         translation = Translation(
             lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given)
         )
+        driven = input_formulas(own, symbol(TIME))
+
+        def read(given: Any, what: str = "Lagrangian") -> Expr:
+            return translation.apply(sympy.sympify(given), what).xreplace(driven)
+
         return cls(
             name=name,
             coordinates=translation.coordinates,
             time=symbol(TIME),
             parameters=translation.parameters,
             defaults=tuple(number(parameter, value) for parameter, value in given.items()),
-            lagrangian=translation.apply(lagrangian),
+            lagrangian=read(lagrangian),
             forces=_forces(
                 translation.coordinates,
                 {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
                 dissipation,
-                lambda given: translation.apply(sympy.sympify(given), "forces"),
+                lambda given: read(given, "forces"),
             ),
-            constraints=constraints_of(bound, lambda given: translation.apply(given, "constraints")),
+            constraints=constraints_of(bound, lambda given: read(given, "constraints")),
+            inputs=own,
         )
 
     @classmethod

@@ -71,6 +71,7 @@ class MechanicalSystem(ABC):
         clock: how time runs, if not evenly.
         forces: m forces beside those of the function (:mod:`scvi_codegen.mechanics.forces`), in (q, v, t) of a
             Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
+        inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.mechanics.inputs`).
         constraints: what a Lagrangian's motion keeps at 0, in (q, t) (:mod:`scvi_codegen.mechanics.constraints`).
     """
 
@@ -82,6 +83,7 @@ class MechanicalSystem(ABC):
     clock: Clock | None = None
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
+    inputs: tuple[str, ...] = ()
 
     @property
     @abstractmethod
@@ -146,7 +148,7 @@ class MechanicalSystem(ABC):
             repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
             sympy.srepr(self.clock.rate) if self.clock else "",
             *map(sympy.srepr, (*self.forces, *self.constraints)),
-            str(len(self.constraints)),
+            repr((len(self.constraints), self.inputs)),
         )
 
     def to_text(self) -> str:

@@ -113,6 +113,7 @@ class Interface:
         momentum_names: of a Hamiltonian; see :attr:`momenta`.
         exchange_names: of what forces give in a step, energy and momentum maps; none without forces.
         constraints: formulas of what the motion keeps at 0.
+        inputs: names of functions of time given as data, each five of the parameters.
         energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
         monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
     """
@@ -137,6 +138,7 @@ class Interface:
     monitor: str = ""
     exchange_names: tuple[str, ...] = ()
     constraints: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -11,7 +12,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector
+from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["Memory"]
@@ -114,6 +115,35 @@ class Memory:
     def t(self) -> float:
         """Time, as carried along: the sum of all steps, rounded."""
         return _time(self._memory)
+
+    def change(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
+        """Go on with other parameters, another step, another goal; what is not given stays.
+
+        Args:
+            parameters: by name, others staying what they are; or all in order.
+        """
+        interface = self.stepper.interface
+        if isinstance(parameters, Mapping):
+            values = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
+            parameters = {**values, **parameters}
+        if parameters is not None:
+            self._parameters = checked_parameters(interface, parameters)
+        if h is not None and checked_step(h) != self._memory.h:
+            self._memory.h, self._memory.guess = h, 0
+        if goal is not None:
+            self.goal = goal
+
+    def hold(self, **inputs: float) -> None:
+        """Go on with inputs held at numbers: between the samples of a controller.
+
+        >>> run.hold(u=-1.5); run.skip(10)  # doctest: +SKIP
+        """
+        names = self.stepper.interface.inputs
+        for name, value in inputs.items():
+            if name not in names:
+                raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
+            first = parameter_index(self.stepper.interface, f"{name}_0")
+            self._parameters[first : first + 5] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
 
     @property
     def steps(self) -> int:

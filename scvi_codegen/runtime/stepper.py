@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import FUNCTION, takes
+from scvi_codegen.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.dense_output import times_of_run
+from scvi_codegen.runtime.driven import DrivenTrajectory, checked_inputs, drive, end_of, parameters_of
 from scvi_codegen.runtime.ensemble import consistent_ensemble, integrate_ensemble, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
@@ -230,6 +231,56 @@ class Stepper(Integrator):
         if tolerance is not None:
             raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
         return Run.started(self, q, p, h=h, t=t, parameters=parameters, options=options)
+
+    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
+    def drive(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        inputs: Mapping[str, Any],
+        velocity: ArrayLike | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        events: EventLike | Sequence[EventLike] | None = None,
+    ) -> DrivenTrajectory:
+        """Run a system whose inputs are data: steps end at their breakpoints, so that the order is kept.
+
+        Args:
+            inputs: by name ``(t, values)``, linear between them; ``(t, values, kind)`` with ``"constant"`` (each value
+                from its time on), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or ``PPoly`` of
+                degree 3 at most.
+            h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
+            steps, t_end: with h one of both; without it ``t_end``.
+            q, p, velocity, tolerance, every, t, parameters, options, progress, events: as of :meth:`integrate`.
+
+        Raises:
+            StateError: for inputs that are not given for all of the run, or make no function of time.
+            StepFailedError: if a step fails; its ``trajectory`` holds the states of that piece before.
+        """
+        stepper = self if events is None else self.with_events(events)
+        data = checked_inputs(self, inputs)
+        end = end_of(t, h, steps, t_end)
+        values = parameters_of(self, parameters, data)
+        run = stepper.start(
+            q,
+            p,
+            velocity=velocity,
+            h=h,
+            t=t,
+            t_end=end if h is None else None,
+            tolerance=tolerance,
+            parameters=values(t),
+            options=options,
+        )
+        return drive(run, data, end, every=checked_count(every, "every", least=1), values=values, progress=progress)
 
     def project(
         self,

@@ -18,6 +18,7 @@ from scvi_codegen.models.model_file import load_model
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
+    "balanced_cart_pole",
     "collisions_in_space",
     "curves_and_quadratures",
     "eccentric_comet",
@@ -168,3 +169,13 @@ def test_hanging_chain_comes_to_rest_as_a_catenary(tmp_path):
     assert tension == pytest.approx(9.81 * a / 1.2, rel=1e-3)
     carried, weight = re.search(r"carry (\S+) of the weight (\S+)", output).groups()
     assert float(carried) == pytest.approx(float(weight), abs=1e-5)
+
+
+def test_a_cart_balances_its_pole(tmp_path):
+    output = output_of("balanced_cart_pole", tmp_path)
+    assert float(re.search(r"formula to (\S+)", output)[1]) < 1e-9
+    first, later, last = re.search(r"tilt (\S+) at first, (\S+) after 2 s, (\S+) after", output).groups()
+    assert float(first) > 0.3
+    assert float(later) < 0.05
+    assert float(last) < 1e-3
+    assert float(re.search(r"ends (\S+) away", output)[1]) < 1e-12

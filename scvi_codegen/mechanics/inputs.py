@@ -1,0 +1,39 @@
+"""Inputs: functions of time that are data, such as the force of a motor or a measured ground motion.
+
+Between two breakpoints an input u is a cubic of the time since the first of them,
+
+    u(t) = u_0 + u_1 s + u_2 s^2 + u_3 s^3,        s = t - u_t,
+
+with five parameters of the system. A run changes them at the breakpoints, where it ends a step: nothing is compiled
+anew for other data, every method and solver takes them, and steps never see a kink, so that orders are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sympy import Expr, Symbol
+
+from scvi_codegen.formulas.symbols import check_name, symbol
+
+__all__ = ["PARTS", "input_formulas", "input_parameters"]
+
+PARTS = ("0", "1", "2", "3", "t")
+"""Of an input: coefficients by power, and the breakpoint that they count from."""
+
+
+def input_parameters(inputs: Sequence[str]) -> dict[str, float]:
+    """The parameters of all inputs, each of which is 0 until it is given."""
+    for name in inputs:
+        check_name(name)
+    return {f"{name}_{part}": 0.0 for name in inputs for part in PARTS}
+
+
+def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]:
+    """What stands for each input in formulas, by its own symbol."""
+    found: dict[Symbol, Expr] = {}
+    for name in inputs:
+        c0, c1, c2, c3, start = (symbol(f"{name}_{part}") for part in PARTS)
+        s = time - start
+        found[symbol(name)] = c0 + s * (c1 + s * (c2 + s * c3))
+    return found

@@ -1,0 +1,156 @@
+"""Inputs given as data: exact where the motion is, in order between breakpoints, held by a sampled controller."""
+
+import time
+
+import numpy as np
+import pytest
+import sympy
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+from scipy.interpolate import Akima1DInterpolator, CubicSpline
+
+from scvi_codegen import (
+    SVI,
+    Gauss,
+    LagrangianSystem,
+    StateError,
+    StoermerVerlet,
+    SystemDefinitionError,
+    compile_stepper,
+)
+
+KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
+VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """Pushed by u, its hook shaken by w."""
+    return LagrangianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + (1 + w)*cos(q)",
+        parameters={"c": 0.2},
+        forces={"q": "u - c*q_dot"},
+        inputs=["u", "w"],
+    )
+
+
+def reference(u, w, t_end):
+    """By DOP853, piece by piece."""
+    state, ends = [0.3, 0.1], [*KNOTS[(KNOTS > 0.0) & (t_end > KNOTS)], t_end]
+    for start, end in zip([0.0, *ends], ends, strict=False):
+        inner = (start + end) / 2
+
+        def motion(t, y, inner=inner):
+            return [y[1], u(t, inner) - 0.2 * y[1] - (1 + w(t, inner)) * np.sin(y[0])]
+
+        state = solve_ivp(motion, (start, end), state, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    return state
+
+
+def held(t, inner):
+    return VALUES[np.searchsorted(KNOTS, inner, side="right") - 1]
+
+
+def sloped(t, inner):
+    return np.interp(t, KNOTS, VALUES)
+
+
+@pytest.mark.parametrize(
+    ("kind", "exact"), [("constant", held), ("linear", sloped), ("cubic", lambda t, _: CubicSpline(KNOTS, VALUES)(t))]
+)
+@pytest.mark.parametrize("method", [SVI(2), StoermerVerlet(), Gauss(3)], ids=lambda method: method.name)
+def test_the_order_is_kept_across_breakpoints(pendulum, kind, exact, method):
+    stepper, expected = compile_stepper(pendulum, method), reference(exact, lambda t, _: 0.1 * t, 2.3)
+    inputs, errors = {"u": (KNOTS, VALUES, kind), "w": ([0.0, 3.0], [0.0, 0.3])}, []
+    for h in (0.1, 0.02):
+        run = stepper.drive([0.3], velocity=[0.1], inputs=inputs, h=h, t_end=2.3)
+        assert run.t[-1] == pytest.approx(2.3, abs=1e-15)
+        assert set(np.round(KNOTS[1:5], 12)) <= set(np.round(run.t, 12))
+        assert np.diff(run.t).max() < 1.000001 * h
+        errors.append(np.hypot(run.q[-1, 0] - expected[0], run.velocity[-1, 0] - expected[1]))
+    assert errors[1] < 1e-12 or np.log(errors[0] / errors[1]) / np.log(5.0) > method.order - 0.4
+
+
+def test_steps_that_choose_their_length_and_states_between(pendulum):
+    stepper, expected = compile_stepper(pendulum, SVI(6)), reference(sloped, lambda t, _: 0.1 * t, 2.3)
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
+    run = stepper.drive([0.3], velocity=[0.1], inputs=inputs, t_end=2.3)
+    assert_allclose([run.q[-1, 0], run.velocity[-1, 0]], expected, atol=3e-13)
+    q, p = run.at([0.2, 1.0, 2.3])
+    assert_allclose(q[0], reference(sloped, lambda t, _: 0.1 * t, 0.2)[0], atol=3e-13)
+    assert_allclose(q[1], reference(sloped, lambda t, _: 0.1 * t, 1.0)[0], atol=3e-13)
+    assert_allclose((q[2], p[2]), (run.q[-1], run.p[-1]), atol=1e-15)
+    back = stepper.drive(run.q[-1], run.p[-1], inputs=inputs, t=2.3, t_end=0.0)
+    assert_allclose(back.q[-1], [0.3], atol=1e-12)
+
+
+def test_work_of_inputs_is_in_the_balance(pendulum):
+    still = {"w": ([0.0, 3.0], [0.0, 0.0])}
+    run = compile_stepper(pendulum, SVI(5)).drive(
+        [0.3], velocity=[0.1], inputs={"u": (KNOTS, VALUES), **still}, h=0.1, t_end=2.3
+    )
+    assert np.abs(run.energy() - run.energy()[0] - run.work()).max() < 1e-11
+
+
+def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
+    """Between samples an input is held; the same from a saved run, and by the parameters themselves."""
+    stepper = compile_stepper(pendulum, SVI(3))
+    run = stepper.start([0.3], [0.0], h=0.01)
+    states = []
+    for _ in range(50):
+        run.hold(u=-2.0 * run.q[0] - 0.5 * run.p[0])
+        run.skip(4)
+        states.append((run.q[0], run.p[0]))
+    assert abs(run.q[0]) < 0.2
+    again = stepper.start([0.3], [0.0], h=0.01)
+    for k in range(50):
+        again.change(parameters={"u_0": -2.0 * again.q[0] - 0.5 * again.p[0]})
+        again = stepper.restore(again.save(), parameters=again.parameters)
+        again.skip(4)
+        assert (again.q[0], again.p[0]) == states[k]
+    began = time.perf_counter()
+    for _ in range(1000):
+        run.hold(u=0.1)
+    assert time.perf_counter() - began < 1.0
+
+
+def test_from_sympy_and_what_scipy_gives():
+    q, v, u = sympy.symbols("q q_dot u")
+    system = LagrangianSystem.from_sympy(
+        name="pushed", lagrangian=v**2 / 2, coordinates=[q], forces={"q": u}, inputs=[u]
+    )
+    stepper = compile_stepper(system, SVI(3))
+    for given in (CubicSpline(KNOTS, VALUES), Akima1DInterpolator(KNOTS, VALUES)):
+        run = stepper.drive([0.0], [0.0], inputs={"u": given}, h=0.13, t_end=2.6)
+        assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "said"),
+    [
+        ({"u": (KNOTS, VALUES)}, "the input w is not given"),
+        ({"u": (KNOTS, VALUES), "w": (KNOTS, VALUES), "z": 1.0}, "'z' is no input"),
+        ({"u": np.sin, "w": (KNOTS, VALUES)}, "C cannot call"),
+        ({"u": (KNOTS[::-1], VALUES), "w": (KNOTS, VALUES)}, "do not ascend"),
+        ({"u": (KNOTS, VALUES[:3]), "w": (KNOTS, VALUES)}, "shape"),
+        ({"u": (KNOTS, VALUES, "quintic"), "w": (KNOTS, VALUES)}, "constant or linear or cubic"),
+        ({"u": (KNOTS, [np.nan] * 6), "w": (KNOTS, VALUES)}, "nan"),
+        ({"u": (KNOTS[:3], VALUES[:3]), "w": (KNOTS, VALUES)}, "is given from t = 0 to 0.9"),
+        ({"u": 3.0, "w": (KNOTS, VALUES)}, r"\(t, values\)"),
+    ],
+)
+def test_what_is_no_input(pendulum, inputs, said):
+    with pytest.raises(StateError, match=said):
+        compile_stepper(pendulum, SVI(2)).drive([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
+
+
+def test_names_and_runs_without_an_end(pendulum):
+    stepper = compile_stepper(pendulum, SVI(2))
+    with pytest.raises(StateError, match="t_end"):
+        stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
+    with pytest.raises(StateError, match="no input"):
+        stepper.start([0.3], [0.0], h=0.1).hold(v=1.0)
+    with pytest.raises(SystemDefinitionError, match="q"):
+        LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + q", inputs=["q"])
