@@ -53,7 +53,7 @@ OWNERS = {
     "mpmath": "benchmark display tables",
     "pandas": "files runtime",
     "platformdirs": "files",
-    "scipy": "benchmark lowering mechanics",
+    "scipy": "benchmark lowering mechanics runtime",
     "tomli_w": "models",
     "xarray": "files runtime",
     "zarr": "files",

@@ -56,7 +56,8 @@ def test_the_order_is_the_first_power_that_is_not_integrated(rule: Quadrature) -
 
 @pytest.mark.parametrize("rule", rules([1, 2, 3, 7, 20]), ids=lambda rule: rule.name)
 def test_names_read_back_and_the_unit_interval_is_the_same_rule(rule: Quadrature) -> None:
-    assert quadrature_by_name(rule.name) is rule
+    assert quadrature_by_name(rule.name) == rule
+    assert quadrature_by_name(rule.name) is quadrature_by_name(rule.name)
     assert len(rule) == len(rule.points) == len(rule.weights) == int(rule.name.partition(":")[2])
     assert all(weight > 0 for weight in rule.weights)
     assert abs(mp.fsum(rule.unit_weights) - 1) < FIFTY_DIGITS
