@@ -26,6 +26,8 @@ from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
 
+MOST_PROJECTIONS = 6
+"""Each doubles the digits to which a state of doubles meets constraints."""
 MOST_COLUMNS, MOST_HALVINGS = 24, 12
 DIGITS = 45
 ACCURACY = mp.mpf(10) ** -DIGITS
@@ -89,6 +91,18 @@ class ExactMotion:
         others = self._slopes if self.hamiltonian else [entry for row in self._curvature for entry in row]
         return Tape([*self._by_position, *others], self.symbols)
 
+    @cached_property
+    def _holding(self) -> Tape:
+        """Slopes of the constraints, row by row; what their rates grow by while velocities stay; they; their rates."""
+        q, v, t = self.system.coordinates, self.second, self.system.time
+        slopes = [g.diff(x) for g in self.system.constraints for x in q]
+
+        def rate(f: sympy.Expr) -> sympy.Expr:
+            return sympy.Add(f.diff(t), *(f.diff(x) * y for x, y in zip(q, v, strict=True)))
+
+        bound = self.system.constraints
+        return Tape([*slopes, *(rate(rate(g)) for g in bound), *bound, *map(rate, bound)], self.symbols)
+
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
 
@@ -128,13 +142,49 @@ class ExactMotion:
     def _rates(self, state: Numbers, t: Number) -> Numbers:
         """Of (q, p) where H is given, of (q, v) where L is."""
         q, second = np.split(state, 2)
-        m, found = len(q), self._values(self._right_hand_side, q, second, t)
-        force = found[:m]
+        m = len(q)
         if self.hamiltonian:
-            return np.concatenate([found[m:], -force])
+            found = self._values(self._right_hand_side, q, second, t)
+            return np.concatenate([found[m:], -found[:m]])
+        mass, applied = self._mass_and_applied(q, second, t)
+        if self.system.constraints:
+            return np.concatenate([second, self._held(mass, applied, q, second, t)[:m]])
+        return np.concatenate([second, _solved(mass, applied)])
+
+    def _mass_and_applied(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
+        """L_vv, and what it times the accelerations is without constraints, at (q, v) of a Lagrangian."""
+        m, found = len(q), self._values(self._right_hand_side, q, v, t)
         slopes = found[m:].reshape(m, 2 * m + 1)
-        applied = force - slopes[:, m : 2 * m] @ second - slopes[:, 2 * m]
-        return np.concatenate([second, _solved(slopes[:, :m], applied)])
+        return slopes[:, :m], found[:m] - slopes[:, m : 2 * m] @ v - slopes[:, 2 * m]
+
+    def _held(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
+        """(m + c,) accelerations, and the multipliers that keep the second derivatives of the constraints at 0."""
+        slopes, (growth, _, _) = self._bound(q, v, t)
+        return _solved(_saddle(mass, slopes), np.concatenate([applied, -growth]))
+
+    def _bound(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
+        """(c, m) slopes of the constraints; (3, c) what their rates grow by while v stays, they, their rates."""
+        m, count, found = len(q), len(self.system.constraints), self._values(self._holding, q, v, t)
+        return found[: count * m].reshape(count, m), found[count * m :].reshape(3, count)
+
+    def met(self, q: Any, p: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
+        """The state on the constraints next to (q, p), to all digits; (q, p) itself without any."""
+        q, p, t = numbers(q), numbers(p), mp.mpf(t)
+        if not self.system.constraints:
+            return q, p
+        m, still = len(q), numbers(np.zeros(len(q)))
+        v = self.velocity(q, p, t)
+        for _ in range(MOST_PROJECTIONS):
+            mass, (slopes, (_, g, _)) = self._mass_and_applied(q, v, t)[0], self._bound(q, v, t)
+            q = q + _solved(_saddle(mass, slopes), np.concatenate([still, -g]))[:m]
+        mass, (slopes, (_, _, rate)) = self._mass_and_applied(q, v, t)[0], self._bound(q, v, t)
+        v = v + _solved(_saddle(mass, slopes), np.concatenate([still, -rate]))[:m]
+        return q, self.momentum(q, v, t)
+
+    def multipliers(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
+        """(c,) of the constraints at a state."""
+        mass, applied = self._mass_and_applied(q, v, t)
+        return self._held(mass, applied, q, v, t)[len(q) :]
 
     def rates(self, q: Numbers, p: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """(m,) velocities and forces: the rates of q and p by Hamilton's equations."""
@@ -214,6 +264,14 @@ class ExactMotion:
         for j in range(1, n):
             before, now = now, before + self._rates(now, t + j * width) * (2 * width)
         return now
+
+
+def _saddle(mass: Numbers, slopes: Numbers) -> Numbers:
+    """[mass, -slopes^T; slopes, 0]."""
+    count, m = slopes.shape
+    matrix = numbers(np.zeros((m + count, m + count)))
+    matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -slopes.T, slopes
+    return matrix
 
 
 def _solved(matrix: Numbers, right: Numbers) -> Numbers:

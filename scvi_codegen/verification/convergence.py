@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.exact.motion import Numbers
 from scvi_codegen.methods import method_from_specification
 from scvi_codegen.methods.method import Method
 from scvi_codegen.tables.precision import Number, mp
@@ -130,14 +129,11 @@ def _measured_order(subject: Subject) -> tuple[float | None, float]:
 
 def _error(subject: Subject, method: Method, state: State, h: Number) -> Number:
     """Of one step of length h, relative to the sizes of q and of p."""
-    found = subject.derived(method)(state.q, state.p, h, state.t)
-    q, p = _exact(subject, state, h)
+    start = subject.motion.met(state.q, state.p, state.t)
+    found = subject.derived(method)(*start, h, state.t)
+    q, p = subject.motion.flow(*start, h, state.t)
     m, scales = len(state.q), subject.scales(state)
     return max(*(abs(found.q - q) / scales[:m]), *(abs(found.p - p) / scales[m:]))
-
-
-def _exact(subject: Subject, state: State, h: Number) -> tuple[Numbers, Numbers]:
-    return subject.motion.flow(state.q, state.p, h, state.t)
 
 
 def _rate_in_degree(subject: Subject) -> Finding | None:

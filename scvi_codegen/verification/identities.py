@@ -162,7 +162,7 @@ def _legendre_twin(subject: Subject) -> Finding | None:
     system, method = subject.moved, subject.method
     singular = isinstance(system, HamiltonianSystem) and not system.is_regular
     shot = isinstance(method, SCVI) and bool(system.forces)
-    if singular or shot or method.needs_lagrangian:
+    if singular or shot or method.needs_lagrangian or system.constraints:
         return None
     if system.dimension > LARGEST_TWIN:
         raise StateError(f"Legendre's transform is taken for {LARGEST_TWIN} coordinates at most")

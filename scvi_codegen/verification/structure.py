@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.exact.motion import numbers
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 from scvi_codegen.verification.linearisation import Linearised
 from scvi_codegen.verification.subject import EPSILON, State, Subject
@@ -24,6 +26,7 @@ SPREAD = 10.0
 """By how much the error of the derivative may exceed the disagreement of two widths of differences."""
 TOO_ROUGH = 1e-6
 STEPS = 1000
+MULTIPLIER_BOUND = 1e-10
 DOUBLINGS, BISECTIONS = 24, 10
 TRIED = 3
 
@@ -33,6 +36,11 @@ def structure_checks(subject: Subject) -> Iterator[Check]:
     if is_symplectic(subject.method, subject.system):
         promise = "J^T Omega J = Omega, J by finite differences of the compiled step"
         yield from checked("symplecticity", promise, partial(_symplecticity, subject))
+    if subject.system.constraints:
+        promise = f"they and their rates are 0 but for rounding in each of {STEPS} states"
+        yield from checked("constraints", promise, partial(_constraints, subject))
+        promise = "with them the compiled multipliers keep the second derivatives of constraints at 0 (60 digits)"
+        yield from checked("multipliers", promise, partial(_multipliers, subject))
     if subject.method.symmetric:
         yield from checked("reversal", "a step with -h undoes the step with h", partial(_reversal, subject))
     if subject.method.symplectic:
@@ -50,6 +58,8 @@ def _symplecticity(subject: Subject) -> Finding:
         if around is None:
             raise StateError("steps from nearby states fail")
         defect, noise = _defect(around)
+        if subject.system.constraints:
+            defect, noise = _along(subject.tangents(state), around)
         if noise.max() > TOO_ROUGH:
             raise StateError(f"differences are good to {noise.max():.1g} only: try a smaller step")
         place = np.unravel_index(np.argmax(defect / noise), defect.shape)
@@ -67,6 +77,54 @@ def _defect(around: Linearised) -> tuple[Array, Array]:
     error = np.full_like(J, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
     half = error.T @ np.abs(omega) @ np.abs(J)
     return np.abs(J.T @ omega @ J - omega) / units, (half + half.T) / units
+
+
+def _along(tangents: Array, around: Linearised) -> tuple[Array, Array]:
+    """The same of areas along the constrained phase space, in units of those of its directions."""
+    m, scale = len(around.scales) // 2, around.scales
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scale, scale)
+    unit = np.median(scale[:m] * scale[m:])
+    error = np.full_like(around.matrix, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
+    ends = around.matrix @ tangents
+    half = np.abs(tangents.T) @ error.T @ np.abs(omega) @ np.abs(ends)
+    return np.abs(ends.T @ omega @ ends - tangents.T @ omega @ tangents) / unit, (half + half.T) / unit
+
+
+def _constraints(subject: Subject) -> Finding:
+    """G and its rate along a run, in units of what rounding each number of the state changes them by."""
+    first = subject.states[0]
+    run = subject.stepper.integrate(first.q, first.p, h=first.h, steps=STEPS, t=first.t, parameters=subject.parameters)
+    worst = 0.0
+    for k in range(0, len(run), STEPS // 20):
+        state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
+        units = EPSILON * np.maximum(np.abs(state.z), subject.scales(state))
+        slopes = np.abs(subject.constraint_slopes(state, units / EPSILON)).sum(axis=1) + _by_time(subject, state)
+        values = np.abs(
+            np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t, subject.parameters))
+        )
+        worst = max(worst, float(np.max(values / (EPSILON * slopes))))
+    return Finding(worst, ROUNDINGS, f"in units of rounding, steps of {first.h:g}")
+
+
+def _by_time(subject: Subject, state: State) -> Array:
+    """(2c,) what a rounding of the time of a state changes constraints and their rates by, in units of rounding."""
+    moment = 1e-5 * (abs(state.t) + abs(state.h))
+    values = [
+        np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t + sign * moment, subject.parameters))
+        for sign in (1, -1)
+    ]
+    return np.abs(values[0] - values[1]) / 2e-5
+
+
+def _multipliers(subject: Subject) -> Finding:
+    """The acceleration that they give, by the formula alone, against that of the exact motion."""
+    state, motion = subject.states[0], subject.motion
+    q, p, t = numbers(state.q), numbers(state.p), mp.mpf(state.t)
+    v = motion.velocity(q, p, t)
+    found = subject.stepper.multipliers(state.q, state.p, state.t, subject.parameters)
+    exact = motion.multipliers(q, v, t)
+    size = max(float(max(map(abs, exact))), np.finfo(float).tiny)
+    return Finding(float(np.abs(found - exact.astype(float)).max() / size), MULTIPLIER_BOUND, "relative")
 
 
 def _reversal(subject: Subject) -> Finding:

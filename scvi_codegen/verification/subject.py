@@ -25,6 +25,8 @@ __all__ = ["EPSILON", "State", "Subject"]
 Array = NDArray[np.float64]
 
 EPSILON = 2.0**-52
+WIDTH = 1e-5
+"""Of differences of constraints, in parts of a state."""
 NUDGE, NUDGES = 0.05, 6
 """Part of its size by which a state is moved off the given one; so often less, four times each, until a step works."""
 PARAMETER_NUDGE = 0.05
@@ -131,13 +133,35 @@ class Subject:
         directions = np.concatenate([np.cos(1.0 + np.arange(m)), np.sin(2.0 + 1.3 * np.arange(m))])
         for k in range(NUDGES):
             z = given.z + NUDGE / 4**k * sizes * directions
-            state = State(z[:m], z[m:], given.t + 0.37 * given.h, given.h)
+            t = given.t + 0.37 * given.h
             try:
+                state = State(*self._met(z[:m], z[m:], t), t, given.h)
                 self.step(state)
-            except StepFailedError:
+            except (StateError, StepFailedError):
                 continue
             return state
         return given
+
+    def _met(self, q: Array, p: Array, t: float) -> tuple[Array, Array]:
+        """The state that meets the constraints, if there are any, next to (q, p)."""
+        if not self.system.constraints:
+            return q, p
+        return self.stepper.project(q, p, t=t, parameters=self.parameters)
+
+    def tangents(self, state: State) -> Array:
+        """(2m, 2(m - c)) directions in units of :meth:`scales` along which constraints and their rates stay 0."""
+        left = 2 * (len(state.q) - len(self.system.constraints))
+        found: Array = np.linalg.svd(self.constraint_slopes(state, self.scales(state)))[2][-left:].T
+        return found
+
+    def constraint_slopes(self, state: State, units: Array) -> Array:
+        """(2c, 2m) derivatives of the constraints and of their rates by the state, in such units of it."""
+        m, columns = len(state.q), []
+        for unit in np.diag(WIDTH * units):
+            ends = [state.z + sign * unit for sign in (1, -1)]
+            values = [self.stepper.constraint_values(z[:m], z[m:], state.t, self.parameters) for z in ends]
+            columns.append((np.concatenate(values[0]) - np.concatenate(values[1])) / (2 * WIDTH))
+        return np.array(columns).T
 
     def step(
         self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None

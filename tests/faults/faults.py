@@ -11,6 +11,7 @@ from sabotage import Case, Make, Sabotage, changed_result
 
 from scvi_codegen.ir.kernel import Operation
 from scvi_codegen.methods import SVI, RungeKutta, shooting_stages
+from scvi_codegen.methods.stage_system import Table
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.precision import mp
 
@@ -138,3 +139,20 @@ def power_rule_halved(original: Any) -> Any:
         return found / 2 if node.is_Pow and node.exp == 2 and position == 0 else found
 
     return partial
+
+
+def without_last_of(table: Table, row: int) -> Table:
+    """The scatter into a row without what the last point gives."""
+    *lines, last = table.entries
+    return replace(table, entries=(*lines, (*last[:row], 0 * last[row], *last[row + 1 :])))
+
+
+def constraints_off(original: Any) -> Any:
+    """The values of constraints with 1e-9 beside them."""
+
+    def changed(system: Any, name: str, values: Any, **named: Any) -> Any:
+        off = sympy.Rational(1, 10**9)
+        bound = getattr(system, "constraints", ())
+        return original(system, name, tuple(v + off if v in bound else v for v in values), **named)
+
+    return changed

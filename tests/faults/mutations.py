@@ -12,6 +12,7 @@ from certified_cases import case
 from faults import (
     Mutation,
     as_printed,
+    constraints_off,
     doubled,
     eight_digits,
     eight_digits_text,
@@ -25,6 +26,7 @@ from faults import (
     slopes,
     text,
     transposed,
+    without_last_of,
     without_negation,
     without_rates_of,
     wrong_rule,
@@ -34,6 +36,7 @@ from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import derivatives
 from scvi_codegen.ir import arithmetic, numbers
+from scvi_codegen.lowering import constraints as lowered_constraints
 from scvi_codegen.lowering import families
 from scvi_codegen.lowering.solvers import collocation as collocation_sweep
 from scvi_codegen.lowering.solvers import separable
@@ -46,6 +49,7 @@ from scvi_codegen.methods import (
     shooting_stages,
     stage_system,
 )
+from scvi_codegen.methods import constraints as constrained_stages
 from scvi_codegen.methods import method as method_room
 from scvi_codegen.rendering import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
@@ -389,4 +393,45 @@ MUTATIONS = (
         ),
     ),
     Mutation("the chain rule of L_d lost", case("kepler/scvi"), as_printed),
+    # Constraints.
+    here(
+        "a multiplier's force off its gradient",
+        case("linkage/lobatto-svi"),
+        constrained_stages,
+        "with_reactions",
+        changed_result(lambda found: (found[0] * (1 + sympy.Rational(1, 10**6)), *found[1:])),
+    ),
+    here(
+        "hidden constraints without g_t",
+        case("wire/lobatto-svi"),
+        constrained_stages,
+        "constraint_rates",
+        lambda original: (
+            lambda system: tuple(
+                rate - g.diff(system.time) for rate, g in zip(original(system), system.constraints, strict=True)
+            )
+        ),
+    ),
+    here(
+        "multipliers without what velocities add",
+        case("linkage/lobatto-svi"),
+        lowered_constraints,
+        "along_motion",
+        lambda _: lambda system, functions: (sympy.S.Zero,) * len(functions),
+    ),
+    here(
+        "the end's momentum without the last force",
+        case("linkage/lobatto-svi"),
+        constrained_stages,
+        "_with_end",
+        lambda original: lambda table, rows, points: without_last_of(original(table, rows, points), rows),
+    ),
+    here("constraints 1e-9 off", case("linkage/lobatto-svi"), families, "system_kernel", constraints_off),
+    text(
+        "multipliers of the other sign",
+        case("linkage/lobatto-svi"),
+        r"y\[j\] = -y\[j\]",
+        "y[j] = +y[j]",
+        within=r"NAME\(multipliers\)",
+    ),
 )

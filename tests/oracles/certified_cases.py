@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sabotage import Case
-from samples import driven_duffing, pumped_cart_pole
+from samples import driven_duffing, linkage, pumped_cart_pole, turning_wire
 
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
@@ -34,6 +34,8 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "round": (problem("kepler").system, (0.8, 0.1), (0.1, 1.2), 0.35),
     "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
     "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
+    "linkage": (linkage(), (0.0, 1.0, 1.94, 1.5), (0.1, 0.2, 0.0, 0.3), 0.02),
+    "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
 }
 METHODS: dict[str, Callable[[], Method]] = {
@@ -72,8 +74,8 @@ WHOLE = """
     pendulum/svi driven/svi kepler/svi-3 round/svi-8 double/svi double/lobatto-svi cart/svi pendulum/hermite
     pendulum/splines pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss
     kepler/printed double/printed double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss
-    double/gauss-position kepler/radau-iia double/radau-ia kepler/lobatto driven/chebyshev pendulum/verlet
-    double/verlet kepler/composition driven/euler
+    linkage/lobatto-svi wire/lobatto-svi double/gauss-position kepler/radau-iia double/radau-ia kepler/lobatto
+    driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
 """
 CASES = {name: case(name) for name in WHOLE.split()}
 """Everything that is sabotaged, whole."""

@@ -5,11 +5,11 @@ import subprocess
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from samples import linkage
 from style import check_style
 
 from scvi_codegen import (
     SVI,
-    LagrangianSystem,
     Model,
     compile_stepper,
     derive,
@@ -21,14 +21,7 @@ from scvi_codegen.exact.step import compiled_equations, derived_step
 from scvi_codegen.models.model_file import dump_model, parse_model
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
-LINKAGE = LagrangianSystem.from_text(
-    name="four-bar linkage",
-    coordinates=["x1", "y1", "x2", "y2"],
-    lagrangian="m*(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2 + x1_dot*x2_dot/2)/2 - m*g*(y1 + y2)",
-    parameters={"m": 1.0, "g": 9.81, "a": 1.0, "b": 2.0, "c": 1.5, "d": 2.0},
-    constraints=["x1**2 + y1**2 = a**2", "(x2 - x1)**2 + (y2 - y1)**2 = b**2", "(x2 - d)**2 + y2**2 = c**2"],
-    forces={"x2": "-0.1*x2_dot + sin(t)"},
-)
+LINKAGE = linkage()
 NEAR = [0.0, 1.0, 1.94, 1.5]
 
 

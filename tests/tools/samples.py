@@ -51,6 +51,29 @@ def pumped_cart_pole() -> LagrangianSystem:
     )
 
 
+def linkage() -> LagrangianSystem:
+    """Four bars with friction and a motor: three constraints leave one of four coordinates."""
+    return LagrangianSystem.from_text(
+        name="four-bar linkage",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="m*(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2 + x1_dot*x2_dot/2)/2 - m*g*(y1 + y2)",
+        parameters={"m": 1.0, "g": 9.81, "a": 1.0, "b": 2.0, "c": 1.5, "d": 2.0},
+        constraints=["x1**2 + y1**2 = a**2", "(x2 - x1)**2 + (y2 - y1)**2 = b**2", "(x2 - d)**2 + y2**2 = c**2"],
+        forces={"x2": "-0.1*x2_dot + sin(t)"},
+    )
+
+
+def turning_wire() -> LagrangianSystem:
+    """A bead on a straight wire that turns: one constraint, with time, on coordinates that the masses couple."""
+    return LagrangianSystem.from_text(
+        name="turning wire",
+        coordinates=["u", "v"],
+        lagrangian="((u_dot + v_dot)**2 + 2*(u_dot - v_dot)**2)/2 - k*(u**2 + 2*v**2 + u**4)",
+        parameters={"w": 0.8, "k": 3.0},
+        constraints=["(u + v)*sin(w*t) = (u - v)*cos(w*t)"],
+    )
+
+
 def three_bodies() -> LagrangianSystem:
     """Three masses in the plane, each pair joined by a spring that is stiffer the longer it is."""
     pairs = (("a", "b"), ("b", "c"), ("a", "c"))
