@@ -47,7 +47,15 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.events import with_events
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.rendering.text import EMBEDDED, Embedded, render, render_embedded, render_ensemble, workspace_size
+from scvi_codegen.rendering.text import (
+    EMBEDDED,
+    Embedded,
+    render,
+    render_embedded,
+    render_ensemble,
+    render_tangent,
+    workspace_size,
+)
 from scvi_codegen.rendering.text_cache import remembered_text
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.stepper import Stepper
@@ -129,6 +137,11 @@ def compile_stepper(
     def fallback() -> Source | None:
         return render(program(fallback=True), fallback="lent") if borrows() else None
 
+    def tangent() -> Source | None:
+        if system.integrands:
+            return None
+        return render_tangent(program_of(system, method, solver="newton", prefix=prefix, symmetries=symmetries))
+
     texts_of = json.loads(remembered_text((*key, "integrator"), texts))
     source, interface = Source.from_json(texts_of[0]), Interface.from_json(texts_of[1])
     return Stepper(
@@ -137,6 +150,7 @@ def compile_stepper(
         ensemble=remembered("ensemble", lambda: render_ensemble(program())),
         controlled=remembered("controlled", controlled),
         fallback=remembered("fallback", fallback),
+        tangent=remembered("tangent", tangent),
         flags=flags,
         events=as_events(events),
     )

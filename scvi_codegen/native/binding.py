@@ -53,6 +53,11 @@ class Binding:
             self._lender = lender
         return self._lender
 
+    def with_workspace(self, size: int) -> Self:
+        """This one, whose calls need so many doubles."""
+        self._workspace = size
+        return self
+
     def borrow_fallback(self) -> None:
         """Compile Newton's iteration, if that is borrowed and was not needed yet."""
         if self._lacks_fallback:

@@ -122,6 +122,13 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 
 
+def render_tangent(program: Program) -> Source:
+    """The text of a program solved by Newton's iteration, with the derivative of a step by its start."""
+    context = _context(program, DOUBLE, None)
+    slopes = sum(each.points * (len(each.slope.results) - each.slope.values) for each in program.families)
+    return _render(program.prefix, context | {"tangent": slopes, "written_out": None})
+
+
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
     """The same for a microcontroller: one file, iterations bounded when it is compiled, the scalars of its registers.
 
@@ -245,6 +252,7 @@ def _context(
         "max_iterations": MAX_ITERATIONS,
         "most_iterations": "INT_MAX",
         "embedded": False,
+        "tangent": 0,
         "written_out": written_out(program, target),
         "fallback": fallback,
         **_control_context(program, control),

@@ -46,11 +46,13 @@ class CompiledMethod:
         ensemble: Callable[[], Source | None] = no_text,
         controlled: Callable[[], Source | None] = no_text,
         fallback: Callable[[], Source | None] = no_text,
+        tangent: Callable[[], Source | None] = no_text,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
-        self._ensemble, self._controlled, self._fallback = ensemble, controlled, fallback
+        self._ensemble, self._controlled, self._fallback, self._tangent = ensemble, controlled, fallback, tangent
+        self._with_tangent: Binding | None = None
         self._with_control: Self | None = None
         self._plain = source
         self.source = _watching(source, interface, events) if events else source
@@ -89,6 +91,17 @@ class CompiledMethod:
         For loops that must not wait a second for it.
         """
         self.binding.borrow_fallback()
+
+    @property
+    def tangent(self) -> Binding:
+        """The library with derivatives of steps, compiled when first asked for; MethodError where there is none."""
+        if self._with_tangent is None:
+            source = self._tangent()
+            if source is None:
+                raise MethodError(f"there are no derivatives of the steps of '{self.title}'")
+            binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
+            self._with_tangent = binding.with_workspace(binding.constant("TANGENT_WORKSPACE"))
+        return self._with_tangent
 
     def _load_fallback(self) -> building.Library:
         source = self.fallback
@@ -147,6 +160,7 @@ class CompiledMethod:
             ensemble=self._ensemble,
             controlled=self._controlled,
             fallback=self._fallback,
+            tangent=self._tangent,
             flags=self.flags,
             events=wanted,
         )
@@ -172,6 +186,7 @@ class CompiledMethod:
             ensemble=self._ensemble,
             controlled=self._controlled,
             fallback=self._fallback,
+            tangent=self._tangent,
             flags=self.flags,
             events=self.events,
         )

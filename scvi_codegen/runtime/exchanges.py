@@ -11,7 +11,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.dense_output import whole_steps
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 
-__all__ = ["exchanged_until"]
+__all__ = ["exchanged_until", "steps_between"]
 
 
 def exchanged_until(states: KeptStates) -> Array:
@@ -27,7 +27,7 @@ def exchanged_until(states: KeptStates) -> Array:
     for k, (start, length, span) in enumerate(
         zip(t[:-1].tolist(), states.lengths[:-1].tolist(), np.diff(t).tolist(), strict=True)
     ):
-        count = _steps_between(length, span)
+        count = steps_between(length, span)
         q, p = states.q[k], states.p[k]
         total[k + 1] = total[k]
         for j in range(count):
@@ -37,11 +37,11 @@ def exchanged_until(states: KeptStates) -> Array:
     return total
 
 
-def _steps_between(length: float, span: float) -> int:
+def steps_between(length: float, span: float) -> int:
     """How many steps of a length; 1 for a last one that an event or the end cut short."""
     if np.isnan(length):
-        raise StateError("what forces gave is known for whole steps: integrate without t_eval, and with every=1")
+        raise StateError("this is known of whole steps: integrate without t_eval, and with every=1")
     count = int(whole_steps(np.array([span]), np.array([length]))[0])
     if count > 1 and abs(span - count * length) > 1e-9 * abs(length):
-        raise StateError("what forces gave is known for whole steps: keep all states (every=1)")
+        raise StateError("this is known of whole steps: keep all states (every=1)")
     return max(1, count)

@@ -43,7 +43,7 @@ class Stepper(Integrator):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        texts = (self.ensemble, self._controlled(), self.fallback)
+        texts = (self.ensemble, self._controlled(), self.fallback, self._tangent())
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events))
 
     @takes(StateError, progress=FUNCTION)
@@ -388,17 +388,18 @@ def _end_of(run: Run, steps: int | None) -> float:
 def _rebuild(
     source: Source,
     interface: Interface,
-    texts: tuple[Source | None, Source | None, Source | None],
+    texts: tuple[Source | None, ...],
     flags: tuple[str, ...],
     events: tuple[Event, ...],
 ) -> Stepper:
-    ensemble, controlled, fallback = texts
+    ensemble, controlled, fallback, tangent = (*texts, None)[:4]
     return Stepper(
         source,
         interface,
         ensemble=lambda: ensemble,
         controlled=lambda: controlled,
         fallback=lambda: fallback,
+        tangent=lambda: tangent,
         flags=flags,
         events=events,
     )

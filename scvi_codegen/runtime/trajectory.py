@@ -25,6 +25,7 @@ from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.exchanges import exchanged_until
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.tangents import carried, lyapunov_exponents
 
 if TYPE_CHECKING:
     import pandas
@@ -110,6 +111,21 @@ class Trajectory(KeptStates):
         :meth:`work`.
         """
         return exchanged_until(self)[:, 1:]
+
+    def tangent(self, directions: ArrayLike | None = None) -> Array:
+        """(n, 2m, k) what becomes of (2m, k) directions of (q, p) at the first state; all 2m without any.
+
+        The exact derivative of the computed states, lengths of steps held (:meth:`Stepper.jacobian`).
+
+        Raises:
+            MethodError: in transformed time.
+            StateError: for directions of another shape, and states that do not stand at whole steps.
+        """
+        return carried(self, directions)
+
+    def lyapunov_exponents(self) -> Array:
+        """(2m,) Lyapunov exponents of the time that the run covers, descending; of symplectic maps their sum is 0."""
+        return lyapunov_exponents(self)
 
     def multipliers(self) -> Array:
         """(n, c) multipliers of the constraints: g_q^T lambda are the forces that keep the states on them.

@@ -1,0 +1,32 @@
+"""The C text of derivatives compiles without a warning and is in style, of loops over tables and of what is written out."""
+
+import subprocess
+
+import pytest
+from samples import linkage
+from style import check_style
+
+from scvi_codegen import SCVI, SVI, problem
+from scvi_codegen.compiler import program_of
+from scvi_codegen.rendering.text import render_tangent
+
+STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
+CASES = {
+    "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),
+    "pendulum": (problem("planar-pendulum").system, SVI(1)),
+    "double": (problem("double-pendulum").system, SCVI(2)),
+}
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("name", CASES)
+def test_compiles_without_a_warning(name, compiler, tmp_path):
+    system, method = CASES[name]
+    source = render_tangent(program_of(system, method, solver="newton")).amalgamated()
+    (tmp_path / f"{source.prefix}.h").write_text(source.header)
+    (tmp_path / "all.c").write_text(source.code)
+    check_style(source.code)
+    found = subprocess.run(
+        [compiler, *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stderr

@@ -1,0 +1,116 @@
+"""Derivatives of steps and runs: by differences in 60 digits, symplectic, and what they say of motions."""
+
+import numpy as np
+import pytest
+from certified_cases import STATES
+from numpy.testing import assert_allclose
+
+from scvi_codegen import (
+    SCVI,
+    SVI,
+    Gauss,
+    MethodError,
+    SpectralCollocation,
+    StateError,
+    StoermerVerlet,
+    compile_stepper,
+    problem,
+    reparametrise,
+)
+from scvi_codegen.exact.step import derived_step
+from scvi_codegen.tables.precision import mp
+
+CASES = {
+    "pendulum/svi-1": ("pendulum", SVI(1)),
+    "kepler/svi-4": ("kepler", SVI(4)),
+    "double/svi-3": ("double", SVI(3)),
+    "double/scvi": ("double", SCVI(2)),
+    "cart/gauss": ("cart", Gauss(3)),
+    "kepler/verlet": ("kepler", StoermerVerlet()),
+    "vortices/svi": ("vortices", SVI(2)),
+    "linkage/svi": ("linkage", SVI(2, "gauss-lobatto:3")),
+    "double/sc": ("double", SpectralCollocation(3)),
+}
+
+
+def by_differences(system, method, q, p, h, t):
+    """Of the paper's equations, solved in 60 digits."""
+    step, width, z, columns = derived_step(system, method), mp.mpf(10) ** -20, [*map(mp.mpf, (*q, *p))], []
+    for k in range(len(z)):
+        ends = []
+        for sign in (1, -1):
+            moved = list(z)
+            moved[k] += sign * width
+            end = step(moved[: len(q)], moved[len(q) :], h, mp.mpf(t))
+            ends.append(np.array([*end.q, *end.p]))
+        columns.append(((ends[0] - ends[1]) / (2 * width)).astype(float))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_derivative_of_a_step(name):
+    known, method = CASES[name]
+    system, q, p, h = STATES[known]
+    stepper = compile_stepper(system, method)
+    if system.constraints:
+        q, p = stepper.project(q, p)
+    found, exact = stepper.jacobian(q, p, h, 0.3), by_differences(system, method, q, p, h, 0.3)
+    assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
+    if method.symplectic and not system.constraints:
+        omega = np.kron([[0, 1], [-1, 0]], np.eye(len(q)))
+        assert np.abs(found.T @ omega @ found - omega).max() < 4e-15
+
+
+def test_runs_carry_directions():
+    """A chain of steps against differences of whole runs; with steps between kept states, and of their own lengths."""
+    stepper = compile_stepper(problem("double-pendulum").system, SVI(4))
+    start = np.array([0.9, -0.6, 1.0, 0.5])
+    run = stepper.integrate(start[:2], start[2:], h=0.05, steps=40)
+    derivative = run.tangent()
+    columns = []
+    for unit in 1e-4 * np.eye(4):
+        ends = [stepper.integrate(*np.split(start + s * unit, 2), h=0.05, steps=40) for s in (1, -1, 2, -2)]
+        a, b, c, d = (np.concatenate([end.q[-1], end.p[-1]]) for end in ends)
+        columns.append((8 * (a - b) - (c - d)) / 12e-4)
+    assert_allclose(derivative[-1], np.array(columns).T, atol=1e-7 * np.abs(derivative[-1]).max())
+    some = stepper.integrate(start[:2], start[2:], h=0.05, steps=40, every=8)
+    assert_allclose(some.tangent()[-1], derivative[-1], rtol=1e-11, atol=1e-11)
+    one = run.tangent([1.0, 0.0, -1.0, 0.5])
+    assert_allclose(one[-1], derivative[-1] @ [1.0, 0.0, -1.0, 0.5], rtol=1e-12)
+    free = stepper.integrate(start[:2], start[2:], t_end=2.0)
+    assert_allclose(free.tangent()[-1], derivative[-1], rtol=2e-4, atol=2e-4 * np.abs(derivative[-1]).max())
+
+
+def test_a_keplerian_orbit_returns_with_its_shear():
+    """After a period all multipliers are 1, and only the phase drifts with the energy: M - 1 has rank one."""
+    entry = problem("kepler")
+    stepper = compile_stepper(entry.system, SVI(8))
+    run = stepper.integrate([0.5, 0.0], [0.0, np.sqrt(3.0)], h=2 * np.pi / 64, steps=64)
+    monodromy = run.tangent()[-1]
+    assert np.linalg.matrix_rank(monodromy - np.eye(4), tol=1e-4) == 1
+    gradient = np.array([4.0, 0.0, 0.0, np.sqrt(3.0)])  # of the energy: it is kept
+    assert_allclose(gradient @ monodromy, gradient, atol=1e-6)
+
+
+def test_exponents_sum_to_nothing_and_come_in_pairs():
+    """Volume is kept to rounding; pairs are of a long time alone."""
+    stepper = compile_stepper(problem("henon-heiles").system, SVI(4))
+    run = stepper.integrate([0.0, -0.25], [0.42, 0.0], h=0.2, steps=4000)
+    exponents = run.lyapunov_exponents()
+    assert abs(exponents.sum()) < 1e-13
+    assert np.abs(exponents + exponents[::-1]).max() < 5e-3
+    assert exponents[0] > 0.01
+    assert abs(exponents[1]) < 0.01
+
+
+def test_what_has_no_derivative():
+    kepler = problem("kepler")
+    stepper = compile_stepper(kepler.system, SVI(2))
+    run = stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=4)
+    with pytest.raises(StateError, match=r"shape \(4,\) or \(4, k\)"):
+        run.tangent([1.0, 2.0])
+    with pytest.raises(StateError, match="whole steps"):
+        stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=4, t_eval=[0.03, 0.1]).tangent()
+    clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4))
+    with pytest.raises(MethodError, match="no derivatives"):
+        clocked.jacobian(kepler.q, [0.0, 1.0], 0.1)
