@@ -1,4 +1,4 @@
-"""The C text of derivatives compiles without a warning and is in style, of loops over tables and of what is written out."""
+"""The C text of derivatives: without a warning, in style, of loops over tables and of what is written out."""
 
 import subprocess
 
