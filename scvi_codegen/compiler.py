@@ -25,7 +25,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Sequence
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 
 from sympy import Expr
 
@@ -107,57 +108,85 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: for a solver that the method does not have.
     """
-    method = as_method(method, system)
-    key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries), str(monitor))
-
-    @cache
-    def program(*, fallback: bool = False) -> Program:
-        with waiting_for(f"deriving the equations of {system.name} by {method.name}"):
-            return program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, fallback=fallback)
-
-    def borrows() -> bool:
-        return solver == "auto" and program().sweep is not None and not program().newton
-
-    def texts() -> str:
-        interface = describe(program(), system, method, borrows=borrows(), monitor=monitor)
-        return json.dumps([_rendered(program(), borrows=borrows()).to_json(), interface.to_json()])
-
-    def remembered(name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
-        @cache
-        def source() -> Source | None:
-            text = remembered_text((*key, name), lambda: _text_of(make()))
-            return Source.from_json(text) if text else None
-
-        return source
-
-    def controlled() -> Source | None:
-        control = control_of(program()) if monitor is None else density_of(system, monitor)
-        return _rendered(program(), control, borrows=borrows()) if control else None
-
-    def fallback() -> Source | None:
-        return render(program(fallback=True), fallback="lent") if borrows() else None
-
-    def tangent() -> Source | None:
-        if system.integrands:
-            return None
-        return render_tangent(program_of(system, method, solver="newton", prefix=prefix, symmetries=symmetries))
-
-    texts_of = json.loads(remembered_text((*key, "integrator"), texts))
-    source, interface = Source.from_json(texts_of[0]), Interface.from_json(texts_of[1])
+    texts = _Texts(system, as_method(method, system), solver, prefix, symmetries, monitor)
+    own = json.loads(remembered_text((*texts.key, "integrator"), texts.integrator))
+    source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
     return Stepper(
         source,
         interface,
-        ensemble=remembered("ensemble", lambda: render_ensemble(program())),
-        controlled=remembered("controlled", controlled),
-        fallback=remembered("fallback", fallback),
-        tangent=remembered("tangent", tangent),
+        ensemble=texts.remembered("ensemble", lambda: render_ensemble(texts.program())),
+        controlled=texts.remembered("controlled", texts.controlled),
+        fallback=texts.remembered("fallback", texts.fallback),
+        tangent=texts.remembered("tangent", texts.tangent),
         flags=flags,
         events=as_events(events),
     )
 
 
-def _rendered(program: Program, control: Control | None = None, *, borrows: bool) -> Source:
-    return render(program, control, fallback="borrowed" if borrows else None)
+class _Texts:
+    """The texts of one integrator; equations are derived when one of them is first made."""
+
+    def __init__(
+        self,
+        system: MechanicalSystem,
+        method: Method,
+        solver: str,
+        prefix: str | None,
+        symmetries: Sequence[Symmetry],
+        monitor: str | Expr | None,
+    ) -> None:
+        self.system, self.method, self.solver, self.monitor = system, method, solver, monitor
+        self.key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries), str(monitor))
+        self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
+        self._programs: dict[bool, Program] = {}
+
+    def program(self, *, fallback: bool = False) -> Program:
+        """The program, with Newton's iteration behind its sweeps if that is the fallback."""
+        if fallback not in self._programs:
+            with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
+                self._programs[fallback] = self._derived(solver=self.solver, fallback=fallback)
+        return self._programs[fallback]
+
+    @property
+    def borrows(self) -> bool:
+        """Whether Newton's iteration is that of another library."""
+        return self.solver == "auto" and self.program().sweep is not None and not self.program().newton
+
+    def integrator(self) -> str:
+        """The text, and what a caller must know of it."""
+        interface = describe(self.program(), self.system, self.method, borrows=self.borrows, monitor=self.monitor)
+        return json.dumps([self._rendered().to_json(), interface.to_json()])
+
+    def controlled(self) -> Source | None:
+        """With steps that choose their length, if a curve tells their error, or whose density a monitor carries."""
+        control = control_of(self.program()) if self.monitor is None else density_of(self.system, self.monitor)
+        return self._rendered(control) if control else None
+
+    def fallback(self) -> Source | None:
+        """With Newton's iteration, where the text itself borrows it."""
+        return render(self.program(fallback=True), fallback="lent") if self.borrows else None
+
+    def tangent(self) -> Source | None:
+        """With derivatives of steps; none in transformed time."""
+        if self.system.integrands:
+            return None
+        found = self.program(fallback=True)
+        if not found.newton:  # explicit steps
+            found = self._derived(solver="newton")
+        return render_tangent(replace(found, sweep=None))
+
+    def _rendered(self, control: Control | None = None) -> Source:
+        return render(self.program(), control, fallback="borrowed" if self.borrows else None)
+
+    def remembered(self, name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
+        """Makes a text, or finds it where texts are kept."""
+
+        @cache
+        def source() -> Source | None:
+            text = remembered_text((*self.key, name), lambda: _text_of(make()))
+            return Source.from_json(text) if text else None
+
+        return source
 
 
 def _text_of(source: Source | None) -> str:

@@ -46,9 +46,9 @@ def test_the_text_of_an_ensemble_is_made_when_it_is_asked_for_and_then_kept(made
     stepper = sc.compile_stepper(spring(), sc.SVI(2))
     stepper.integrate([1.0], [0.0], h=0.1, steps=3)
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 1)
-    kept = pickle.loads(pickle.dumps(stepper))  # makes also those of steps of their own lengths, and of the fallback
+    kept = pickle.loads(pickle.dumps(stepper))  # makes also those of controlled steps, fallback and derivatives
     assert kept.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
-    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 4)
+    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 5)
     assert len(made) == 2  # with the fallback and without
 
 
