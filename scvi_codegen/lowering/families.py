@@ -22,9 +22,9 @@ __all__ = ["argument_name", "has_action", "lowered_family"]
 def has_action(system: MechanicalSystem) -> bool:
     """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist.
 
-    Nor does it where forces act: momenta are not its slopes.
+    Nor does it where forces act, or constraints hold: momenta are not its slopes.
     """
-    if system.forces:
+    if system.forces or system.constraints:
         return False
     return not isinstance(system, HamiltonianSystem) or system.is_regular
 
