@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.kinds import check_kind
+from scvi_codegen.mechanics.inputs import input_parameters
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
@@ -117,9 +118,10 @@ class Model:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """By name: the defaults of the system, but for an energy that is that of the initial state."""
-        level = self.system.clock.energy if self.system.clock else None
-        return {given.name: value for given, value in self.system.constants.items() if given != level}
+        """By name: the defaults of the system, but for an energy that is that of the initial state, and for inputs."""
+        others = {self.system.clock.energy.name} if self.system.clock else set()
+        others |= input_parameters(self.system.inputs).keys()
+        return {given.name: value for given, value in self.system.constants.items() if given.name not in others}
 
     @property
     def step(self) -> float:

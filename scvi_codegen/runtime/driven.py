@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.times import times_after
@@ -158,7 +160,7 @@ def drive(
                 pieces.append(run.record(1, progress=progress))
         if pieces and pieces[-1].ended_by is not None:
             break
-    return DrivenTrajectory(tuple(pieces))
+    return DrivenTrajectory(tuple(pieces) or (run.record(0),))
 
 
 def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
@@ -174,7 +176,7 @@ def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
             )
         inner |= {float(x) for x in data.breakpoints if low < x < high}
     ends = sorted(inner, reverse=t_end < t)
-    return [*ends, t_end]
+    return [*ends, *([t_end] if t_end != t else [])]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,6 +208,11 @@ class DrivenTrajectory:
     def velocity(self) -> Array:
         """(n, m) velocities."""
         return self._joined(lambda piece: piece.velocity)
+
+    def constraint_values(self) -> tuple[Array, Array]:
+        """(n, c) values of the constraints, and of their rates, at the states."""
+        g, rate = (self._joined(partial(_value_or_rate, k)) for k in range(2))
+        return g, rate
 
     @property
     def iterations(self) -> NDArray[np.int32]:
@@ -268,15 +275,23 @@ class DrivenTrajectory:
         return np.concatenate([found[0], *(each[1:] for each in found[1:])])
 
 
+def _value_or_rate(k: int, piece: Trajectory) -> Array:
+    return piece.constraint_values()[k]
+
+
 def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
     """Where a run with inputs leads."""
-    if t_end is not None:
-        return t_end
-    if h is None or steps is None:
-        raise StateError(
-            "a run with inputs leads to t_end, with h or by steps that choose their length, or takes steps of h"
-        )
-    return float(times_after(t, h, steps)[0])
+    t = checked_number(t, "the time t")
+    if (t_end is None) == (steps is None):
+        raise StateError("a run with inputs leads to t_end or takes steps of h: give one of t_end and steps")
+    if t_end is None:
+        if h is None:
+            raise StateError("steps that choose their length have no number: give t_end, or h and steps")
+        return float(times_after(t, checked_step(h), checked_count(steps, "steps", least=0))[0])
+    end = checked_number(t_end, "t_end")
+    if h is not None and (end - t) * checked_step(h) < 0.0:
+        raise StateError(f"steps of h = {h:g} do not lead from t = {t:g} to t_end = {end:g}")
+    return end
 
 
 def parameters_of(stepper: Integrator, given: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:

@@ -27,7 +27,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
-from scvi_codegen.runtime.inputs import Array, parameter_index
+from scvi_codegen.runtime.inputs import Array, check_inputs_given, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import record_states
@@ -39,10 +39,10 @@ __all__ = [
     "EnsembleParameters",
     "LaneBlock",
     "checked_ensemble",
-    "consistent_ensemble",
     "integrate_ensemble",
     "momenta_of_each",
     "parameters_of_each",
+    "start_of_ensemble",
 ]
 
 EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
@@ -94,9 +94,8 @@ class Ensemble:
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
         self.steps = checked_count(steps, "steps", least=0)
         self.every = checked_count(every, "every", least=1)
-        start_q, start_p = checked_ensemble(stepper, q, p)
+        start_q, start_p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.count = len(start_q)
-        self.parameters = parameters_of_each(stepper, parameters, self.count)
         if not stepper.has_energy(parameters):
             for j in range(self.count):
                 level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
@@ -352,15 +351,17 @@ def momenta_of_each(
     return np.array([stepper.momentum(position, v, at, value) for position, v, value in states])
 
 
-def consistent_ensemble(
+def start_of_ensemble(
     stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
-) -> tuple[Array, Array]:
-    """Initial states put on the constraints, each with its parameters (:func:`consistent`)."""
-    at, (positions, momenta) = checked_number(t, "the time t"), checked_ensemble(stepper, q, p)
+) -> tuple[Array, Array, Array]:
+    """(k, m) positions and momenta, put on the constraints where there are any, and (k, number of parameters)."""
+    check_inputs_given(stepper.interface, parameters)
+    positions, momenta = checked_ensemble(stepper, q, p)
     values = parameters_of_each(stepper, parameters, len(positions))
-    found = [consistent(stepper, q, p, at, own) for q, p, own in zip(positions, momenta, values, strict=True)]
-    q0, p0 = (np.array(part) for part in zip(*found, strict=True))
-    return q0, p0
+    if stepper.interface.constraints:
+        for k, own in enumerate(values):
+            positions[k], momenta[k] = consistent(stepper, positions[k], momenta[k], t, own)
+    return positions, momenta, values
 
 
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:

@@ -24,7 +24,7 @@ from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.driven import DrivenTrajectory, checked_inputs, drive, end_of, parameters_of
-from scvi_codegen.runtime.ensemble import consistent_ensemble, integrate_ensemble, momenta_of_each
+from scvi_codegen.runtime.ensemble import integrate_ensemble, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
@@ -164,8 +164,6 @@ class Stepper(Integrator):
         if self.interface.monitor:
             raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
         p = momenta_of_each(self, q, p, velocity, t, parameters)
-        if self.interface.constraints:
-            q, p = consistent_ensemble(self, q, p, t, parameters)
         if h is None and steps is None and t_end is not None:
             work = EnsembleToEnds(
                 self,
