@@ -304,7 +304,8 @@ class Stepper(Integrator):
     def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """The lambda with which g_q^T lambda are the forces that keep a state on its constraints: (c,), or (n, c).
 
-        d/dt L_v = L_q + f + g_q^T lambda: of ``x**2 + y**2 = l**2`` the tension of the rod is -2 l lambda. It is what
+        d/dt L_v = L_q + f + G^T lambda, G = g_q, or g_v of a constraint of velocities: of ``x**2 + y**2 = l**2`` the
+        tension of the rod is -2 l lambda. It is what
         the state itself says, as exact as the state.
         """
         found = multipliers(self, q, p, t, parameters)

@@ -31,6 +31,7 @@ CASES = {
     "kepler/verlet": ("kepler", StoermerVerlet()),
     "vortices/svi": ("vortices", SVI(2)),
     "linkage/svi": ("linkage", SVI(2, "gauss-lobatto:3")),
+    "sleigh/svi": ("sleigh", SVI(2, "gauss-lobatto:3")),
     "double/sc": ("double", SpectralCollocation(3)),
 }
 
