@@ -1,6 +1,6 @@
-/* States on the constraints g(q, t) = 0, or A v + b = 0 (their g is 0, the latter their rate), and the multipliers that
- * keep them there. Before it: legendre.h, newton.h, the kernels constraints and constrained_motion, and the places of the
- * slopes G = g_q, or A, in CONSTRAINT_ENTRY. */
+/* States on the constraints g(q, t) = 0, or A v + b = 0 (their g is 0, that their rate), and the multipliers that keep
+ * them there. Before it: legendre.h, newton.h, the kernels constraints and constrained_motion, and CONSTRAINT_ENTRY,
+ * the places of the slopes G = g_q, or A. */
 
 #define MOST_PROJECTIONS 100
 #define SETTLED REAL(1e-6) /* of a state, what an update may still want that rounding does not let come nearer */
