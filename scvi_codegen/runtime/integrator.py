@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
-from scvi_codegen.runtime.compiled_method import CompiledMethod
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -23,11 +22,12 @@ from scvi_codegen.runtime.inputs import (
     checked_vector,
     parameter_index,
 )
+from scvi_codegen.runtime.linearised import LinearisedMethod
 
 __all__ = ["Integrator"]
 
 
-class Integrator(CompiledMethod):
+class Integrator(LinearisedMethod):
     """What a compiled method computes."""
 
     def step(
@@ -276,46 +276,6 @@ class Integrator(CompiledMethod):
         if status:
             raise step_failure(status, report, step=0, h=h)
         return q1, p1, given
-
-    def jacobian(
-        self,
-        q: ArrayLike,
-        p: ArrayLike,
-        h: float,
-        t: float = 0.0,
-        parameters: Parameters = None,
-        *,
-        options: SolverOptions | None = None,
-    ) -> Array:
-        """d(q1, p1) / d(q0, p0) of a step, (2m, 2m), exact: of the map that its equations define.
-
-        Symplectic to round-off where the step is. Compiled when first asked for.
-
-        Raises:
-            MethodError: in transformed time.
-            StepFailedError: if Newton's iteration does not converge.
-        """
-        return self.tangent_step(self._vector(q, "q"), self._vector(p, "p"), h, t, parameters, options)[2]
-
-    def tangent_step(
-        self, q: Array, p: Array, h: float, t: float, parameters: Parameters, options: SolverOptions | None
-    ) -> tuple[Array, Array, Array]:
-        """(q1, p1) and the derivative."""
-        binding, m = self.tangent, self.dimension
-        q1, p1, derivative = np.empty_like(q), np.empty_like(p), np.empty((2 * m, 2 * m))
-        report = binding.new("report *")
-        status = binding.function("tangent")(
-            checked_number(t, "the time t"),
-            checked_step(h),
-            *map(binding.pointer, (q, p, self._parameters(parameters))),
-            binding.options(options),
-            *map(binding.pointer, (q1, p1, derivative)),
-            report,
-            binding.workspace(),
-        )
-        if status:
-            raise step_failure(status, report, step=0, h=h)
-        return q1, p1, derivative
 
     def step_positions(
         self,
