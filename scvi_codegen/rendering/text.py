@@ -270,8 +270,9 @@ def _context(
 def _scalar_kernels(
     program: Program, control: Control | None, kernels: Sequence[Kernel] | None = None
 ) -> tuple[Kernel, ...]:
+    own = program.kernels if kernels is None else kernels
     splitting = program.splitting.kernels if program.splitting else ()
-    return (*(program.kernels if kernels is None else kernels), *splitting, *((control.density,) if control and control.density else ()))
+    return (*own, *splitting, *((control.density,) if control and control.density else ()))
 
 
 def _is_cut(kernels: Iterable[Kernel]) -> bool:

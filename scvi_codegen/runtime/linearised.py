@@ -74,8 +74,8 @@ class LinearisedMethod(CompiledMethod):
 
     @property
     def given(self) -> int:
-        """Numbers that a step starts from: (q, p), parameters, t and h."""
-        return 2 * self.dimension + len(self.parameters) + 2
+        """Numbers that a step starts from: (q, p), parameters, t and h; MethodError where there are no derivatives."""
+        return self.tangent.constant("GIVEN")
 
     def jacobian(
         self,
@@ -135,8 +135,8 @@ class LinearisedMethod(CompiledMethod):
         values = checked_parameters(self.interface, parameters)
         vectors = np.zeros((2, count, self.given))
         vectors[0] = np.eye(count, self.given)
-        self.linearise(starts, vectors, values, options, chained=True)
-        return starts.q[1], starts.p[1], vectors[1, :, : 2 * self.dimension].T.copy()
+        q1, p1 = self.linearise(starts, vectors, values, options, chained=True)
+        return q1[0], p1[0], vectors[1, :, : 2 * self.dimension].T.copy()
 
     def linearise(
         self,
@@ -147,7 +147,7 @@ class LinearisedMethod(CompiledMethod):
         *,
         chained: bool = False,
         back: bool = False,
-    ) -> None:
+    ) -> tuple[Array, Array]:
         """Carry vectors along steps, in place.
 
         Args:
@@ -159,27 +159,28 @@ class LinearisedMethod(CompiledMethod):
             chained: whether the steps follow each other: all states of ``starts`` but the first are written.
             back: by the transpose: to those in i is added what step i makes of those in i + 1, slopes by what is given.
 
+        Returns:
+            (n, m) positions and momenta at the ends of the steps, solved anew.
+
         Raises:
             MethodError: in transformed time.
             StepFailedError: if Newton's iteration does not converge.
         """
         binding, m = self.tangent, self.dimension
         report = binding.new("report *")
-        q, p = binding.pointer(starts.q), binding.pointer(starts.p)
+        q1, p1 = (starts.q[1:], starts.p[1:]) if chained else np.empty((2, len(starts.h), m))
         status = binding.function("linearise")(
             len(starts.h),
-            *map(binding.pointer, (starts.t, starts.h)),
-            q,
-            p,
-            binding.pointer(parameters),
+            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
             binding.options(options),
             int(back),
             vectors.shape[1],
             binding.pointer(vectors),
-            *((q + m, p + m) if chained else (binding.null, binding.null)),
+            *map(binding.pointer, (q1, p1)),
             report,
             binding.workspace(),
         )
         if status:
             failed = int(report.steps) if not back else len(starts.h) - 1 - int(report.steps)
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
+        return q1, p1
