@@ -36,7 +36,7 @@ class Derivatives:
 
     program: Program
     by_given: tuple[GivenSlopes, ...]
-    lanes: int = 4
+    lanes: int = 8
 
     @property
     def families(self) -> tuple[tuple[Family, GivenSlopes], ...]:

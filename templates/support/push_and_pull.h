@@ -146,7 +146,7 @@ static int carry_over(const linearised_step *at, int back, int count, const real
   return all_finite(to, count * GIVEN) ? OK : NOT_FINITE;
 }
 
-SELDOM int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
+int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
     solver_report *report, real *workspace)
 {
