@@ -10,7 +10,6 @@ from sabotage import Case
 from samples import QUICK_FLAGS
 
 from scvi_codegen import SVI, LagrangianSystem, MethodError, StateError, compile_stepper, problem, reparametrise
-from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.step import DerivedStep
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.runtime.linearised import Starts
@@ -59,8 +58,7 @@ def by_differences(case, q, p, h, t):
     step = DerivedStep(system, paper_equations(system, case.method()))
 
     def end(numbers):
-        step.motion = ExactMotion(system, numbers[2 * m : -2])
-        found = step(numbers[:m], numbers[m : 2 * m], numbers[-1], numbers[-2])
+        found = step.with_parameters(numbers[2 * m : -2])(numbers[:m], numbers[m : 2 * m], numbers[-1], numbers[-2])
         return np.array([*found.q, *found.p])
 
     start, columns = [mp.mpf(x) for x in (*q, *p, *system.defaults, t, h)], []
