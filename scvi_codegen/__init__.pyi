@@ -14,6 +14,7 @@ from scvi_codegen.errors import BuildError as BuildError
 from scvi_codegen.errors import CacheWarning as CacheWarning
 from scvi_codegen.errors import EventError as EventError
 from scvi_codegen.errors import ExpressionError as ExpressionError
+from scvi_codegen.errors import FitError as FitError
 from scvi_codegen.errors import MethodError as MethodError
 from scvi_codegen.errors import MethodWarning as MethodWarning
 from scvi_codegen.errors import MissingLibraryError as MissingLibraryError
@@ -80,6 +81,10 @@ from scvi_codegen.runtime.driven import DrivenTrajectory as DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory as EnsembleTrajectory
 from scvi_codegen.runtime.events import Crossings as Crossings
 from scvi_codegen.runtime.events import Event as Event
+from scvi_codegen.runtime.fitting import Fit as Fit
+from scvi_codegen.runtime.fitting import fit as fit
+from scvi_codegen.runtime.gradients import Gradient as Gradient
+from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
 from scvi_codegen.runtime.run import Run as Run
 from scvi_codegen.runtime.stepper import Stepper as Stepper
 from scvi_codegen.runtime.trajectory import Trajectory as Trajectory

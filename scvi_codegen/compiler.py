@@ -35,6 +35,7 @@ from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.lowering.density import density_of
+from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
@@ -52,9 +53,9 @@ from scvi_codegen.rendering.text import (
     EMBEDDED,
     Embedded,
     render,
+    render_derivatives,
     render_embedded,
     render_ensemble,
-    render_tangent,
     workspace_size,
 )
 from scvi_codegen.rendering.text_cache import remembered_text
@@ -167,13 +168,14 @@ class _Texts:
         return render(self.program(fallback=True), fallback="lent") if self.borrows else None
 
     def tangent(self) -> Source | None:
-        """With derivatives of steps; none in transformed time."""
+        """With derivatives of steps by all they start from; none in transformed time."""
         if self.system.integrands:
             return None
         found = self.program(fallback=True)
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
-        return render_tangent(replace(found, sweep=None))
+        stages = discretise(self.system, self.method)
+        return render_derivatives(derivatives_of(self.system, stages, replace(found, sweep=None)))
 
     def _rendered(self, control: Control | None = None) -> Source:
         return render(self.program(), control, fallback="borrowed" if self.borrows else None)

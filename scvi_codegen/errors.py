@@ -12,6 +12,7 @@ __all__ = [
     "CacheWarning",
     "EventError",
     "ExpressionError",
+    "FitError",
     "MethodError",
     "MethodWarning",
     "MissingLibraryError",
@@ -59,6 +60,10 @@ class ExpressionError(SystemDefinitionError):
         start = max(0, column - 50)
         window = text[start : column + 30].replace("\n", " ")
         super().__init__(f"{message}\n  {window}\n  {' ' * (column - start)}^ column {column + 1}")
+
+
+class FitError(ScviCodegenError, ValueError):
+    """Measurements that do not tell what is asked of them."""
 
 
 class MethodError(ScviCodegenError, ValueError):

@@ -10,6 +10,7 @@ against this.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -52,6 +53,12 @@ class ExactMotion:
         self.second = system.auxiliaries or system.velocities
         self.parameters = [mp.mpf(value) for value in (system.defaults if parameters is None else parameters)]
         self.symbols = (*system.coordinates, *self.second, system.time, *system.parameters)
+
+    def with_parameters(self, parameters: Sequence[Number]) -> ExactMotion:
+        """The same functions with other values of the parameters, in order."""
+        found = copy(self)
+        found.parameters = [mp.mpf(value) for value in parameters]
+        return found
 
     @cached_property
     def _formula(self) -> Tape:

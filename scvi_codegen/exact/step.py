@@ -9,6 +9,7 @@ differences.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
@@ -55,7 +56,7 @@ class _Known:
 
 
 class DerivedStep:
-    """The stage equations of a system as functions of numbers; parameters have their default values."""
+    """The stage equations of a system as functions of numbers; parameters have default values, or others."""
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
@@ -73,6 +74,12 @@ class DerivedStep:
         self.momenta = numbers([*(row.momentum for row in stages.rows), stages.end_momentum])
         self.gathers = [[numbers(gather.table.entries) for gather in family.gathers] for family in stages.families]
         self.scatters = [[numbers(scatter.table.entries) for scatter in family.scatters] for family in stages.families]
+
+    def with_parameters(self, parameters: Sequence[Number]) -> DerivedStep:
+        """The same equations with other values of the parameters, in order."""
+        found = copy(self)
+        found.motion = self.motion.with_parameters(parameters)
+        return found
 
     @property
     def unknowns(self) -> int:

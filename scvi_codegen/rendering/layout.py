@@ -20,8 +20,14 @@ def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]]) -> st
     line = f"{declaration} = {{{', '.join(braced)}}};"
     if len(line) <= WIDTH:
         return line
-    lines = _lines(", ".join(braced), "    ", "    ") if isinstance(rows[0], str) else _rows(braced)
+    lines = _entries(braced) if isinstance(rows[0], str) else _rows(braced)
     return "\n".join([f"{declaration} = {{", *lines]) + "};"
+
+
+def _entries(braced: Sequence[str]) -> list[str]:
+    """Full lines of entries, each of which is on one."""
+    joined = ", ".join(entry.replace(" ", "\0") for entry in braced)
+    return [line.replace("\0", " ") for line in _lines(joined, "    ", "    ")]
 
 
 def _rows(braced: Sequence[str]) -> list[str]:

@@ -7,12 +7,13 @@ over the program's tables and the C that does not depend on it. Arithmetic arriv
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.derivatives import Derivatives
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.parts import parts
 from scvi_codegen.ir.program import Program
@@ -33,6 +34,7 @@ __all__ = [
     "EventSearch",
     "ExampleRun",
     "render",
+    "render_derivatives",
     "render_embedded",
     "render_events",
     "render_example",
@@ -122,11 +124,10 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 
 
-def render_tangent(program: Program) -> Source:
-    """The text of a program solved by Newton's iteration, with the derivative of a step by its start."""
-    context = _context(program, DOUBLE, None)
-    slopes = sum(each.points * (len(each.slope.results) - each.slope.values) for each in program.families)
-    return _render(program.prefix, context | {"tangent": slopes, "written_out": None})
+def render_derivatives(derivatives: Derivatives) -> Source:
+    """The text of a program solved by Newton's iteration, with the derivative of steps and its transpose."""
+    context = _context(derivatives.program, DOUBLE, None, kernels=(*derivatives.program.kernels, *derivatives.kernels))
+    return _render(derivatives.program.prefix, context | {"derivatives": derivatives, "written_out": None})
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
@@ -236,15 +237,21 @@ def scratch_size(program: Program) -> int:
 
 
 def _context(
-    program: Program, target: Target, control: Control | None, fallback: Fallback | None = None
+    program: Program,
+    target: Target,
+    control: Control | None,
+    fallback: Fallback | None = None,
+    *,
+    kernels: Sequence[Kernel] | None = None,
 ) -> dict[str, object]:
-    fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control)
+    kernels = program.kernels if kernels is None else kernels
+    fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
     return {
         "program": program,
         "prefix": program.prefix,
         "target": target,
         "real": target.scalar,
-        "kernels": program.kernels,
+        "kernels": kernels,
         "cut": _is_cut((*scalars, *(program.sweep.kernels if program.sweep else ()))),
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
         "workspace": workspace_size(program),
@@ -252,7 +259,7 @@ def _context(
         "max_iterations": MAX_ITERATIONS,
         "most_iterations": "INT_MAX",
         "embedded": False,
-        "tangent": 0,
+        "derivatives": None,
         "written_out": written_out(program, target),
         "fallback": fallback,
         **_control_context(program, control),
@@ -260,9 +267,12 @@ def _context(
     }
 
 
-def _scalar_kernels(program: Program, control: Control | None) -> tuple[Kernel, ...]:
+def _scalar_kernels(
+    program: Program, control: Control | None, kernels: Sequence[Kernel] | None = None
+) -> tuple[Kernel, ...]:
+    own = program.kernels if kernels is None else kernels
     splitting = program.splitting.kernels if program.splitting else ()
-    return (*program.kernels, *splitting, *((control.density,) if control and control.density else ()))
+    return (*own, *splitting, *((control.density,) if control and control.density else ()))
 
 
 def _is_cut(kernels: Iterable[Kernel]) -> bool:

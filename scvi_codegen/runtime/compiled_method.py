@@ -100,7 +100,7 @@ class CompiledMethod:
             if source is None:
                 raise MethodError(f"there are no derivatives of the steps of '{self.title}'")
             binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
-            self._with_tangent = binding.with_workspace(binding.constant("TANGENT_WORKSPACE"))
+            self._with_tangent = binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
         return self._with_tangent
 
     def _load_fallback(self) -> building.Library:

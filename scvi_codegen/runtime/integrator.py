@@ -15,7 +15,6 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
-from scvi_codegen.runtime.compiled_method import CompiledMethod
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -25,11 +24,12 @@ from scvi_codegen.runtime.inputs import (
     checked_vector,
     parameter_index,
 )
+from scvi_codegen.runtime.linearised import LinearisedMethod
 
 __all__ = ["Integrator"]
 
 
-class Integrator(CompiledMethod):
+class Integrator(LinearisedMethod):
     """What a compiled method computes."""
 
     def step(
@@ -274,36 +274,6 @@ class Integrator(CompiledMethod):
         q1, p1, given = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
         self._solve(self.binding.with_function("exchanges"), "exchanges", t, h, state, options, (q1, p1, given))
         return q1, p1, given
-
-    def jacobian(
-        self,
-        q: ArrayLike,
-        p: ArrayLike,
-        h: float,
-        t: float = 0.0,
-        parameters: Parameters = None,
-        *,
-        options: SolverOptions | None = None,
-    ) -> Array:
-        """d(q1, p1) / d(q0, p0) of a step, (2m, 2m), exact: of the map that its equations define.
-
-        Symplectic to round-off where the step is. Compiled when first asked for.
-
-        Raises:
-            MethodError: in transformed time.
-            StepFailedError: if Newton's iteration does not converge.
-        """
-        return self.tangent_step(self._vector(q, "q"), self._vector(p, "p"), h, t, parameters, options)[2]
-
-    def tangent_step(
-        self, q: Array, p: Array, h: float, t: float, parameters: Parameters, options: SolverOptions | None
-    ) -> tuple[Array, Array, Array]:
-        """(q1, p1) and the derivative."""
-        check_inputs_given(self.interface, parameters)
-        state, m = (q, p, self._parameters(parameters)), self.dimension
-        q1, p1, derivative = *np.empty((2, m)), np.empty((2 * m, 2 * m))
-        self._solve(self.tangent, "tangent", t, h, state, options, (q1, p1, derivative))
-        return q1, p1, derivative
 
     def step_positions(
         self,

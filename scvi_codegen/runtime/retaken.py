@@ -15,7 +15,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.dense_output import whole_steps
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 
-__all__ = ["retaken"]
+__all__ = ["refuse_strays", "retaken", "steps_between"]
 
 Found = TypeVar("Found")
 
@@ -41,16 +41,17 @@ def retaken(
     for k, (start, length, end) in enumerate(
         zip(states.t[:-1].tolist(), states.lengths[:-1].tolist(), states.t[1:].tolist(), strict=True)
     ):
-        count, given = _steps_between(length, end - start), []
+        count, given = steps_between(length, end - start), []
         q, p = states.q[k], states.p[k]
         for j in range(count):
             q, p, found = step(q, p, length if count > 1 else end - start, start + j * length)
             given.append(found)
-        _check_same(states, k + 1, q, p)
+        known = np.concatenate([states.q[k : k + 2], states.p[k : k + 2]], axis=1)
+        refuse_strays(states.t[k : k + 1], np.concatenate([q, p])[np.newaxis], known[1:], known[:1])
         yield given
 
 
-def _steps_between(length: float, span: float) -> int:
+def steps_between(length: float, span: float) -> int:
     """How many steps of a length; 1 for a last one that an event or the end cut short."""
     if np.isnan(length):
         raise StateError("this is known of whole steps: integrate without t_eval, and with every=1")
@@ -60,13 +61,21 @@ def _steps_between(length: float, span: float) -> int:
     return max(1, count)
 
 
-def _check_same(states: KeptStates, k: int, q: Array, p: Array) -> None:
-    """Beside the largest number of both states: of a momentum that is kept at 0 all is rounding."""
-    near = slice(k - 1, k + 1)
-    size = max(np.abs(states.q[near]).max(), np.abs(states.p[near]).max())
-    if not max(np.abs(q - states.q[k]).max(), np.abs(p - states.p[k]).max()) <= SAME_STATE * size:
+def refuse_strays(t: Array, found: Array, known: Array, before: Array) -> None:
+    """Raise :class:`StateError` for the first of n steps from t, solved anew, that does not lead where it led.
+
+    Beside the largest number of a state: of a momentum that is kept at 0 all is rounding.
+
+    Args:
+        t: (n,) times at which the steps begin.
+        found, known: (n, 2m) states at their ends.
+        before: (n, 2m) states at their starts.
+    """
+    sizes = np.maximum(np.abs(known).max(axis=1), np.abs(before).max(axis=1))
+    strays = np.flatnonzero(~(np.abs(found - known).max(axis=1) <= SAME_STATE * sizes))
+    if strays.size:
         raise StateError(
-            f"the steps from t = {states.t[k - 1]:g}, taken again, do not lead to the state kept at "
-            f"t = {states.t[k]:g}: their equations have several solutions (take shorter steps), or the motion is too "
-            "sensitive between the two (keep all states, every=1)"
+            f"what begins at t = {t[strays[0]]:g}, taken again, does not lead where it led in the run: the equations "
+            "of a step have several solutions (take shorter steps), or the motion is too sensitive between the kept "
+            "states (keep all, every=1)"
         )

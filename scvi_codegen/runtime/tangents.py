@@ -1,4 +1,4 @@
-"""How directions at the start of a run are carried along: tangent maps of its steps, and Lyapunov exponents.
+"""Lyapunov exponents: how fast nearby motions part, by the tangent maps of the steps of a run.
 
 The derivative is that of the computed map, lengths of steps held; of a symplectic method each factor is symplectic to
 round-off. Steps are taken again; a run stores nothing of it.
@@ -9,34 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 from scvi_codegen.runtime.retaken import retaken
 
-__all__ = ["carried", "lyapunov_exponents"]
-
-
-def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
-    """(n, 2m, k) what becomes of (2m, k) directions of (q, p); all 2m without any, the derivative of each state.
-
-    Raises:
-        StateError: for directions of another shape, and states that do not stand at whole steps.
-    """
-    size = 2 * states.stepper.dimension
-    given = np.eye(size) if directions is None else real_array(directions, "directions")
-    if given.ndim not in (1, 2) or len(given) != size:
-        raise StateError(f"directions have shape ({size},) or ({size}, k), not {given.shape}")
-    found = np.empty((len(states), *given.shape))
-    found[0] = given
-    for k, factors in enumerate(_factors(states)):
-        now = found[k]
-        for factor in factors:
-            now = factor @ now
-        found[k + 1] = now
-    return found
+__all__ = ["lyapunov_exponents"]
 
 
 def lyapunov_exponents(states: KeptStates) -> Array:

@@ -23,9 +23,11 @@ from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.exchanges import exchanged_until
+from scvi_codegen.runtime.gradients import Gradient, carried, pulled_back, sensitivity
 from scvi_codegen.runtime.kept_states import Array, KeptStates
+from scvi_codegen.runtime.linearised import Sensitivity
 from scvi_codegen.runtime.quantities import quantities
-from scvi_codegen.runtime.tangents import carried, lyapunov_exponents
+from scvi_codegen.runtime.tangents import lyapunov_exponents
 
 if TYPE_CHECKING:
     import pandas
@@ -122,6 +124,29 @@ class Trajectory(KeptStates):
             StateError: for directions of another shape, and states that do not stand at whole steps.
         """
         return carried(self, directions)
+
+    def sensitivity(self) -> Sensitivity:
+        """Derivatives of all states by the initial state, the parameters, the initial time and h, lengths held.
+
+        Of steps solved anew from the kept states, exact to round-off. For a few functions of the states
+        :meth:`pullback` costs less. Raises as :meth:`tangent`.
+        """
+        return sensitivity(self)
+
+    def pullback(self, cotangents: ArrayLike) -> Gradient:
+        """The gradient of a function of the states by the initial state, the parameters, the initial time and h.
+
+        One pass back along the run, whatever the number of parameters: the adjoint, exact to round-off of the computed
+        states. Where not all states are kept (``every``) the steps between them are taken again.
+
+        Args:
+            cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions.
+
+        Raises:
+            MethodError: in transformed time.
+            StateError: for another shape, and states that do not stand at whole steps.
+        """
+        return pulled_back(self, cotangents)
 
     def lyapunov_exponents(self) -> Array:
         """(2m,) Lyapunov exponents of the time that the run covers, descending; of symplectic maps their sum is 0."""

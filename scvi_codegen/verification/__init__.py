@@ -32,6 +32,7 @@ from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome
 from scvi_codegen.verification.convergence import convergence_checks
+from scvi_codegen.verification.derivatives import derivative_checks
 from scvi_codegen.verification.identities import identity_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import step_checks
@@ -92,6 +93,7 @@ def verify(
         *step_checks(subject),
         *(() if system.constraints else roundoff_checks(subject)),
         *structure_checks(subject),
+        *derivative_checks(subject),
         *convergence_checks(subject),
         *identity_checks(subject),
         largest_step(subject),

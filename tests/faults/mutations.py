@@ -37,6 +37,7 @@ from sabotage import changed_property, changed_result, of_entries
 from scvi_codegen.formulas import derivatives
 from scvi_codegen.ir import arithmetic, numbers
 from scvi_codegen.lowering import constraints as lowered_constraints
+from scvi_codegen.lowering import derivatives as lowered_derivatives
 from scvi_codegen.lowering import families
 from scvi_codegen.lowering.solvers import collocation as collocation_sweep
 from scvi_codegen.lowering.solvers import separable
@@ -84,6 +85,23 @@ ROUNDOFF = (
     ("weights of 53 bits", "round/svi-8", "sweep", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
     ("h^2 of 53 bits", "kepler/svi-3", "prepare_sweep", r"data->square_low = .*;", "data->square_low = 0.0;"),
     ("drifts of 53 bits", "kepler/svi-3", "sweep", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
+)
+
+DERIVATIVES = (
+    ("points at the time of the start", "driven/svi", "given_wide", r"f->abscissa\[n\], v", "0, v"),
+    ("arguments stretched by h too much", "cart/svi", "slopes_of", r"\(real\)loop->power \* ", ""),
+    ("results not stretched by h", "wire/lobatto-svi", "slopes_of", r"\*= \(real\)f->scatter\[s\]\.power / h", "*= 0"),
+    ("q1 by h at its start alone", "vortices/svi", "end_position", r"END_POSITION\[b\] \* z\[i \* B \+ b\]", "0"),
+    ("momenta held", "double/scvi", "push", r"momentum_rows\(at, 0\);", ""),
+    ("rows exchanged no more on the way back", "linkage/lobatto-svi", "lower_wide", r"if \(back\)", "if (0)"),
+    ("slopes by momenta lost on the way back", "double/gauss", "pull", r"momentum_rows\(at, 1\);", ""),
+    (
+        "time that does not pass on the way back",
+        "driven/svi",
+        "pull",
+        r"flow\(1, at->v \+ GIVEN_H - 1",
+        "flow(0, at->v",
+    ),
 )
 
 MUTATIONS = (
@@ -433,5 +451,17 @@ MUTATIONS = (
         r"y\[j\] = -y\[j\]",
         "y[j] = +y[j]",
         within=r"NAME\(multipliers\)",
+    ),
+    # Derivatives.
+    here(
+        "a slope by a parameter off by 1e-6",
+        case("double/svi"),
+        lowered_derivatives,
+        "jacobian",
+        changed_result(lambda found: found | {k: found[k] * sympy.Rational(1000001, 10**6) for k in list(found)[:1]}),
+    ),
+    *(
+        text(f"{what}, {where}", case(where), pattern, replacement, within=within)
+        for what, where, within, pattern, replacement in DERIVATIVES
     ),
 )

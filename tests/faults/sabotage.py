@@ -58,7 +58,7 @@ class Sabotage:
         self.patch.setattr(home, name, make(getattr(home, name)))
 
     def edit(self, pattern: str, replacement: str) -> None:
-        """Edit the first place of each C text, of the artefact, of Newton's solver and of lanes, with the pattern."""
+        """Edit the first place with the pattern of each C text: artefact, Newton's solver, lanes, derivatives."""
 
         def make(render: Callable[..., Any]) -> Callable[..., Any]:
             def rendered(program: Any, *control: Any, **where: Any) -> Any:
@@ -72,8 +72,8 @@ class Sabotage:
 
             return rendered
 
-        self.replace(compiler, "render", make)
-        self.replace(compiler, "render_ensemble", make)
+        for render in ("render", "render_ensemble", "render_derivatives"):
+            self.replace(compiler, render, make)
 
 
 def changed_result(change: Make) -> Make:

@@ -21,6 +21,7 @@ SCRIPTS = (
     "balanced_cart_pole",
     "collisions_in_space",
     "curves_and_quadratures",
+    "duffing_fit",
     "eccentric_comet",
     "hanging_chain",
     "custom_sympy_system",
@@ -179,3 +180,12 @@ def test_a_cart_balances_its_pole(tmp_path):
     assert float(later) < 0.05
     assert float(last) < 1e-3
     assert float(re.search(r"ends (\S+) away", output)[1]) < 1e-12
+
+
+def test_a_duffing_oscillator_is_found_in_a_noisy_recording(tmp_path):
+    output = output_of("duffing_fit", tmp_path)
+    for name, true in {"alpha": -1.0, "beta": 1.0, "delta": 0.3}.items():
+        value, error = map(float, re.search(rf"{name} += (\S+) \+- (\S+)", output).groups())
+        assert abs(value - true) < 3.0 * error < 0.02
+    assert abs(float(re.search(r"noise of (\S+),", output)[1]) - 0.02) < 0.002
+    assert "do not tell m, alpha, beta, delta and gamma apart" in output

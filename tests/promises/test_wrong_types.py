@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import numpy as np
 import pytest
 import samples
 from samples import QUICK_FLAGS
@@ -83,6 +84,8 @@ OF_STEPPERS: dict[str, dict[str, Any]] = {
     "integrate_ensemble": MOVED | {"q": [Q], "p": [P], "steps": 3, "every": 1, "threads": 1},
     "start": MOVED,
     "step": MOVED,
+    "jacobian": MOVED,
+    "sensitivity": MOVED,
     "momentum": {"q": Q, "v": P, "t": 0.0, "parameters": None},
     "velocity": STATE | {"t": 0.0, "parameters": None},
     "energy": STATE | {"t": 0.0, "parameters": None},
@@ -134,6 +137,11 @@ def test_pictures_refuse_wrong_types_by_name(name, run):
 
 def test_trajectories_refuse_wrong_types_by_name(run, tmp_path):
     refused(run.at, {"t": 0.1})
+    refused(run.pullback, {"cotangents": np.zeros((6, 4))})
+    refused(run.tangent, {"directions": Q + P})
+    known = {"stepper": run.stepper, "t": run.t, "measured": run.q, "q": Q, "p": P, "h": 0.1, "parameters": None}
+    asked = {"unknown": ["mu"], "state": True, "start": 0.0, "observed": ["q1", "q2"], "deviations": 1.0}
+    refused(sc.fit, known | asked | {"inputs": None, "bounds": {"mu": (0.0, 2.0)}})
     refused(run.crossings, {"events": "q1"})
     refused(run.save, {"path": tmp_path / "run.npz", "units": None})
     span = {"t_span": (0.0, 1.0), "y0": [*Q, *P], "method": None, "h": 0.1, "t_eval": None, "dense_output": False}

@@ -118,7 +118,7 @@ def test_what_has_no_derivative():
         stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=0).lyapunov_exponents()
     elsewhere = run.q.copy()
     elsewhere[2] += 0.01
-    with pytest.raises(StateError, match=r"from t = 0\.05, taken again, do not lead to the state kept at t = 0\.1"):
+    with pytest.raises(StateError, match=r"t = 0\.05, taken again, does not lead where it led"):
         replace(run, q=elsewhere).tangent()
     clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4))
     with pytest.raises(MethodError, match="no derivatives"):

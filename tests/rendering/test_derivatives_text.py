@@ -3,16 +3,19 @@
 import subprocess
 
 import pytest
-from samples import linkage
+from samples import linkage, pumped_cart_pole
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, problem
 from scvi_codegen.compiler import program_of
-from scvi_codegen.rendering.text import render_tangent
+from scvi_codegen.lowering.derivatives import derivatives_of
+from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.rendering.text import render_derivatives
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {
     "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),
+    "cart": (pumped_cart_pole(), SVI(1)),
     "pendulum": (problem("planar-pendulum").system, SVI(1)),
     "double": (problem("double-pendulum").system, SCVI(2)),
 }
@@ -22,7 +25,8 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_compiles_without_a_warning(name, compiler, tmp_path):
     system, method = CASES[name]
-    source = render_tangent(program_of(system, method, solver="newton")).amalgamated()
+    program = program_of(system, method, solver="newton")
+    source = render_derivatives(derivatives_of(system, discretise(system, method), program)).amalgamated()
     (tmp_path / f"{source.prefix}.h").write_text(source.header)
     (tmp_path / "all.c").write_text(source.code)
     check_style(source.code)

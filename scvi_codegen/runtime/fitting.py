@@ -1,0 +1,294 @@
+"""Parameters and initial states from measured motions: nonlinear least squares with the exact derivatives of the steps.
+
+The motion goes from measurement to measurement by equal steps no longer than h, so that it is known at each of their
+times, and what is minimised is a smooth function of the unknowns whose slopes are those of the computed states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import FitError, StateError, closest
+from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
+from scvi_codegen.native.arguments import real_array
+from scvi_codegen.pictures.residuals import ResidualPlot
+from scvi_codegen.runtime.driven import checked_inputs
+from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
+from scvi_codegen.runtime.measurements import Measurements, state_names
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["Fit", "fit"]
+
+SAME = 1e-10
+"""Beside slopes of size 1: what is smaller tells nothing but rounding."""
+SHARE = 0.1
+"""Of a direction that changes nothing: an unknown with less of it is not named."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """What measurements say of a motion.
+
+    Attributes:
+        names: of the k unknowns: parameters, then coordinates and momenta of the initial state.
+        values: (k,) of the unknowns.
+        covariance: (k, k) of their errors, to first order.
+        parameters: of the motion, all of them by name; q, p: (m,) its initial state.
+        t: (n,) times of the measurements, the initial state being that at ``start``.
+        observed: names of the c quantities measured.
+        computed, residuals: (n, c) what the motion has there; what the measurements have beyond it.
+        deviations: (c,) standard deviations of the noise, as given, else as the residuals tell.
+        evaluations: how often the motion was computed.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    parameters: dict[str, float]
+    q: Array
+    p: Array
+    start: float
+    t: Array
+    observed: tuple[str, ...]
+    computed: Array
+    residuals: Array
+    deviations: Array
+    evaluations: int
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """By the names of the unknowns."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def __str__(self) -> str:
+        width = max(map(len, self.names))
+        errors = self.standard_errors.values()
+        lines = [
+            f"{name:{width}} = {value:.8g} +- {error:.2g}"
+            for name, value, error in zip(self.names, self.values, errors, strict=True)
+        ]
+        return "\n".join(lines)
+
+    @property
+    def plot(self) -> ResidualPlot:
+        """``fit.plot()``, ``fit.plot("residuals.png")``: the residuals over time, beside the noise; Matplotlib axes."""
+        return ResidualPlot(self.t, self.residuals, self.deviations, self.observed)
+
+
+@takes(
+    StateError,
+    stepper=of("a compiled stepper", Stepper),
+    unknown=NAMES,
+    state=SWITCH,
+    observed=NAMES,
+    inputs=MAPPING,
+    bounds=MAPPING,
+)
+def fit(
+    stepper: Stepper,
+    t: ArrayLike,
+    measured: ArrayLike,
+    *,
+    q: ArrayLike,
+    p: ArrayLike | None = None,
+    velocity: ArrayLike | None = None,
+    h: float,
+    parameters: Mapping[str, float] | Sequence[float] | Array | None = None,
+    unknown: Sequence[str] | None = None,
+    state: bool = True,
+    start: float | None = None,
+    observed: Sequence[str] | None = None,
+    deviations: ArrayLike | None = None,
+    inputs: Mapping[str, Any] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+) -> Fit:
+    """Find parameters and the initial state of a motion from measurements, by nonlinear least squares.
+
+    Args:
+        stepper: system and method.
+        t: (n,) times, ascending.
+        measured: (n,) or (n, c) values; not a number where nothing was measured.
+        q, p, velocity: (m,) the initial state, one of p and velocity: a first guess, or, without ``state``, known.
+        h: steps are no longer than this.
+        parameters: first guesses of those unknown, values of the others; by default those of the system.
+        unknown: parameters to find, by default all but those of inputs.
+        state: whether the initial state is to be found, too.
+        start: time of the initial state, by default that of the first measurement.
+        observed: what the columns of ``measured`` are, coordinates and momenta (``"p_x"``, or of a Hamiltonian their
+            own names); by default the coordinates in order.
+        deviations: number or (c,), standard deviations of the noise; by default the same for all, and told by what is
+            left.
+        inputs: as of :meth:`Stepper.drive`.
+        bounds: (least, greatest) by names of unknowns.
+
+    Returns:
+        A :class:`Fit`.
+
+    Raises:
+        FitError: where the measurements do not tell an unknown, or no least squares are found.
+        MethodError: with constraints, and in transformed time.
+        StateError: on wrong shapes, names or numbers.
+        StepFailedError: if a step fails on the way.
+    """
+    from scipy.optimize import least_squares  # here: slow to import
+
+    measurements = Measurements.checked(
+        stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper, inputs)
+    )
+    model = _Model.checked(measurements, q, p, velocity, parameters, unknown, state=state)
+    if measurements.used.sum() < len(model.names):
+        raise FitError(f"{int(measurements.used.sum())} measurements do not tell {len(model.names)} unknowns")
+    found = least_squares(
+        model.residuals,
+        model.guess,
+        jac=model.slopes,
+        bounds=model.bounded(bounds or {}),
+        x_scale="jac",
+    )
+    if not found.success:
+        raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
+    _check_told(model.names, found.jac)
+    return model.fit(found.x, found.nfev, known_noise=deviations is not None)
+
+
+@dataclass(eq=False)
+class _Model:
+    """The motion as a function of the unknowns.
+
+    Attributes:
+        names, guess: (k,) of the unknowns.
+        places: (k,) where they stand among (q, p, parameters).
+        known: (2m + parameters,) values of all, those of the unknowns overwritten.
+    """
+
+    measurements: Measurements
+    names: tuple[str, ...]
+    places: NDArray[np.intp]
+    known: Array
+    at: Array | None = None
+
+    @classmethod
+    def checked(
+        cls,
+        measurements: Measurements,
+        q: ArrayLike,
+        p: ArrayLike | None,
+        velocity: ArrayLike | None,
+        parameters: Mapping[str, float] | Sequence[float] | Array | None,
+        unknown: Sequence[str] | None,
+        *,
+        state: bool,
+    ) -> _Model:
+        """From what users give."""
+        stepper, m = measurements.stepper, measurements.stepper.dimension
+        own = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
+        wanted = own if unknown is None else list(unknown)
+        for name in wanted:
+            if name not in own:
+                raise StateError(f"there is no parameter '{name}' to find{closest(name, own)}")
+        if p is None and not state:
+            raise StateError(
+                "momenta follow from velocities by way of the parameters: give p, or let the state be found, too"
+            )
+        values = checked_parameters(stepper.interface, parameters)
+        momenta = stepper.momenta_given(q, p, velocity, measurements.start, values)
+        places = [2 * m + stepper.parameters.index(name) for name in wanted]
+        names = (*wanted, *state_names(stepper)) if state else tuple(wanted)
+        places += range(2 * m) if state else ()
+        first = (checked_vector(stepper.interface, given, name) for given, name in ((q, "q"), (momenta, "p")))
+        known = np.concatenate([*first, values])
+        return cls(measurements, names, np.array(places, dtype=np.intp), known)
+
+    @property
+    def guess(self) -> Array:
+        """(k,) to begin with."""
+        return self.known[self.places]
+
+    def bounded(self, given: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
+        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given."""
+        low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
+        for name, ends in given.items():
+            if name not in self.names:
+                raise StateError(f"'{name}' is not among the unknowns, so has no bounds{closest(name, self.names)}")
+            pair, k = real_array(ends, f"the bounds of {name}"), self.names.index(name)
+            if pair.shape != (2,) or not pair[0] < self.guess[k] < pair[1]:
+                raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
+            low[k], high[k] = pair
+        return low, high
+
+    def residuals(self, x: Array) -> Array:
+        """Of all measurements, in standard deviations."""
+        return self._evaluated(x)[0]
+
+    def slopes(self, x: Array) -> Array:
+        """(measurements, k) of the same."""
+        return self._evaluated(x)[1]
+
+    def _all(self, x: Array) -> Array:
+        values = self.known.copy()
+        values[self.places] = x
+        return values
+
+    def _evaluated(self, x: Array) -> tuple[Array, Array]:
+        """Both, of one computation of the motion."""
+        if self.at is None or not np.array_equal(x, self.at):
+            measurements, values = self.measurements, self._all(x)
+            size = 2 * measurements.stepper.dimension
+            changes = np.zeros((len(x), measurements.stepper.given))
+            changes[np.arange(len(x)), self.places] = 1.0
+            computed, slopes = measurements.motion(values[:size], changes, values[size:])
+            self.at, self.computed = x.copy(), computed
+            scaled = (computed - measurements.measured) / measurements.deviations
+            self.found = scaled[measurements.used], (slopes / measurements.deviations[:, np.newaxis])[measurements.used]
+        return self.found
+
+    def fit(self, x: Array, evaluations: int, *, known_noise: bool) -> Fit:
+        """What was found."""
+        measurements, values = self.measurements, self._all(x)
+        m = measurements.stepper.dimension
+        scaled, slopes = self._evaluated(x)
+        free = len(scaled) - len(x)
+        noise = 1.0 if known_noise else float(np.sqrt(scaled @ scaled / free)) if free else np.nan
+        inverse = np.linalg.pinv(slopes)
+        return Fit(
+            names=self.names,
+            values=np.array(x),
+            covariance=noise**2 * inverse @ inverse.T,
+            parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=True)),
+            q=values[:m],
+            p=values[m : 2 * m],
+            start=measurements.start,
+            t=measurements.t,
+            observed=measurements.observed,
+            computed=self.computed,
+            residuals=measurements.measured - self.computed,
+            deviations=noise * measurements.deviations,
+            evaluations=evaluations,
+        )
+
+
+def _of_inputs(stepper: Stepper) -> set[str]:
+    return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
+
+
+def _check_told(names: Sequence[str], slopes: Array) -> None:
+    """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is."""
+    sizes = np.sqrt((slopes**2).sum(axis=0))
+    if nothing := np.flatnonzero(sizes <= SAME * sizes.max(initial=0.0)).tolist():
+        raise FitError(
+            f"these measurements do not tell {names[nothing[0]]}: they do not depend on it. Take it as known"
+        )
+    singular, directions = np.linalg.svd(slopes / sizes)[1:]
+    if singular[-1] > SAME * singular[0]:
+        return
+    shares = np.abs(directions[-1])
+    told = [names[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist()]
+    raise FitError(
+        f"these measurements do not tell {', '.join(told[:-1])} and {told[-1]} apart: changed together, they leave all "
+        "that is measured as it is. Take one of them as known"
+    )

@@ -1,0 +1,175 @@
+"""How the states of a run depend on its start and its parameters: changes carried along, slopes carried back.
+
+Derivatives are those of the computed map, lengths of steps held. They are made from the kept states; where several
+steps lie between these, they are taken again, from each kept state to the next, so that runs of many steps need little
+memory (checkpoints). That a step solved anew leads where it led in the run is checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import real_array
+from scvi_codegen.native.options import step_failure
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.kept_states import KeptStates
+from scvi_codegen.runtime.linearised import Sensitivity, Starts
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.retaken import refuse_strays, steps_between
+
+__all__ = ["Gradient", "carried", "pulled_back", "sensitivity"]
+
+MOST_STEPS = 1024
+"""Of a piece, where all states are kept."""
+SAME_LENGTH = 1e-9
+"""Of a step: by how much rounded times may seem to change it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gradient:
+    """How a function of the states of a run, or c of them, depends on what the run started from.
+
+    Attributes:
+        q, p: (m,) or (m, c) slopes by the initial state.
+        parameters: (k,) or (k, c) by the parameters, in the order of ``stepper.parameters``.
+        t: number or (c,) by the initial time, which moves all times.
+        h: the same by the length of all steps; ``None`` of a run whose steps have several.
+    """
+
+    q: Array
+    p: Array
+    parameters: Array
+    t: Array
+    h: Array | None
+
+
+def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
+    """(n, 2m, k) what becomes of (2m, k) directions of (q, p); all 2m without any, the derivative of each state.
+
+    Raises:
+        StateError: for directions of another shape, and states that do not stand at whole steps.
+    """
+    size = 2 * states.stepper.dimension
+    given = np.eye(size) if directions is None else real_array(directions, "directions")
+    if given.ndim not in (1, 2) or len(given) != size:
+        raise StateError(f"directions have shape ({size},) or ({size}, k), not {given.shape}")
+    changes = np.zeros((given.size // size, states.stepper.given))
+    changes[:, :size] = given.reshape(size, -1).T
+    return _forward(states, changes).reshape(len(states), *given.shape)
+
+
+def sensitivity(states: KeptStates) -> Sensitivity:
+    """Of all states, by all that the run started from."""
+    columns = _forward(states, np.eye(states.stepper.given))
+    return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_one_length(states))
+
+
+def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
+    """The transpose of :func:`sensitivity` applied to (n, 2m) or (n, 2m, c) slopes of functions by the states."""
+    size, m = 2 * states.stepper.dimension, states.stepper.dimension
+    slopes = real_array(cotangents, "cotangents")
+    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (len(states), size):
+        shape = f"({len(states)}, {size})"
+        raise StateError(
+            f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
+        )
+    seeds = np.zeros((len(states), slopes[0].size // size, states.stepper.given))
+    seeds[:, :, :size] = slopes.reshape(len(states), size, -1).transpose(0, 2, 1)
+    now = np.zeros_like(seeds[0])
+    for first, last in reversed(list(_pieces(states))):
+        starts, numbers = _starts(states, first, last)
+        vectors = np.zeros((len(numbers), *now.shape))
+        kept = np.flatnonzero(numbers[1:] > 0) + 1
+        vectors[kept] = seeds[numbers[kept]]
+        vectors[-1] += now
+        _carry(states, starts, numbers, vectors, back=True)
+        now = vectors[0]
+    found = (now + seeds[0]).T.reshape(states.stepper.given, *slopes.shape[2:])
+    return Gradient(
+        q=found[:m],
+        p=found[m:size],
+        parameters=found[size:-2],
+        t=found[-2],
+        h=found[-1] if _has_one_length(states) else None,
+    )
+
+
+def _forward(states: KeptStates, changes: Array) -> Array:
+    """(n, 2m, count) what becomes of (count, given) changes at the start."""
+    size = 2 * states.stepper.dimension
+    found = np.empty((len(states), size, len(changes)))
+    found[0] = changes[:, :size].T
+    for first, last in _pieces(states):
+        starts, numbers = _starts(states, first, last)
+        vectors = np.zeros((len(numbers), *changes.shape))
+        vectors[0] = changes
+        _carry(states, starts, numbers, vectors, back=False)
+        kept = np.flatnonzero(numbers[1:] > 0) + 1
+        found[numbers[kept]] = vectors[kept, :, :size].transpose(0, 2, 1)
+        changes = vectors[-1]
+    return found
+
+
+def _carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
+    """Along the steps of a piece, whose ends are held against the states it is made of."""
+    ends = states.stepper.linearise(starts, vectors, states.parameters, states.options, back=back)
+    known = np.concatenate([starts.q, starts.p], axis=1)
+    refuse_strays(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
+
+
+def _pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
+    """First and last number of kept states: with no steps between them but those that are kept, or just two."""
+    spans, lengths = np.diff(states.t), states.lengths[:-1]
+    several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
+    first = 0
+    while first < len(spans):
+        last = first + 1
+        if not several[first]:
+            ahead = several[first : first + MOST_STEPS]
+            last = first + (int(np.argmax(ahead)) if ahead.any() else len(ahead))
+        yield first, last
+        first = last
+
+
+def _starts(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
+    """The steps of a piece, and (steps + 1,) the number of the kept state at each of their ends, -1 where none is."""
+    length, span = float(states.lengths[first]), float(states.t[last] - states.t[first])
+    count = steps_between(length, span) if last == first + 1 else 1
+    if count == 1:
+        spans, lengths = np.diff(states.t[first : last + 1]), states.lengths[first:last]
+        h = np.where(np.abs(spans - lengths) < SAME_LENGTH * np.abs(lengths), lengths, spans)
+        of = slice(first, last + 1)
+        starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())
+        return starts, np.arange(first, last + 1)
+    t, h = states.t[first] + length * np.arange(count), np.full(count, length)
+    starts = Starts.chain(states.q[first], states.p[first], t, h)
+    run = Memory.started(
+        states.stepper,
+        states.q[first],
+        states.p[first],
+        h=length,
+        t=float(t[0]),
+        parameters=states.parameters,
+        options=states.options,
+    )
+    status, report = run.advance(count, 1, np.empty(count), starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
+    if status:
+        raise step_failure(status, report, step=run.steps, h=length)
+    numbers = np.full(count + 1, -1)
+    numbers[[0, -1]] = first, last
+    starts.q[-1], starts.p[-1] = states.q[last], states.p[last]
+    return starts, numbers
+
+
+def _has_one_length(states: KeptStates) -> bool:
+    """Whether all steps are of h."""
+    if states.goal is not None:
+        return False
+    spans = np.diff(states.t)
+    steps = np.rint(spans / states.h)
+    return bool((np.abs(spans - steps * states.h) <= SAME_LENGTH * abs(states.h) * np.maximum(1.0, steps)).all())

@@ -1,0 +1,138 @@
+"""Measurements of a motion, and the steps that lead to them, with what their values change by.
+
+The motion goes from measurement to measurement by equal steps no longer than h, so that it is known at each of their
+times. Breakpoints of inputs are ends of steps, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import MethodError, StateError, closest
+from scvi_codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.runtime.dense_output import checked_times
+from scvi_codegen.runtime.driven import Input, parameters_of
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["Measurements", "state_names"]
+
+WHOLE = 1e-9
+"""Of a step: what rounding may leave of a span."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Measurements, and the steps that lead to them.
+
+    Attributes:
+        measured, used: (n, c) values, and whether there is one.
+        columns: (c,) where they stand in (q, p).
+        pieces: steps with the same parameters: times and lengths.
+        places: (n,) after how many steps.
+    """
+
+    stepper: Stepper
+    t: Array
+    start: float
+    measured: Array
+    observed: tuple[str, ...]
+    columns: NDArray[np.intp]
+    deviations: Array
+    inputs: Mapping[str, Input]
+    pieces: tuple[tuple[Array, Array], ...]
+    places: NDArray[np.intp]
+
+    @classmethod
+    def checked(
+        cls,
+        stepper: Stepper,
+        t: ArrayLike,
+        measured: ArrayLike,
+        observed: Sequence[str] | None,
+        deviations: ArrayLike | None,
+        start: float | None,
+        h: float,
+        inputs: Mapping[str, Input],
+    ) -> Measurements:
+        """From what users give."""
+        if stepper.constraints:
+            raise MethodError("motions with constraints are not fitted: an initial state does not vary freely on them")
+        times, values = checked_times(t, "t"), real_array(measured, "measured")
+        if times.ndim != 1 or not len(times) or (np.diff(times) <= 0.0).any():
+            raise StateError("t is a list of ascending times")
+        names = tuple(observed or stepper.coordinates)
+        values = values[:, np.newaxis] if values.ndim == 1 and len(names) == 1 else values
+        if values.shape != (len(times), len(names)):
+            wanted = f"({len(times)}, {len(names)}) for {', '.join(names)}"
+            raise StateError(f"measured has shape {wanted}, not {values.shape}; observed=[..] names its columns")
+        sizes = np.ones(len(names)) if deviations is None else real_array(deviations, "deviations")
+        if sizes.shape not in ((), (len(names),)) or not (sizes > 0.0).all():
+            raise StateError(f"deviations are a positive number, or one for each of {', '.join(names)}")
+        first = float(times[0]) if start is None else checked_number(start, "the time start")
+        if first > times[0]:
+            raise StateError(f"the initial state, at t = {first:g}, is that before the first measurement")
+        pieces, places = _steps(first, times, abs(checked_step(h)), inputs)
+        columns = np.array([_column(stepper, name) for name in names])
+        sizes = np.broadcast_to(sizes, (len(names),)).copy()
+        return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, places)
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """(n, c) where there is a value."""
+        return np.isfinite(self.measured)
+
+    def motion(self, state: Array, changes: Array, parameters: Array) -> tuple[Array, Array]:
+        """(n, c) values at the measurements, (n, c, k) what they change by where the start does by (k, given)."""
+        m, done = self.stepper.dimension, 0
+        values, slopes = np.empty_like(self.measured), np.empty((*self.measured.shape, len(changes)))
+        for t, h in self.pieces:
+            at = parameters_of(self.stepper, parameters, self.inputs)(float(t[0]) + 0.5 * float(h[0]))
+            starts = Starts.chain(state[:m], state[m:], t, h)
+            vectors = np.zeros((len(h) + 1, *changes.shape))
+            vectors[0] = changes
+            self.stepper.linearise(starts, vectors, at, None, chained=True)
+            states = np.concatenate([starts.q, starts.p], axis=1)
+            here = np.flatnonzero((self.places >= done) & (self.places <= done + len(h)))
+            rows = self.places[here] - done
+            values[here] = states[rows][:, self.columns]
+            slopes[here] = vectors[rows][:, :, self.columns].transpose(0, 2, 1)
+            state, changes, done = states[-1], vectors[-1], done + len(h)
+        return values, slopes
+
+
+def _steps(
+    start: float, t: Array, h: float, inputs: Mapping[str, Input]
+) -> tuple[tuple[tuple[Array, Array], ...], NDArray[np.intp]]:
+    """Steps to all times by way of the breakpoints of inputs, in pieces between these; after how many each time is."""
+    breaks = np.concatenate([np.empty(0), *(data.breakpoints for data in inputs.values())])
+    breaks = np.unique(breaks[(breaks > start) & (breaks < t[-1])])
+    nodes = np.unique(np.concatenate([[start], t, breaks]))
+    spans = np.diff(nodes)
+    counts = np.maximum(1, np.ceil(spans / h - WHOLE)).astype(np.intp)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    within = np.arange(ends[-1]) - np.repeat(ends[:-1], counts)
+    lengths = np.repeat(spans / counts, counts)
+    starts = np.repeat(nodes[:-1], counts) + within * lengths
+    cuts = ends[np.searchsorted(nodes, breaks)]
+    pieces = zip(np.split(starts, cuts), np.split(lengths, cuts), strict=True)
+    return tuple(piece for piece in pieces if len(piece[1])), ends[np.searchsorted(nodes, t)]
+
+
+def state_names(stepper: Stepper) -> tuple[str, ...]:
+    """Of coordinates and momenta."""
+    momenta = stepper.interface.momentum_names or tuple(f"p_{name}" for name in stepper.coordinates)
+    return (*stepper.coordinates, *momenta)
+
+
+def _column(stepper: Stepper, name: str) -> int:
+    names = state_names(stepper)
+    if name not in names:
+        raise StateError(f"'{name}' cannot be observed, only coordinates and momenta{closest(name, names)}")
+    return names.index(name)

@@ -1,0 +1,171 @@
+/* The derivative of steps, and its transpose, exact: those of the map which the solved equations define. Before it:
+ * newton_from_line.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated. */
+
+enum {
+  COUNT_OF_FAMILIES = sizeof FAMILIES / sizeof *FAMILIES
+};
+
+/* What one step is linearised by: the solved step; its slopes at points; room for what changes. */
+typedef struct {
+  const step_data *step;
+  newton_data data;
+  band shape;
+  real *slopes;
+  wide *v, *dz, *rows, *x, *points;
+} linearised_step;
+
+static linearised_step linearised_in(const step_data *step, real *workspace)
+{
+  linearised_step at;
+  at.step = step;
+  at.data = newton_in(workspace + SCRATCH);
+  at.shape = band_of(SITES, B);
+  at.slopes = workspace + WORKSPACE;
+  at.v = (wide *)(at.slopes + SLOPES);
+  at.dz = at.v + GIVEN;
+  at.rows = at.dz + N;
+  at.x = at.rows + SITES * (B + 1);
+  at.points = at.x + N;
+  return at;
+}
+
+/* The step solved, its equations factorised, its slopes evaluated. */
+static int linearise_step(const linearised_step *at, const solver_options *options, real *q1, real *p1,
+    solver_report *report)
+{
+  const step_data *step = at->step;
+  real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *slopes = at->slopes;
+  int keep = 0, status = newton_from_line(step, &at->data, dp, &keep, options, report);
+  if (status != OK)
+    return status;
+  evaluate(step, at->data.z, at->data.rows, size_p, size_q, at->data.factors, &at->shape);
+  if (!factorise(at->data.factors, &at->shape, at->data.pivot))
+    return SINGULAR;
+  for (int f = 0; f < COUNT_OF_FAMILIES; f++)
+    slopes = slopes_of(FAMILIES + f, step, at->data.z, slopes);
+  gather(END_POSITION, 1, step->h, at->data.z, M, dq, 0, 1);
+  for (int i = 0; q1 && i < M; i++) {
+    q1[i] = step->q0[i] + dq[i];
+    p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
+  }
+  return OK;
+}
+
+/* From v (or where back: to it) to all rows, or from dz to the last one, that of p1, by way of all points. */
+static void through_points(const linearised_step *at, int back, wide *v, wide *dz)
+{
+  const real *slopes = at->slopes;
+  for (int f = 0; f < COUNT_OF_FAMILIES; f++)
+    slopes = through_family(FAMILIES + f, at->step->h, back, slopes, at->points, v, dz, at->rows);
+}
+
+/* dz = -(matrix)^-1 rows, the last row of each site left out. */
+static void solve_forward(const linearised_step *at)
+{
+  for (int i = 0; i < N; i++)
+    at->x[PLACE[i / B] * B + i % B] = at->rows[i / B * (B + 1) + i % B];
+  solve_wide(at->data.factors, &at->shape, at->data.pivot, 0, at->x);
+  memset(at->dz, 0, sizeof(wide) * N);
+  for (int i = 0; i < N; i++)
+    flow(0, at->dz + i, -1, at->x + PLACE[i / B] * B + i % B);
+}
+
+/* rows = -(transposed matrix)^-1 dz. */
+static void solve_back(const linearised_step *at)
+{
+  memset(at->x, 0, sizeof(wide) * N);
+  for (int i = 0; i < N; i++)
+    flow(1, at->dz + i, -1, at->x + PLACE[i / B] * B + i % B);
+  solve_wide(at->data.factors, &at->shape, at->data.pivot, 1, at->x);
+  for (int i = 0; i < N; i++)
+    at->rows[i / B * (B + 1) + i % B] = at->x[PLACE[i / B] * B + i % B];
+}
+
+/* How q1 depends on q0, on unknowns and on h. */
+static void end_position(const linearised_step *at, int back)
+{
+  const real h = at->step->h, *z = at->data.z;
+  for (int i = 0; i < M; i++)
+    for (int b = 0; b < B; b++) {
+      flow(back, at->v + i, h * END_POSITION[b], at->dz + i * B + b);
+      flow(back, at->v + i, END_POSITION[b] * z[i * B + b], at->v + GIVEN_H);
+    }
+}
+
+/* How rows depend on p0. */
+static void momentum_rows(const linearised_step *at, int back)
+{
+  for (int i = 0; i < M; i++)
+    for (int r = 0; r < B; r++)
+      flow(back, at->rows + i * (B + 1) + r, MOMENTUM_ROW[r], at->v + M + i);
+}
+
+/* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
+static void push(const linearised_step *at)
+{
+  memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
+  momentum_rows(at, 0);
+  through_points(at, 0, at->v, NULL);
+  solve_forward(at);
+  through_points(at, 0, NULL, at->dz);
+  end_position(at, 0);
+  for (int i = 0; i < M; i++)
+    flow(0, at->v + M + i, 1, at->rows + i * (B + 1) + B);
+  flow(0, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
+}
+
+/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose of push. */
+static void pull(const linearised_step *at)
+{
+  memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
+  memset(at->dz, 0, sizeof(wide) * N);
+  flow(1, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
+  for (int i = 0; i < M; i++)
+    flow(1, at->v + M + i, 1, at->rows + i * (B + 1) + B);
+  end_position(at, 1);
+  through_points(at, 1, NULL, at->dz);
+  solve_back(at);
+  through_points(at, 1, at->v, NULL);
+  momentum_rows(at, 1);
+}
+
+/* Adds to vectors `to` what the step makes of `from`, LANES at a time. */
+static int carry_over(const linearised_step *at, int back, int count, const real *from, real *to)
+{
+  for (int first = 0; first < count; first += LANES) {
+    const int lanes = least(LANES, count - first);
+    memset(at->v, 0, sizeof(wide) * GIVEN);
+    for (int j = 0; j < lanes; j++)
+      for (int i = 0; i < GIVEN; i++)
+        at->v[i].lane[j] = from[(first + j) * GIVEN + i];
+    (back ? pull : push)(at);
+    for (int j = 0; j < lanes; j++)
+      for (int i = 0; i < GIVEN; i++)
+        to[(first + j) * GIVEN + i] += at->v[i].lane[j];
+  }
+  return all_finite(to, count * GIVEN) ? OK : NOT_FINITE;
+}
+
+int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
+    const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
+    solver_report *report, real *workspace)
+{
+  const solver_options standard = NAME(default_options)();
+  const real carry[M] = {0};
+  const long long across = (long long)count * GIVEN;
+  memset(report, 0, sizeof *report);
+  for (long long done = 0; done < steps; done++) {
+    const long long k = back ? steps - 1 - done : done;
+    const step_data step = {t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace, 1, NULL};
+    const linearised_step at = linearised_in(&step, workspace);
+    int status;
+    report->t = t[k];
+    status = linearise_step(&at, options ? options : &standard, q1 ? q1 + k * M : NULL, p1 ? p1 + k * M : NULL, report);
+    if (status == OK)
+      status = carry_over(&at, back, count, vectors + (k + back) * across, vectors + (k + !back) * across);
+    if (status != OK)
+      return status;
+    report->steps++;
+  }
+  return OK;
+}

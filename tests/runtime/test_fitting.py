@@ -1,0 +1,180 @@
+"""Parameters and initial states from measurements: against DOP853 and curve_fit, and errors that mean what they say."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS, linkage
+from scipy.integrate import solve_ivp
+from scipy.optimize import curve_fit
+
+from scvi_codegen import SVI, FitError, LagrangianSystem, MethodError, StateError, compile_stepper, fit
+
+TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
+NOISE = 0.01
+TIMES = np.sort(np.random.default_rng(0).uniform(0.0, 20.0, 150))
+GUESS = {"q": [0.7], "velocity": [0.2], "h": 0.1, "start": 0.0, "parameters": TRUE | {"alpha": -0.9, "delta": 0.3}}
+SOME = ["alpha", "beta", "delta"]
+
+
+@cache
+def oscillator():
+    system = LagrangianSystem.from_text(
+        name="oscillator",
+        coordinates=["x"],
+        lagrangian="m*x_dot**2/2 - alpha*x**2/2 - beta*x**4/4",
+        parameters=TRUE,
+        forces={"x": "gamma*cos(omega*t)"},
+        dissipation="delta*x_dot**2/2",
+    )
+    return compile_stepper(system, SVI(6), flags=QUICK_FLAGS)
+
+
+def exact(t, alpha, beta, delta, x, p):
+    """(2, n) positions and momenta, by DOP853."""
+    m, gamma, omega = TRUE["m"], TRUE["gamma"], TRUE["omega"]
+
+    def rates(at, y):
+        return [y[1] / m, gamma * np.cos(omega * at) - alpha * y[0] - beta * y[0] ** 3 - delta * y[1] / m]
+
+    return solve_ivp(rates, (0.0, t[-1]), [x, p], method="DOP853", t_eval=t, rtol=1e-12, atol=1e-12).y
+
+
+@cache
+def motion():
+    return exact(TIMES, TRUE["alpha"], TRUE["beta"], TRUE["delta"], 0.8, 0.1)
+
+
+def recorded(seed=None):
+    values = motion()
+    return values if seed is None else values + NOISE * np.random.default_rng(seed).normal(size=values.shape)
+
+
+def test_without_noise_the_truth_is_found():
+    found = fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
+    assert found.names == (*SOME, "x", "p_x")
+    assert_allclose(found.values, [TRUE[name] for name in SOME] + [0.8, 0.1], rtol=1e-9)
+    assert_allclose([found.q[0], found.p[0]], [0.8, 0.1], rtol=1e-9)
+    assert found.parameters == TRUE | dict(zip(SOME, found.values, strict=False))
+    assert np.abs(found.residuals).max() < 1e-9
+
+
+def test_values_and_errors_are_those_of_curve_fit():
+    """Which integrates with DOP853, and takes differences for slopes."""
+    measured = recorded(1)[0]
+    found = fit(oscillator(), TIMES, measured, unknown=SOME, **GUESS)
+    values, covariance = curve_fit(
+        lambda t, *x: exact(t, *x)[0], TIMES, measured, p0=[-0.9, 0.8, 0.3, 0.7, 0.2], xtol=1e-12, ftol=1e-12
+    )
+    assert_allclose(found.values, values, rtol=1e-6)
+    assert_allclose(found.covariance, covariance, rtol=1e-3, atol=1e-3 * np.abs(covariance).max())
+    assert_allclose(found.deviations, NOISE, rtol=0.15)
+    assert list(found.standard_errors) == list(found.names)
+    assert "alpha = " in str(found)
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    """The sum of squares of 5 errors, in their own deviations, over 40 series of noise: chi squared, 200 +- 20."""
+    true, total = np.array([*(TRUE[name] for name in SOME), 0.8, 0.1]), 0.0
+    for seed in range(40):
+        found = fit(oscillator(), TIMES, recorded(100 + seed)[0], unknown=SOME, deviations=NOISE, **GUESS)
+        away = found.values - true
+        total += away @ np.linalg.solve(found.covariance, away)
+    assert 140.0 < total < 260.0
+
+
+def test_several_quantities_with_gaps_and_noise_of_their_own():
+    both = recorded(2).T.copy()
+    both[:, 1] += 9 * NOISE * np.random.default_rng(3).normal(size=len(TIMES))
+    both[::7, 0] = np.nan
+    sizes = [NOISE, np.sqrt(82.0) * NOISE]
+    found = fit(oscillator(), TIMES, both, observed=["x", "p_x"], deviations=sizes, unknown=SOME, **GUESS)
+    alone = fit(oscillator(), TIMES, both[:, 0], deviations=NOISE, unknown=SOME, **GUESS)
+    assert_allclose(found.values, alone.values, atol=4 * np.sqrt(np.diag(alone.covariance)).max())
+    assert (np.diag(found.covariance) < np.diag(alone.covariance)).all()
+    assert np.isnan(found.residuals[::7, 0]).all()
+    held = fit(oscillator(), TIMES, both[:, 0], bounds={"delta": (0.25, 0.5)}, unknown=SOME, **GUESS)
+    assert held.values[2] == pytest.approx(0.25, abs=1e-6)
+
+
+def test_a_known_start_and_inputs_that_are_data():
+    """The cart is pushed as measured; what is known is not found."""
+    system = LagrangianSystem.from_text(
+        name="pushed",
+        coordinates=["x"],
+        lagrangian="m*x_dot**2/2 - k*x**2/2",
+        parameters={"m": 1.5, "k": 2.0},
+        forces={"x": "u"},
+        inputs=["u"],
+    )
+    stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
+    push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
+    run = stepper.drive([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
+    times = np.linspace(0.13, 7.9, 60)
+    found = fit(
+        stepper,
+        times,
+        run.at(times)[0],
+        q=[0.5],
+        p=[0.0],
+        start=0.0,
+        h=0.05,
+        inputs=push,
+        state=False,
+        parameters={"m": 1.0, "k": 1.0},
+    )
+    assert found.names == ("m", "k")
+    assert_allclose(found.values, [1.5, 2.0], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"unknown": [*SOME, "m", "gamma"]}, "do not tell alpha, beta, delta, m and gamma apart"),
+        ({"unknown": ["omega"], "parameters": TRUE | {"gamma": 0.0}}, "do not tell omega: they do not depend on it"),
+    ],
+)
+def test_what_the_measurements_do_not_tell_is_named(options, message):
+    with pytest.raises(FitError, match=message):
+        fit(oscillator(), TIMES, recorded(5)[0], **(GUESS | options))
+
+
+def test_two_measurements_do_not_tell_five_unknowns():
+    with pytest.raises(FitError, match="2 measurements do not tell 5 unknowns"):
+        fit(oscillator(), TIMES[:2], recorded()[0][:2], unknown=SOME, **GUESS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"unknown": ["alfa"]}, "no parameter 'alfa' to find; did you mean 'alpha'"),
+        ({"observed": ["v"]}, "'v' cannot be observed"),
+        ({"observed": ["x", "p_x"]}, r"measured has shape \(150, 2\) for x, p_x, not \(150,\)"),
+        ({"deviations": -1.0}, "deviations are a positive number"),
+        ({"start": 1.0}, "before the first measurement"),
+        ({"state": False}, "give p, or let the state be found"),
+        ({"bounds": {"k": (0, 1)}}, "'k' is not among the unknowns"),
+        ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
+        ({"h": 0.0}, "the step h is 0"),
+    ],
+)
+def test_what_is_wrong_is_named(options, message):
+    with pytest.raises(StateError, match=message):
+        fit(oscillator(), TIMES, recorded()[0], **(GUESS | {"unknown": SOME} | options))
+
+
+def test_times_ascend_and_constraints_are_not_fitted():
+    with pytest.raises(StateError, match="ascending"):
+        fit(oscillator(), TIMES[::-1], recorded()[0], **GUESS)
+    bars = compile_stepper(linkage(), SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
+    with pytest.raises(MethodError, match="constraints are not fitted"):
+        fit(bars, [0.0, 0.1], np.zeros((2, 4)), q=[0, 1, 1.94, 1.5], p=np.zeros(4), h=0.1)
+
+
+def test_residuals_are_drawn():
+    found = fit(oscillator(), TIMES, recorded(6)[0], unknown=SOME, **GUESS)
+    axes = found.plot()
+    assert_allclose(axes.get_lines()[0].get_ydata(), found.residuals[:, 0])
+    inside = np.abs(found.residuals) < 2 * found.deviations
+    assert 0.9 < inside.mean() < 1.0

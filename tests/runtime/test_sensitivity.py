@@ -1,0 +1,198 @@
+"""Derivatives of steps by all they start from, by differences in 60 digits; and their transpose."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from certified_cases import case as certified
+from numpy.testing import assert_allclose
+from sabotage import Case
+from samples import QUICK_FLAGS
+
+from scvi_codegen import SVI, LagrangianSystem, MethodError, StateError, compile_stepper, problem, reparametrise
+from scvi_codegen.exact.step import DerivedStep
+from scvi_codegen.methods.discretise import paper_equations
+from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.tables.precision import mp
+
+
+def pushed_pendulum():
+    """A damped pendulum with an input, whose five parameters are those of its piece."""
+    return LagrangianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        lagrangian="l*q_dot**2/2 + cos(q)",
+        parameters={"l": 1.2, "c": 0.1},
+        forces={"q": "u"},
+        dissipation="c*q_dot**2/2",
+        inputs=["u"],
+    ).with_parameters(u_0=0.3, u_1=-0.2, u_2=0.5, u_3=0.1, u_t=0.05)
+
+
+NAMES = [
+    *("driven/svi", "double/svi", "kepler/svi-3", "cart/svi", "pendulum/hermite", "pendulum/splines", "vortices/svi"),
+    *("double/scvi", "kepler/printed", "kepler/sc-phase-space", "double/gauss", "linkage/lobatto-svi"),
+    *("wire/lobatto-svi", "double/gauss-position", "double/radau-ia", "driven/chebyshev", "kepler/composition"),
+    *("driven/euler", "cart/verlet", "pushed/svi"),
+]
+"""Systems and methods: with forces, constraints, inputs, explicit time, of Hamiltonians; of every solver."""
+
+OWN = {"pushed/svi": Case(pushed_pendulum(), lambda: SVI(2), (0.4,), (-0.8,), 0.2)}
+T = 0.3
+EXACT, BOUND = 1e-13, 3e-13
+"""Relative; of constrained systems, whose equations h makes ill-conditioned."""
+
+
+@cache
+def given(name):
+    """A stepper, a state, and a step."""
+    case = OWN.get(name) or certified(name)
+    stepper = compile_stepper(case.system, case.method(), flags=QUICK_FLAGS)
+    q, p = stepper.project(case.q, case.p, t=T) if case.system.constraints else (case.q, case.p)
+    return case, stepper, np.array(q, dtype=float), np.array(p, dtype=float), case.h
+
+
+def by_differences(case, q, p, h, t):
+    """(2m, 2m + k + 2) of the paper's equations, solved in 60 digits."""
+    system, width, m = case.system, mp.mpf(10) ** -15, len(q)
+    step = DerivedStep(system, paper_equations(system, case.method()))
+
+    def end(numbers):
+        found = step.with_parameters(numbers[2 * m : -2])(numbers[:m], numbers[m : 2 * m], numbers[-1], numbers[-2])
+        return np.array([*found.q, *found.p])
+
+    start, columns = [mp.mpf(x) for x in (*q, *p, *system.defaults, t, h)], []
+    for k in range(len(start)):
+        ends = []
+        for sign in (1, -1):
+            moved = list(start)
+            moved[k] += sign * width
+            ends.append(end(moved))
+        columns.append(((ends[0] - ends[1]) / (2 * width)).astype(float))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_derivatives_by_all_that_a_step_starts_from(name):
+    case, stepper, q, p, h = given(name)
+    found, exact = stepper.sensitivity(q, p, h, T), by_differences(case, q, p, h, T)
+    m, tolerance = len(q), BOUND if case.system.constraints else EXACT
+    for block, own in {
+        "state": exact[:, : 2 * m],
+        "parameters": exact[:, 2 * m : -2],
+        "t": exact[:, -2],
+        "h": exact[:, -1],
+    }.items():
+        assert getattr(found, block).shape == own.shape
+        largest = np.abs(own).max(initial=0.0)
+        assert np.abs(getattr(found, block) - own).max(initial=0.0) <= tolerance * largest
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_adjoint_is_the_transpose(name):
+    """Of vectors of all that is given, and what they become: (J v, w) = (v, J^T w), for all v and w of a basis."""
+    _, stepper, q, p, h = given(name)
+    size = stepper.given
+    starts = Starts.chain(q, p, np.array([T, T + h, T + 2 * h]), np.array([h, h, 0.5 * h]))
+    forward, back = np.zeros((2, 4, size, size))
+    forward[0] = back[-1] = np.eye(size)
+    stepper.linearise(starts, forward, stepper.defaults, None, chained=True)
+    stepper.linearise(starts, back, stepper.defaults, None, back=True)
+    assert np.abs(forward[-1]).max() > 1.0
+    assert np.abs(forward[-1].T - back[0]).max() < 1e-13 * np.abs(forward[-1]).max()
+
+
+def driven(steps=60, **options):
+    """A run of a driven, damped pendulum, and its stepper."""
+    still = pushed_pendulum().with_parameters(u_1=0.0, u_2=0.0, u_3=0.0)
+    stepper = compile_stepper(still, SVI(3), flags=QUICK_FLAGS)
+    values = {"t": T, "h": 0.1} | options
+    return stepper, stepper.integrate([0.4], [-0.8], steps=steps, **values)
+
+
+def test_runs_tell_how_their_states_depend_on_all_they_started_from():
+    """Against differences of whole runs, of fourth order."""
+    stepper, run = driven()
+    found = run.sensitivity()
+    columns = np.concatenate([found.state, found.parameters, found.t[..., None], found.h[..., None]], axis=2)
+    start = np.array([0.4, -0.8, *stepper.defaults, T, 0.1])
+    for k in range(len(start)):
+        ends, width = [], 1e-4
+        for steps in (1, -1, 2, -2):
+            moved = start.copy()
+            moved[k] += steps * width
+            other = stepper.integrate(moved[:1], moved[1:2], parameters=moved[2:-2], t=moved[-2], h=moved[-1], steps=60)
+            ends.append(np.concatenate([other.q, other.p], axis=1))
+        slope = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12 * width)
+        assert_allclose(columns[:, :, k], slope, atol=1e-6 * np.abs(slope).max() + 1e-9)
+    assert_allclose(found.state, run.tangent(), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"every": 12}, {"h": -0.1}, {"h": None, "steps": None, "t_end": 4.0}],
+    ids=["all", "checkpoints", "backward", "own lengths"],
+)
+def test_gradients_are_the_transpose_of_sensitivities(options):
+    """For functions of all states at once: one pass back, where not all states are kept, too."""
+    _, run = driven(**options)
+    forward = run.sensitivity()
+    seeds = np.random.default_rng(1).normal(size=(len(run), 2, 3))
+    found = run.pullback(seeds)
+    state = np.concatenate([found.q, found.p])
+    assert_allclose(state, np.einsum("nic,nij->jc", seeds, forward.state), rtol=1e-12, atol=1e-12)
+    assert_allclose(found.parameters, np.einsum("nic,nik->kc", seeds, forward.parameters), rtol=1e-12, atol=1e-11)
+    assert_allclose(found.t, np.einsum("nic,ni->c", seeds, forward.t), rtol=1e-12, atol=1e-12)
+    if options.get("t_end"):
+        assert found.h is None
+        assert forward.h is None
+    else:
+        assert_allclose(found.h, np.einsum("nic,ni->c", seeds, forward.h), rtol=1e-12, atol=1e-11)
+    one = run.pullback(seeds[:, :, 0])
+    assert_allclose(one.parameters, found.parameters[:, 0], rtol=1e-13)
+    assert one.q.shape == (1,)
+
+
+def test_checkpoints_give_what_all_states_give():
+    _, whole = driven(steps=2500)
+    _, some = driven(steps=2500, every=500)
+    seeds = np.zeros((len(whole), 2))
+    seeds[::500] = np.random.default_rng(2).normal(size=(6, 2))
+    expected, found = whole.pullback(seeds), some.pullback(seeds[::500])
+    assert_allclose(found.parameters, expected.parameters, rtol=1e-9)
+    assert_allclose(found.q, expected.q, rtol=1e-9)
+    assert_allclose(some.sensitivity().parameters, whole.sensitivity().parameters[::500], rtol=1e-9, atol=1e-12)
+
+
+def test_the_energy_at_the_end_of_a_run_does_not_depend_on_time():
+    """And by mass it does as it does at the start: a closed form for what the adjoint gives."""
+    entry = problem("planar-pendulum")
+    stepper = compile_stepper(entry.system, SVI(8), flags=QUICK_FLAGS)
+    run = stepper.integrate([2.0], [0.3], h=0.05, steps=400)
+    m, length, g = stepper.defaults
+    seeds = np.zeros((len(run), 2))
+    seeds[-1] = m * g * length * np.sin(run.q[-1, 0]), run.p[-1, 0] / (m * length**2)
+    found = run.pullback(seeds)
+    assert_allclose(found.q, m * g * length * np.sin(2.0), rtol=1e-9)
+    assert_allclose(found.p, 0.3 / (m * length**2), rtol=1e-9)
+    assert abs(found.h) < 1e-9
+    assert abs(found.t) < 1e-12
+
+
+def test_what_has_no_gradient():
+    stepper, run = driven()
+    with pytest.raises(StateError, match=r"cotangents, slopes by \(q, p\) of each state, have shape \(61, 2\)"):
+        run.pullback(np.zeros((60, 2)))
+    with pytest.raises(StateError, match="whole steps"):
+        stepper.integrate([0.4], [-0.8], h=0.1, steps=9, t_eval=[0.03, 0.1]).sensitivity()
+    kepler = problem("kepler")
+    clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4), flags=QUICK_FLAGS)
+    with pytest.raises(MethodError, match="no derivatives"):
+        clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).sensitivity()
+
+
+def test_a_state_that_the_steps_do_not_lead_to_is_no_base_of_derivatives():
+    _, run = driven()
+    run.q[30] += 1e-3
+    with pytest.raises(StateError, match="does not lead where it led in the run"):
+        run.sensitivity()
