@@ -85,7 +85,7 @@ class Program:
         straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is not.
         momentum_blocks: (B,) 1 where that guess is p0.
         moving_blocks: (B,) 1 where h times the block is a length; convergence is judged by these.
-        extrapolation: (B, B) guess for the next step.
+        extrapolation: (B, B) guess for the next step, sum_c table[c][b] z_c; below it the same for multipliers, if any.
         legendre: p and dp/dv at (q, v); where a Hamiltonian is given, v and dv/dp at (q, p).
         mass_entries: (i, j) of the slopes of ``legendre``.
         energy: L at (q, v), from which and ``legendre`` follows the energy; where a Hamiltonian is given, H at (q, p).

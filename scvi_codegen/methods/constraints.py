@@ -42,9 +42,10 @@ from scvi_codegen.mechanics.constraints import (
 )
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
-from scvi_codegen.tables.basis import cardinal_values, identity_matrix
-from scvi_codegen.tables.precision import Matrix, mp
+from scvi_codegen.tables.basis import cardinal_values
+from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = ["with_constraints"]
@@ -78,7 +79,7 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
         ),
         families=(_held(system, family), *_rolling(system, stages, family), _end(system, stages, points)),
         end_position=Table.joined(stages.end_position, Table.constant(1, 1 + points)),
-        extrapolation=stages.extrapolation and _extrapolation(stages.extrapolation, family.abscissae),
+        extrapolation=stages.extrapolation and _extrapolation(stages, family.abscissae),
     )
 
 
@@ -199,10 +200,22 @@ def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> PointFam
     )
 
 
-def _extrapolation(own: Matrix, abscissae: tuple[mp.mpf, ...]) -> Matrix:
-    """Velocities at the points as without constraints; that of the end, and multipliers, stay what they were."""
-    size, points = len(own), len(abscissae)
-    lines = [(*line, *(mp.zero,) * (1 + points)) for line in own]
-    lines.append((*(mp.zero,) * size, mp.one, *(mp.zero,) * points))
-    lines += [(*(mp.zero,) * (size + 1), *line) for line in identity_matrix(points)]
+def _extrapolation(stages: StageSystem, abscissae: Vector) -> Matrix:
+    """Velocities on the polynomial through those of the curve and the one at the end; multipliers on theirs.
+
+    The velocity at the end is as good as the step, those of the curve are not: it makes the guess one order better.
+    """
+    blocks = stages.shape.blocks if isinstance(stages.shape, Velocities) else ()
+    size, points, known = len(stages.blocks), len(abscissae), (*blocks, mp.one)
+    if len(set(known)) <= size:
+        lines = [(*line, *(mp.zero,) * (1 + points)) for line in stages.extrapolation or ()]
+        lines.append((*(mp.zero,) * size, mp.one, *(mp.zero,) * points))
+    else:
+        lines = [(*line, *(mp.zero,) * points) for line in _ahead(known)]
+    lines += [(*(mp.zero,) * (size + 1), *line) for line in _ahead(abscissae)]
     return tuple(lines)
+
+
+def _ahead(known: Vector) -> Matrix:
+    """From values at points of a step to those that their polynomial has at the same points of the next."""
+    return cardinal_values([2 * c - 1 for c in known], [2 * c + 1 for c in known])
