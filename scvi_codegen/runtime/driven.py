@@ -5,17 +5,16 @@ Steps end at breakpoints; the compensated sums go on across them. See :mod:`scvi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.dense_output import checked_times
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -24,9 +23,16 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.integrator import Integrator
     from scvi_codegen.runtime.run import Run
 
-__all__ = ["DrivenTrajectory", "Input", "checked_inputs", "drive", "end_of", "parameters_of"]
-
-Number = TypeVar("Number", bound=np.generic)
+__all__ = [
+    "Input",
+    "checked_inputs",
+    "drive",
+    "end_of",
+    "input_of",
+    "parameters_of",
+    "stretches",
+    "with_end",
+]
 
 POWERS = 4
 NEGLIGIBLE_STEP = 1e-9
@@ -66,10 +72,11 @@ def checked_inputs(stepper: Integrator, given: Mapping[str, Any] | None) -> dict
             raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
     if missing := [name for name in names if name not in given]:
         raise StateError(f"the input {missing[0]} is not given: inputs={{'{missing[0]}': (t, values)}}")
-    return {name: _input(name, value) for name, value in given.items()}
+    return {name: input_of(name, value) for name, value in given.items()}
 
 
-def _input(name: str, given: Any) -> Input:
+def input_of(name: str, given: Any) -> Input:
+    """One of them; raises as :func:`checked_inputs`."""
     if callable(given) and not hasattr(given, "c"):
         raise StateError(
             f"the input {name} is a function of Python's, which C cannot call in the middle of a step: give values, "
@@ -89,8 +96,9 @@ def _input(name: str, given: Any) -> Input:
         raise StateError(
             f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each"
         )
-    if (np.diff(t) <= 0.0).any():
-        raise StateError(f"the times of the input {name} do not ascend")
+    if (late := np.flatnonzero(np.diff(t) <= 0.0)).size:
+        k = int(late[0])
+        raise StateError(f"the times of the input {name} do not ascend: {t[k + 1]:g} after {t[k]:g}")
     return _from_pieces(name, t, KINDS[kind](t, values))
 
 
@@ -141,24 +149,51 @@ def drive(
         values: the parameters of the piece in which a time lies.
         progress: called with the steps done.
     """
-    forward, h, pieces = np.sign(t_end - run.t), run.h, []
-    ends = _ends(run.t, t_end, inputs)
-    for end in ends:
-        middle = run.t + 0.5 * (end - run.t)
-        if run.goal is not None:
-            run.change(parameters=values(middle), goal=replace(run.goal, t_end=end))
-            pieces.append(run.record(every=every, progress=progress))
-        else:
-            run.change(parameters=values(middle), h=h)
-            whole = int(np.floor((end - run.t) / h + NEGLIGIBLE_STEP))
-            if whole:
-                pieces.append(run.record(whole, every=every, progress=progress))
-            if forward * (end - run.t) > NEGLIGIBLE_STEP * abs(h):
-                run.change(h=end - run.t)
-                pieces.append(run.record(1, progress=progress))
-        if pieces and pieces[-1].ended_by is not None:
+    pieces: list[Trajectory] = []
+    first = run.steps
+    told = None if progress is None else lambda _: progress(run.steps - first)
+    for steps in stretches(run, inputs, t_end, values):
+        pieces.append(with_end(run.record(steps, every=every, progress=told), run))
+        if pieces[-1].ended_by is not None:
             break
-    return DrivenTrajectory(tuple(pieces))
+    return DrivenTrajectory(tuple(pieces or [run.record(0)]))
+
+
+def stretches(
+    run: Run, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
+) -> Iterator[int | None]:
+    """Has the run ready for each stretch without a breakpoint or another step inside.
+
+    Yields:
+        How many steps it takes; ``None`` where steps choose their length and lead to the goal of the run.
+    """
+    forward, h = np.sign(t_end - run.t), run.h
+    for end in _ends(run.t, t_end, inputs):
+        parameters = values(run.t + 0.5 * (end - run.t))
+        if run.goal is not None:
+            run.change(parameters=parameters, goal=replace(run.goal, t_end=end))
+            yield None
+            continue
+        run.change(parameters=parameters, h=h)
+        if whole := int(np.floor((end - run.t) / h + NEGLIGIBLE_STEP)):
+            yield whole
+        if forward * (end - run.t) > NEGLIGIBLE_STEP * abs(h):
+            run.change(h=end - run.t)
+            yield 1
+
+
+def with_end(piece: Trajectory, run: Run) -> Trajectory:
+    """A stretch with the state that it ends at, whatever the number of that."""
+    if piece.t[-1] == run.t or piece.ended_by is not None:
+        return piece
+    return replace(
+        piece,
+        t=np.append(piece.t, run.t),
+        q=np.append(piece.q, [run.q], axis=0),
+        p=np.append(piece.p, [run.p], axis=0),
+        iterations=np.append(piece.iterations, np.int32(0)),
+        lengths=np.append(piece.lengths, run.h),
+    )
 
 
 def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
@@ -175,97 +210,6 @@ def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
         inner |= {float(x) for x in data.breakpoints if low < x < high}
     ends = sorted(inner, reverse=t_end < t)
     return [*ends, t_end]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DrivenTrajectory:
-    """States along a run with inputs, and what follows from them, each with the parameters of its piece.
-
-    Attributes:
-        pieces: trajectories from breakpoint to breakpoint, the first state of each the last of the one before.
-    """
-
-    pieces: tuple[Trajectory, ...]
-
-    @property
-    def t(self) -> Array:
-        """(n,) times."""
-        return self._joined(lambda piece: piece.t)
-
-    @property
-    def q(self) -> Array:
-        """(n, m) positions."""
-        return self._joined(lambda piece: piece.q)
-
-    @property
-    def p(self) -> Array:
-        """(n, m) momenta."""
-        return self._joined(lambda piece: piece.p)
-
-    @property
-    def velocity(self) -> Array:
-        """(n, m) velocities."""
-        return self._joined(lambda piece: piece.velocity)
-
-    @property
-    def iterations(self) -> NDArray[np.int32]:
-        """(n,) iterations since the state before."""
-        return self._joined(lambda piece: piece.iterations)
-
-    @property
-    def steps(self) -> int:
-        """Taken since the start."""
-        return self.pieces[-1].steps
-
-    @property
-    def stepper(self) -> Integrator:
-        """The compiled integrator."""
-        return self.pieces[0].stepper
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def energy(self) -> Array:
-        """(n,) energies p.v - L."""
-        return self._joined(lambda piece: piece.energy())
-
-    def momentum_maps(self) -> Array:
-        """(n, k) values of what symmetries conserve."""
-        return self._joined(lambda piece: piece.momentum_maps())
-
-    def multipliers(self) -> Array:
-        """(n, c) multipliers of the constraints."""
-        return self._joined(lambda piece: piece.multipliers())
-
-    def work(self) -> Array:
-        """(n,) work of the forces since the first state."""
-        return self._summed(lambda piece: piece.work())
-
-    def impulses(self) -> Array:
-        """(n, k) what forces gave to momentum maps since the first state."""
-        return self._summed(lambda piece: piece.impulses())
-
-    def at(self, t: ArrayLike) -> tuple[Array, Array]:
-        """States between those kept, as of :meth:`Trajectory.at`."""
-        times = checked_times(t, "t")
-        flat, m = times.ravel(), self.stepper.dimension
-        q, p = np.empty((2, len(flat), m))
-        forward = self.pieces[0].forward
-        ends = forward * np.array([piece.t[-1] for piece in self.pieces])
-        number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)
-        for k in np.unique(number):
-            q[number == k], p[number == k] = self.pieces[k].at(flat[number == k])
-        return q.reshape(*times.shape, m), p.reshape(*times.shape, m)
-
-    def _joined(self, part: Callable[[Trajectory], NDArray[Number]]) -> NDArray[Number]:
-        first, *others = (part(piece) for piece in self.pieces)
-        return np.concatenate([first, *(other[1:] for other in others)])
-
-    def _summed(self, part: Callable[[Trajectory], Array]) -> Array:
-        found = [part(piece) for piece in self.pieces]
-        for before, after in pairwise(found):
-            after += before[-1]
-        return np.concatenate([found[0], *(each[1:] for each in found[1:])])
 
 
 def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:

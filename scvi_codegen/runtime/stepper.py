@@ -23,7 +23,8 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.driven import DrivenTrajectory, checked_inputs, drive, end_of, parameters_of
+from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, parameters_of
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble import consistent_ensemble, integrate_ensemble, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
