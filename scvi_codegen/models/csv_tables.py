@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,8 +32,8 @@ class CsvTable:
         return f"line {self.lines[k]}" if self.lines else f"row {k}"
 
 
-def parse_table(text: str) -> CsvTable:
-    """The table in a text.
+def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> CsvTable:
+    """The table in a text, with a look at its names before its numbers.
 
     Raises:
         ModelFileError: naming the column or line at fault.
@@ -47,6 +48,8 @@ def parse_table(text: str) -> CsvTable:
         raise ModelFileError(f"the column '{repeated[0]}' is there twice")
     if "" in names:
         raise ModelFileError(f"column {names.index('') + 1} has no name in the first line")
+    if check is not None:
+        check(names)
     rows = [_row(cells, names, number) for number, cells in lines[1:]]
     return CsvTable(dict(zip(names, np.array(rows).T, strict=True)), tuple(number for number, _ in lines[1:]))
 

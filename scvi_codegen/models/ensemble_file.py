@@ -85,9 +85,16 @@ class EnsembleStates:
             return self._table(self._momenta, model.momenta(stepper))
         default = model.velocity
         if default is None:
-            default = tuple(stepper.velocity(model.q, model.momenta(stepper), model.t, model.system.defaults))
-        states = zip(self.q, self._table(self._velocities, default), self.parameters, strict=True)
+            start = model.parameters_at_start(stepper)
+            default = tuple(stepper.velocity(model.q, model.momenta(stepper), model.t, start))
+        states = zip(self.q, self._table(self._velocities, default), self._at_start(stepper), strict=True)
         return np.array([stepper.momentum(q, v, model.t, values) for q, v, values in states])
+
+    def _at_start(self, stepper: Stepper) -> Array:
+        """(k, number of parameters), with those of inputs where the model gives them."""
+        if not self.model.inputs:
+            return self.parameters
+        return self._table(list(stepper.parameters), self.model.parameters_at_start(stepper))
 
     @property
     def _coordinates(self) -> list[str]:
@@ -168,9 +175,7 @@ def real(value: Any, where: str) -> float:
 
 
 def _read_table(text: str, check: Check) -> dict[str, Array]:
-    columns = parse_table(text).columns
-    check(list(columns))
-    return columns
+    return parse_table(text, check).columns
 
 
 def _check_names(model: Model, names: Sequence[str]) -> None:

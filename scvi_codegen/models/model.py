@@ -172,21 +172,31 @@ class Model:
         if not self.system.inputs:
             yield None if run.goal else self.step_count
             return
-        from scvi_codegen.runtime.driven import end_of, stretches
+        from scvi_codegen.runtime.driven import stretches  # here, as NumPy above
 
         inputs, values = self._driven(run.stepper)
-        end = end_of(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
-        yield from stretches(run, inputs, end, values)
+        yield from stretches(run, inputs, self.end, values)
 
-    def _driven(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
-        """The inputs, and what they make of the parameters at a time."""
-        from scvi_codegen.runtime.driven import checked_inputs, parameters_of  # here, as NumPy above
+    @property
+    def end(self) -> float:
+        """The time to which a run with inputs leads."""
+        from scvi_codegen.runtime.driven import end_of
 
+        return end_of(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
+
+    def all_inputs(self) -> Mapping[str, InputTable]:
+        """The inputs; ModelFileError unless all that the system has are given."""
         for name in self.system.inputs:
             if name not in self.inputs:
                 way = f'[inputs] {name} = {{ file = "{name}.csv" }}, or --input {name}=FILE'
                 raise ModelFileError(f"the input {name} is not given: {way}")
-        found = checked_inputs(stepper, self.inputs)
+        return self.inputs
+
+    def _driven(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
+        """The inputs, and what they make of the parameters at a time."""
+        from scvi_codegen.runtime.driven import checked_inputs, parameters_of
+
+        found = checked_inputs(stepper, self.all_inputs())
         return found, parameters_of(stepper, self.parameters, found)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:

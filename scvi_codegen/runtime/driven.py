@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,16 +25,21 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Input",
+    "Stretch",
     "checked_inputs",
     "drive",
     "end_of",
     "input_of",
+    "later",
+    "parameters_at",
     "parameters_of",
+    "planned",
     "stretches",
     "with_end",
 ]
 
 POWERS = 4
+ALL = slice(None)
 NEGLIGIBLE_STEP = 1e-9
 """Of a step: what is left before a breakpoint that is not worth one."""
 
@@ -45,22 +50,26 @@ class Input:
 
     Attributes:
         breakpoints: (n + 1,) ascending times.
-        coefficients: (4, n) of powers of the time since the breakpoint before, ascending.
+        pieces: (n, 5) parameters from each to the next: coefficients of powers of the time since it, ascending, and
+            itself; (n, k, 5) of k trajectories.
     """
 
     breakpoints: Array
-    coefficients: Array
+    pieces: Array
 
-    def parameters(self, name: str, t: float) -> dict[str, float]:
-        """Values of the parameters of an input for the piece in which t lies."""
-        piece = int(np.searchsorted(self.breakpoints, t, side="right")) - 1
-        piece = min(max(piece, 0), len(self.breakpoints) - 2)
-        values = {f"{name}_{k}": float(c) for k, c in enumerate(self.coefficients[:, piece])}
-        return values | {f"{name}_t": float(self.breakpoints[piece])}
+    def parameters(self, t: float, part: slice = ALL) -> Array:
+        """(5,) for the piece in which t lies, or those of a part of the trajectories."""
+        piece = int(self.breakpoints.searchsorted(t, side="right")) - 1
+        found: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
+        return found[part] if found.ndim == 2 else found
 
 
-def checked_inputs(stepper: Integrator, given: Mapping[str, Any] | None) -> dict[str, Input]:
+def checked_inputs(
+    stepper: Integrator, given: Mapping[str, Any] | None, trajectories: int | None = None
+) -> dict[str, Input]:
     """Inputs as users give them: (t, values), (t, values, kind), or a piecewise polynomial of SciPy's.
+
+    With a number of trajectories each may have values of its own, a row each.
 
     Raises:
         StateError: for names that are no inputs, inputs that are not given, and data that make no function of time.
@@ -72,10 +81,10 @@ def checked_inputs(stepper: Integrator, given: Mapping[str, Any] | None) -> dict
             raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
     if missing := [name for name in names if name not in given]:
         raise StateError(f"the input {missing[0]} is not given: inputs={{'{missing[0]}': (t, values)}}")
-    return {name: input_of(name, value) for name, value in given.items()}
+    return {name: input_of(name, value, trajectories) for name, value in given.items()}
 
 
-def input_of(name: str, given: Any) -> Input:
+def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
     """One of them; raises as :func:`checked_inputs`."""
     if callable(given) and not hasattr(given, "c"):
         raise StateError(
@@ -83,7 +92,8 @@ def input_of(name: str, given: Any) -> Input:
             f"{name}=(t, values) or scipy.interpolate.CubicSpline(t, values)"
         )
     if hasattr(given, "c") and hasattr(given, "x"):
-        return _from_pieces(name, np.array(given.x, dtype=float), np.array(given.c, dtype=float)[::-1])
+        ascending = np.moveaxis(np.array(given.c, dtype=float)[::-1], 1, -1)
+        return _from_pieces(name, np.array(given.x, dtype=float), ascending, trajectories)
     if not isinstance(given, tuple) or len(given) not in (2, 3):
         raise StateError(f"the input {name} is given as (t, values), or (t, values, 'cubic'), not {given!r:.60}")
     t, values = (
@@ -92,42 +102,44 @@ def input_of(name: str, given: Any) -> Input:
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in KINDS:
         raise StateError(f"the input {name} is {' or '.join(KINDS)} between its values, not {kind!r}")
-    if t.ndim != 1 or t.shape != values.shape or len(t) < 2:
+    if t.ndim != 1 or len(t) < 2 or values.shape not in (t.shape, (trajectories, *t.shape)):
+        rows = "" if trajectories is None else f", values also for each of {trajectories} trajectories"
         raise StateError(
-            f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each"
+            f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each{rows}"
         )
     if (late := np.flatnonzero(np.diff(t) <= 0.0)).size:
         k = int(late[0])
         raise StateError(f"the times of the input {name} do not ascend: {t[k + 1]:g} after {t[k]:g}")
-    return _from_pieces(name, t, KINDS[kind](t, values))
+    return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
 
 
 def _constant(t: Array, values: Array) -> Array:
-    return values[np.newaxis, :-1]
+    return values[np.newaxis, ..., :-1]
 
 
 def _linear(t: Array, values: Array) -> Array:
-    return np.array([values[:-1], np.diff(values) / np.diff(t)])
+    return np.array([values[..., :-1], np.diff(values) / np.diff(t)])
 
 
 def _cubic(t: Array, values: Array) -> Array:
     from scipy.interpolate import CubicSpline  # here: slow to import
 
-    found: Array = CubicSpline(t, values).c[::-1]
-    return found
+    return np.moveaxis(CubicSpline(t, values, axis=-1).c[::-1], 1, -1)
 
 
 KINDS: dict[str, Callable[[Array, Array], Array]] = {"constant": _constant, "linear": _linear, "cubic": _cubic}
 
 
-def _from_pieces(name: str, breakpoints: Array, ascending: Array) -> Input:
-    if ascending.ndim != 2 or len(ascending) > POWERS or not np.isfinite(ascending).all():
+def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: int | None) -> Input:
+    shaped = ascending.shape[1:-1] in ((), (trajectories,))
+    if not shaped or len(ascending) > POWERS or not np.isfinite(ascending).all():
         raise StateError(
             f"the pieces of the input {name} are polynomials of degree 3 at most, with finite coefficients"
         )
-    coefficients = np.zeros((POWERS, ascending.shape[1]))
-    coefficients[: len(ascending)] = ascending
-    return Input(breakpoints, coefficients)
+    pieces = np.zeros((ascending.shape[-1], *ascending.shape[1:-1], POWERS + 1))
+    pieces[..., : len(ascending)] = ascending.T
+    pieces.T[POWERS] = breakpoints[:-1]
+    return Input(breakpoints, pieces)
 
 
 def drive(
@@ -167,19 +179,49 @@ def stretches(
     Yields:
         How many steps it takes; ``None`` where steps choose their length and lead to the goal of the run.
     """
-    forward, h = np.sign(t_end - run.t), run.h
+    if run.goal is None:
+        for stretch in planned(run.t, t_end, run.h, inputs):
+            run.change(parameters=values(stretch.middle), h=stretch.h)
+            yield stretch.steps
+        return
     for end in _ends(run.t, t_end, inputs):
-        parameters = values(run.t + 0.5 * (end - run.t))
-        if run.goal is not None:
-            run.change(parameters=parameters, goal=replace(run.goal, t_end=end))
-            yield None
-            continue
-        run.change(parameters=parameters, h=h)
-        if whole := int(np.floor((end - run.t) / h + NEGLIGIBLE_STEP)):
-            yield whole
-        if forward * (end - run.t) > NEGLIGIBLE_STEP * abs(h):
-            run.change(h=end - run.t)
-            yield 1
+        run.change(parameters=values(run.t + 0.5 * (end - run.t)), goal=replace(run.goal, t_end=end))
+        yield None
+
+
+class Stretch(NamedTuple):
+    """Steps of one length in one piece of all inputs.
+
+    Attributes:
+        start: when they begin, in two pieces as runs carry them.
+        middle: a time in that piece.
+    """
+
+    steps: int
+    h: float
+    start: tuple[float, float]
+    middle: float
+
+
+def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Stretch]:
+    """By steps of h, and one that is shorter where a breakpoint or the end comes before theirs."""
+    forward, now, found = np.sign(t_end - t), (t, 0.0), []
+    for end in _ends(t, t_end, inputs):
+        middle = now[0] + 0.5 * (end - now[0])
+        if whole := int(np.floor((end - now[0]) / h + NEGLIGIBLE_STEP)):
+            found.append(Stretch(whole, h, now, middle))
+            now = later(now, h, whole)
+        if forward * (end - now[0]) > NEGLIGIBLE_STEP * abs(h):
+            found.append(Stretch(1, end - now[0], now, middle))
+            now = later(now, end - now[0], 1)
+    return found
+
+
+def later(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]:
+    """A time in two pieces, so many steps on."""
+    high, low = map(float, times_after(now[0], h, steps))
+    total = high + (low + now[1])
+    return total, (low + now[1]) - (total - high)
 
 
 def with_end(piece: Trajectory, run: Run) -> Trajectory:
@@ -225,13 +267,15 @@ def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) ->
 
 def parameters_of(stepper: Integrator, given: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:
     """The values of all parameters at a time, those of inputs by their pieces."""
-    return partial(_parameters_at, stepper, given, inputs)
+    return partial(parameters_at, stepper.parameters, stepper._parameters(given), inputs)
 
 
-def _parameters_at(stepper: Integrator, given: Any, inputs: Mapping[str, Input], t: float) -> Array:
-    values: Array = stepper._parameters(given)
-    names: Sequence[str] = stepper.parameters
+def parameters_at(
+    names: Sequence[str], others: Array, inputs: Mapping[str, Input], t: float, part: slice = ALL
+) -> Array:
+    """(p,) values by names, or (k, p) of a part of many trajectories: others, but for those of inputs."""
+    values = others[part].copy()
     for name, data in inputs.items():
-        for key, value in data.parameters(name, t).items():
-            values[names.index(key)] = value
+        first = names.index(f"{name}_0")
+        values[..., first : first + POWERS + 1] = data.parameters(t, part)
     return values

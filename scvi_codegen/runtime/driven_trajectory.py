@@ -16,7 +16,7 @@ from scvi_codegen.files.labelled import to_dataset
 from scvi_codegen.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.events import Crossings
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.trajectory import Trajectory, relative_changes
 
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["DrivenTrajectory"]
 
 Number = TypeVar("Number", bound=np.generic)
-
-PARTS = ("0", "1", "2", "3", "t")
-"""Of an input, five parameters: coefficients by power, and the breakpoint that they count from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +154,7 @@ class DrivenTrajectory:
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """The states as :mod:`scvi_codegen.files.export` writes them; parameters are those that are no inputs'."""
-        own = {f"{name}_{part}" for name in self.stepper.interface.inputs for part in PARTS}
+        own = {self.stepper.parameters[k] for k in columns_of_inputs(self.stepper.interface)}
         found = [quantities(self.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
         told = {name: _after_another([each[name] for each in found]) for name in found[0]}
         common, piece = self.pieces[0].states(units), (self.t, self.q, self.p, self.iterations)

@@ -12,7 +12,15 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
 
-__all__ = ["Array", "Parameters", "checked_parameters", "checked_states", "checked_vector", "parameter_index"]
+__all__ = [
+    "Array",
+    "Parameters",
+    "checked_parameters",
+    "checked_states",
+    "checked_vector",
+    "columns_of_inputs",
+    "parameter_index",
+]
 
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -69,6 +77,11 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}")
     return values
+
+
+def columns_of_inputs(interface: Interface) -> list[int]:
+    """Places of the parameters that inputs are made of: coefficients by power, and the breakpoint they count from."""
+    return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
 
 
 def parameter_index(interface: Interface, name: str) -> int:

@@ -98,6 +98,24 @@ def test_what_is_refused(words, said):
     assert said in result.stderr
 
 
+def test_an_ensemble_of_them(model):
+    Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
+    Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
+    text = output_of("--ensemble", "many.csv", "-o", "many.npz")
+    model = load_model("pushed.toml")
+    stepper = compile_stepper(model.system, model.method)
+    given = {"inputs": dict(model.inputs), "h": 0.1, "t_end": 2.3}
+    expected = [stepper.drive([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
+    with np.load("many.npz") as file:
+        assert (file["t"] == expected[0].t).all()
+        assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), atol=2e-15)
+    assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states kept of each" in text
+    changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
+    assert f"it changed by {changes:.3g} at most" in text
+    Path("pushed.toml").write_text(MODEL.replace("step = 0.1", "tolerance = 0.0"))
+    assert "give a step h" in invoke("--ensemble", "many.csv").stderr
+
+
 def test_an_input_that_is_not_given():
     Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
     assert "the input u is not given" in invoke().stderr

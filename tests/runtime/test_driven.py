@@ -191,6 +191,7 @@ def test_momentum_maps_with_inputs():
         ({"u": np.sin, "w": (KNOTS, VALUES)}, "C cannot call"),
         ({"u": (KNOTS[::-1], VALUES), "w": (KNOTS, VALUES)}, "do not ascend"),
         ({"u": (KNOTS, VALUES[:3]), "w": (KNOTS, VALUES)}, "shape"),
+        ({"u": (KNOTS, np.tile(VALUES, (3, 1))), "w": (KNOTS, VALUES)}, "shape"),
         ({"u": (KNOTS, VALUES, "quintic"), "w": (KNOTS, VALUES)}, "constant or linear or cubic"),
         ({"u": (KNOTS, [np.nan] * 6), "w": (KNOTS, VALUES)}, "nan"),
         ({"u": (KNOTS[:3], VALUES[:3]), "w": (KNOTS, VALUES)}, "is given from t = 0 to 0.9"),
