@@ -146,12 +146,13 @@ def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
     """The largest change of the energy of any trajectory."""
     energies = result.energy()
     sizes = np.abs(energies[0])
-    relative = bool((sizes > 0.0).all())
+    why = model.system.changes_energy
+    relative = bool((sizes > 0.0).all()) and not why
     changes = np.abs(energies - energies[0]) / (sizes if relative else 1.0)
     if not np.isfinite(changes).any():
         return "energy: no state has one"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
-    if why := model.system.changes_energy:
-        return f"energy: {why}, it changed by {abs(energies[state, worst] - energies[0, worst]):.3g} at most"
+    if why:
+        return f"energy: {why}, it changed by {changes[state, worst]:.3g} at most"
     what = "relative energy error" if relative else "energy error"
     return f"{what}: {changes[state, worst]:.2e} at most, of trajectory {worst}"
