@@ -9,9 +9,10 @@ import numpy as np
 
 from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.runtime.driven import input_of
+from scvi_codegen.rendering.text import ExampleInput
+from scvi_codegen.runtime.driven import POWERS, input_of, parameters_at
 
-__all__ = ["InputTable", "checked_tables"]
+__all__ = ["InputTable", "checked_tables", "tables_of_example"]
 
 
 class InputTable(NamedTuple):
@@ -43,3 +44,16 @@ def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[s
         t, values = (tuple(np.asarray(part, dtype=float).tolist()) for part in table[:2])
         found[name] = InputTable(t, values, *table[2:])
     return found
+
+
+def tables_of_example(
+    system: MechanicalSystem, inputs: Mapping[str, InputTable], t: float
+) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
+    """Inputs as C takes them, all or none, and all parameters at t."""
+    data = {name: input_of(name, tuple(inputs[name])) for name in system.inputs if inputs}
+    tables = tuple(
+        ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))
+        for name, each in data.items()
+    )
+    names = [parameter.name for parameter in system.parameters]
+    return tables, tuple(parameters_at(names, np.array(system.defaults), data, t).tolist())

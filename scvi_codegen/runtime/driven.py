@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.inputs import Array
@@ -250,14 +251,14 @@ def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
                 f"the input {name} is given from t = {first:g} to {last:g}; the run is from {low:g} to {high:g}"
             )
         inner |= {float(x) for x in data.breakpoints if low < x < high}
-    ends = sorted(inner, reverse=t_end < t)
+    ends = sorted(inner, reverse=bool(t_end < t))
     return [*ends, t_end]
 
 
 def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
     """Where a run with inputs leads."""
     if t_end is not None:
-        return t_end
+        return checked_number(t_end, "t_end")
     if h is None or steps is None:
         raise StateError(
             "a run with inputs leads to t_end, with h or by steps that choose their length, or takes steps of h"
