@@ -104,6 +104,7 @@ class Program:
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
         exchanges: names of what forces give: energy, and momentum maps; none without forces.
         constraints: what keeps the motion on them, or ``None``.
+        inputs: the place of the first of the five parameters of each function of time that is data, by name.
     """
 
     prefix: str
@@ -141,6 +142,7 @@ class Program:
     integrals: Integrals | None = None
     exchanges: tuple[str, ...] = ()
     constraints: Constraints | None = None
+    inputs: tuple[tuple[str, int], ...] = ()
 
     @property
     def dimension(self) -> int:

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import sympy
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
@@ -114,6 +115,7 @@ def lower(
         integrals=_integrals(system, method, stages),
         exchanges=_exchanges(system, stages),
         constraints=constraints,
+        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
 

@@ -33,6 +33,7 @@ from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import of
+from scvi_codegen.mechanics.inputs import inputs_by_name
 
 __all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
 
@@ -162,7 +163,11 @@ class MechanicalSystem(ABC):
 
     def to_text(self) -> str:
         """The function as text that ``from_text`` reads back."""
-        return format_expression(self.formula)
+        return self.text_of(self.formula)
+
+    def text_of(self, formula: Expr) -> str:
+        """A formula of the system's, with its inputs by their names."""
+        return format_expression(inputs_by_name(formula, self.inputs))
 
     def with_parameters(self, **values: float) -> Self:
         """Copy the system with other default values for the parameters named."""
@@ -196,9 +201,9 @@ class MechanicalSystem(ABC):
         """The forces, one on each line of a notebook's card."""
         for q, force in zip(self.coordinates, self.forces, strict=False):
             if force != 0:
-                yield f"force on {q.name}", plain(format_expression(force))
+                yield f"force on {q.name}", plain(self.text_of(force))
         for g in self.constraints:
-            yield "constraint", plain(f"{format_expression(g)} = 0")
+            yield "constraint", plain(f"{self.text_of(g)} = 0")
 
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""

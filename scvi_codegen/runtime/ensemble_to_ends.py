@@ -20,7 +20,8 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.ensemble import PROGRESS_SECONDS, EnsembleParameters, start_of_ensemble
+from scvi_codegen.runtime.ensemble import PROGRESS_SECONDS
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
@@ -101,6 +102,11 @@ class EnsembleToEnds:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def length(self) -> int:
+        """What ``progress`` counts up to: trajectories."""
+        return len(self)
 
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""

@@ -20,6 +20,7 @@ __all__ = [
     "checked_parameters",
     "checked_states",
     "checked_vector",
+    "columns_of_inputs",
     "inputs_not_given",
     "missing_input",
     "parameter_index",
@@ -101,6 +102,11 @@ def missing_input(name: str) -> StateError:
         f"the input {name} is not given: stepper.drive(..., inputs={{'{name}': (t, values)}}) follows data, "
         f"run.hold({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
     )
+
+
+def columns_of_inputs(interface: Interface) -> list[int]:
+    """Places of the parameters that inputs are made of: coefficients by power, and the breakpoint they count from."""
+    return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
 
 
 def parameter_index(interface: Interface, name: str) -> int:

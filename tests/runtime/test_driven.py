@@ -131,6 +131,62 @@ def test_from_sympy_and_what_scipy_gives():
         assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), atol=1e-14)
 
 
+@pytest.mark.parametrize("t_end", [2.3, 2.05])
+def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
+    """Nothing but what is kept depends on it: states between, work and iterations are those of all states."""
+    stepper = compile_stepper(pendulum, SVI(3))
+    given = {"inputs": {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, "h": 0.1, "t_end": t_end}
+    told = []
+    full = stepper.drive([0.3], [0.1], **given, progress=told.append)
+    assert told[-1] == full.steps == sum(map(len, full.pieces)) - len(full.pieces)
+    assert told == sorted(told)
+    fewer = stepper.drive([0.3], [0.1], **given, every=3)
+    assert {0.0, *KNOTS[1:5][KNOTS[1:5] <= t_end].tolist(), t_end} <= set(np.round(fewer.t, 14))
+    assert len(fewer) < len(full) / 1.5
+    kept = np.isin(full.t, fewer.t)
+    assert kept.sum() == len(fewer)
+    assert (fewer.q == full.q[kept]).all()
+    assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
+    assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
+    assert len(stepper.drive([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
+
+
+def test_files_hold_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
+    stepper = compile_stepper(pendulum, SVI(4))
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0])}
+    run = stepper.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3, parameters={"c": 0.3}, events="q_dot")
+    run.save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        assert (file["q"] == run.q).all()
+        assert dict(zip(file["parameter_names"].tolist(), file["parameters"].tolist(), strict=True)) == {"c": 0.3}
+    table = run.to_xarray()
+    w = np.interp(run.t, [0.0, 1.0, 3.0], [0.0, 0.5, 0.0])
+    assert_allclose(table["energy"], run.p[:, 0] ** 2 / 2 - (1 + w) * np.cos(run.q[:, 0]), rtol=1e-14)
+    assert len(run.to_dataframe()) == len(run)
+    (turns,) = run.events
+    assert_allclose(run.at(turns.t)[1], 0.0, atol=1e-9)
+    assert len(turns) == np.count_nonzero(np.diff(np.sign(run.p[:, 0])))
+    run.plot(tmp_path / "run.png")
+    assert 0.0 < run.step_error < 1e-4
+    assert run.step_error_t in run.t
+
+
+def test_momentum_maps_with_inputs():
+    """A push inside of a pair leaves its momentum alone."""
+    pair = LagrangianSystem.from_text(
+        name="pair",
+        coordinates=["x", "y"],
+        lagrangian="x_dot**2/2 + y_dot**2 - (x - y - u)**2/2",
+        inputs=["u"],
+    )
+    run = compile_stepper(pair, SVI(3)).drive(
+        [0.0, 1.0], velocity=[0.5, 0.1], inputs={"u": (KNOTS, VALUES)}, h=0.1, t_end=2.3
+    )
+    assert np.ptp(run.energy()) > 0.1
+    assert [name.split()[0] for name in run.stepper.momentum_map_names] == ["momentum", "boost"]
+    assert np.abs(run.momentum_errors()).max(axis=0) == pytest.approx([0.0, 0.0], abs=4e-15)
+
+
 @pytest.mark.parametrize(
     ("inputs", "said"),
     [
@@ -139,6 +195,7 @@ def test_from_sympy_and_what_scipy_gives():
         ({"u": np.sin, "w": (KNOTS, VALUES)}, "C cannot call"),
         ({"u": (KNOTS[::-1], VALUES), "w": (KNOTS, VALUES)}, "do not ascend"),
         ({"u": (KNOTS, VALUES[:3]), "w": (KNOTS, VALUES)}, "shape"),
+        ({"u": (KNOTS, np.tile(VALUES, (3, 1))), "w": (KNOTS, VALUES)}, "shape"),
         ({"u": (KNOTS, VALUES, "quintic"), "w": (KNOTS, VALUES)}, "constant or linear or cubic"),
         ({"u": (KNOTS, [np.nan] * 6), "w": (KNOTS, VALUES)}, "nan"),
         ({"u": (KNOTS[:3], VALUES[:3]), "w": (KNOTS, VALUES)}, "is given from t = 0 to 0.9"),
