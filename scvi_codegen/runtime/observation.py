@@ -10,18 +10,19 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.errors import StepFailedError
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.clock import part_of_step
-from scvi_codegen.runtime.dense_output import lengths_at, states_and_steps_at
+from scvi_codegen.runtime.dense_output import lengths_at, states_and_steps_at, times_of_run
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import SLICE_SECONDS, record, trajectory_of
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Observation"]
+__all__ = ["Observation", "observed_until"]
 
 Array = NDArray[np.float64]
 NUMBERS = 2**18
@@ -179,3 +180,21 @@ class Observation:
         crossings = self.search.crossings() if self.search is not None else ()
         tau = stepped if self.run.stepper.interface.energy_parameter else None
         return trajectory_of(self.run, t, q, p, iterations, lengths=lengths, events=crossings, tau=tau)
+
+
+def observed_until(
+    run: Memory,
+    t_end: float,
+    steps: int | None,
+    every: int,
+    t_eval: ArrayLike | None,
+    progress: Callable[[int], None] | None,
+) -> Trajectory:
+    """The trajectory of a run in transformed time to t_end, with the states kept that are asked for."""
+    end = checked_number(t_end, "the time t_end")
+    if steps is not None:
+        raise StateError(f"the run ends after steps={steps} or at t_end={end:g}: give one of the two")
+    if (end - run.t) * run.h < 0.0:
+        raise StateError(f"steps of h = {run.h:g} do not lead from t = {run.t:g} to t_end = {end:g}")
+    times = None if t_eval is None else times_of_run(t_eval, run.t, end)
+    return Observation(run, every=every, times=times, end=end).advance(None, progress)

@@ -11,17 +11,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
-from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
-from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
+from scvi_codegen.runtime.constrained_states import ConstrainedStates
+from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, parameters_of
 from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
@@ -32,9 +31,8 @@ from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensem
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.inputs import Array, Parameters
-from scvi_codegen.runtime.integrator import Integrator
-from scvi_codegen.runtime.observation import Observation
+from scvi_codegen.runtime.inputs import Parameters
+from scvi_codegen.runtime.observation import Observation, observed_until
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -42,7 +40,7 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["Stepper"]
 
 
-class Stepper(Integrator):
+class Stepper(ConstrainedStates):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -114,7 +112,7 @@ class Stepper(Integrator):
             options=options,
         )
         if clocked and t_end is not None:
-            return _said(_go_until(run, t_end, steps, every, t_eval, progress))
+            return _said(observed_until(run, t_end, steps, every, t_eval, progress))
         if run.goal is None and steps is None:
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if run.goal is not None and steps is not None:
@@ -331,44 +329,6 @@ class Stepper(Integrator):
         work.run(progress=progress, threads=threads)
         return work.result()
 
-    def project(
-        self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
-        *,
-        velocity: ArrayLike | None = None,
-        t: float = 0.0,
-        parameters: Parameters = None,
-    ) -> tuple[Array, Array]:
-        """The nearest state (q, p) that meets the constraints, in the metric of the masses; at rest without p.
-
-        Raises:
-            MethodError: for a system without constraints.
-            StateError: if none is found, or constraints depend on each other there.
-        """
-        momenta = self.momenta_given(
-            q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
-        )
-        q1, p1, _ = projected(self, q, momenta, t, parameters)
-        return q1, p1
-
-    def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """The lambda with which g_q^T lambda are the forces that keep a state on its constraints: (c,), or (n, c).
-
-        d/dt L_v = L_q + f + G^T lambda, G = g_q, or g_v of a constraint of velocities: of ``x**2 + y**2 = l**2`` the
-        tension of the rod is -2 l lambda. It is what
-        the state itself says, as exact as the state.
-        """
-        found = multipliers(self, q, p, t, parameters)
-        return found[0] if np.ndim(q) == 1 else found
-
-    def constraint_values(
-        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
-    ) -> tuple[Array, Array]:
-        """How far states are off: g, and its rate g_q v + g_t; (c,) each, or (n, c)."""
-        g, rate = constraint_values(self, q, p, t, parameters)
-        return (g[0], rate[0]) if np.ndim(q) == 1 else (g, rate)
-
     def restore(
         self,
         saved: bytes,
@@ -398,24 +358,6 @@ def _said(trajectory: Trajectory) -> Trajectory:
     """The same, after what is to be said of its worst step."""
     warn_of_long_steps(trajectory)
     return trajectory
-
-
-def _go_until(
-    run: Run,
-    t_end: float,
-    steps: int | None,
-    every: int,
-    t_eval: ArrayLike | None,
-    progress: Callable[[int], None] | None,
-) -> Trajectory:
-    """The trajectory of a run in transformed time to t_end."""
-    end = checked_number(t_end, "the time t_end")
-    if steps is not None:
-        raise StateError(f"the run ends after steps={steps} or at t_end={end:g}: give one of the two")
-    if (end - run.t) * run.h < 0.0:
-        raise StateError(f"steps of h = {run.h:g} do not lead from t = {run.t:g} to t_end = {end:g}")
-    times = None if t_eval is None else times_of_run(t_eval, run.t, end)
-    return Observation(run, every=every, times=times, end=end).advance(None, progress)
 
 
 def _end_of(run: Run, steps: int | None) -> float:

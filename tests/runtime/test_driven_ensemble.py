@@ -1,5 +1,7 @@
 """Ensembles with inputs: each trajectory is that of ``drive``, with values of its own or common ones."""
 
+import pickle
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -195,3 +197,17 @@ def test_what_is_refused(pendulum, change, said):
     given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3} | change
     with pytest.raises(StateError, match=said):
         compile_stepper(pendulum, SVI(3)).drive_ensemble(*starts(1), **given)
+
+
+def test_no_steps_at_all_and_pickled_results(pendulum):
+    stepper, given = (
+        compile_stepper(pendulum, SVI(3)),
+        {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1},
+    )
+    still = stepper.drive_ensemble(*starts(1), **given, t=0.4, t_end=0.4)
+    assert still.t.tolist() == [0.4]
+    assert still.ok.all()
+    assert still.energy().shape == (1, COUNT)
+    runs = stepper.drive_ensemble(*starts(1), **given, t_end=1.0)
+    again = pickle.loads(pickle.dumps(runs))
+    assert (again.energy() == runs.energy()).all()
