@@ -124,10 +124,11 @@ def _carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vector
     sizes = np.maximum(np.abs(known).max(axis=1), np.abs(np.concatenate([starts.q, starts.p], axis=1)[:-1]).max(axis=1))
     strays = np.flatnonzero(~(np.abs(found - known).max(axis=1) <= SAME_STATE * sizes))
     if strays.size:
+        t, h = float(starts.t[strays[0]]), float(starts.h[strays[0]])
         raise StateError(
-            f"the step from t = {starts.t[strays[0]]:g}, solved anew, does not lead where it led in the run: its "
-            "equations have several solutions (take shorter steps), or the motion is too sensitive between the kept "
-            "states (keep all, every=1)"
+            f"the steps from t = {t:g}, taken again, do not lead to the state kept at t = {t + h:g}: their equations have "
+            "several solutions (take shorter steps), or the motion is too sensitive between the two (keep all states, "
+            "every=1)"
         )
 
 
