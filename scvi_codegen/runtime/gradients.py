@@ -126,9 +126,9 @@ def _carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vector
     if strays.size:
         t, h = float(starts.t[strays[0]]), float(starts.h[strays[0]])
         raise StateError(
-            f"the steps from t = {t:g}, taken again, do not lead to the state kept at t = {t + h:g}: their equations have "
-            "several solutions (take shorter steps), or the motion is too sensitive between the two (keep all states, "
-            "every=1)"
+            f"the steps from t = {t:g}, taken again, do not lead to the state kept at t = {t + h:g}: their equations "
+            "have several solutions (take shorter steps), or the motion is too sensitive between the two (keep all "
+            "states, every=1)"
         )
 
 
