@@ -192,6 +192,8 @@ def test_what_has_no_gradient():
     _, run = driven()
     with pytest.raises(StateError, match=r"cotangents, slopes by \(q, p\) of each state, have shape \(61, 2\)"):
         run.pullback(np.zeros((60, 2)))
+    with pytest.raises(StateError, match="cotangents that are not finite"):
+        run.pullback(np.full((61, 2), np.nan))
     with pytest.raises(StateError, match="whole steps"):
         driven(steps=9, t=0.0, t_eval=[0.03, 0.1])[1].sensitivity()
     kepler = problem("kepler")
