@@ -75,7 +75,10 @@ class MethodWarning(UserWarning):
 
 
 class AccuracyWarning(UserWarning):
-    """A run whose equations were solved, with steps too long for the motion: its states are not to be trusted."""
+    """Of a run that went on: steps too long for the motion, or an initial state that was moved onto its constraints.
+
+    The equations were solved; but states after steps that are too long are not to be trusted.
+    """
 
 
 class ModelFileError(ScviCodegenError, ValueError):

@@ -1,5 +1,5 @@
 /* A step by Newton's iteration alone. Before it: newton.h, the table EXTRAPOLATION: the guess from the step before is
- * sum_c EXTRAPOLATION[c][b] z_c. */
+ * sum_c EXTRAPOLATION[c][b] z_c; for multipliers the rows from B on. */
 typedef struct {
   int unused;
 } solver_data;
@@ -37,7 +37,7 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
     keep = step->first ? remake_factors(step, memory + N, &data) : 1;
   if (*guess) {
     gather(EXTRAPOLATION[0], B, 1, memory, M, data.z, 1, B);
-    memcpy(data.z + M * B, memory + M * B, sizeof(real) * (N - M * B));
+    gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data.z + M * B, 1, B);
     status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)

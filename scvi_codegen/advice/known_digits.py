@@ -7,7 +7,9 @@ of the first: of its steps, its round-off and what the motion makes of them.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import default_method
 from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Known", "known_digits"]
@@ -54,8 +57,14 @@ class _TooLongError(Exception):
 
 
 @unwarned()
-def known_digits(system: MechanicalSystem, trajectory: Trajectory, *, most: int) -> Known | None:
-    """What is known of the last state of ``trajectory``, a motion of ``system``.
+def known_digits(
+    system: MechanicalSystem,
+    trajectory: Trajectory | DrivenTrajectory,
+    *,
+    most: int,
+    inputs: Mapping[str, Any] | None = None,
+) -> Known | None:
+    """What is known of the last state of ``trajectory``, a motion of ``system``, with its inputs if it has any.
 
     ``None`` where a second run fails, would take more than about ``most`` steps, or time is transformed.
     """
@@ -69,20 +78,19 @@ def known_digits(system: MechanicalSystem, trajectory: Trajectory, *, most: int)
     chosen = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
     times = trajectory.t[chosen]
     nudged = trajectory.q[0] * (1.0 + NUDGE * np.cos(np.arange(trajectory.q.shape[1])))
+    span: dict[str, Any] = {"t": float(times[0]), "t_end": float(times[-1])}
+    given = {**span, "parameters": trajectory.parameters, "progress": count}
     try:
-        second = compile_stepper(system, default_method(system)).integrate(
-            nudged,
-            trajectory.p[0],
-            t=float(times[0]),
-            t_end=float(times[-1]),
-            parameters=trajectory.parameters,
-            t_eval=times,
-            progress=count,
-        )
+        stepper = compile_stepper(system, default_method(system))
+        if system.inputs:
+            q, p = stepper.drive(nudged, trajectory.p[0], inputs=inputs or {}, **given).at(times)
+        else:
+            second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **given)
+            q, p = second.q, second.p
     except (ScviCodegenError, _TooLongError):
         return None
-    q, p = np.abs(second.q - trajectory.q[chosen]), np.abs(second.p - trajectory.p[chosen])
-    size = math.sqrt(float(np.mean(np.sum(second.q**2, axis=1)))) or 1.0
+    size = math.sqrt(float(np.mean(np.sum(q**2, axis=1)))) or 1.0
+    q, p = np.abs(q - trajectory.q[chosen]), np.abs(p - trajectory.p[chosen])
     tenfold = _tenfold(np.linalg.norm(q, axis=1) / size, abs(float(times[-1] - times[0])))
     return Known(q=_at_the_end(q), p=_at_the_end(p), tenfold=tenfold)
 

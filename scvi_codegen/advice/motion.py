@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -124,59 +124,82 @@ def solve_motion(
     q: ArrayLike
     given: ArrayLike | None
     q, given = (y0, None) if velocity is not None else _halves(y0)
-    advised = None
-    if isinstance(system, Stepper):
-        if method is not None or monitor is not None or tolerance is not None:
-            raise StateError(
-                "a compiled stepper has its method and monitor, and its step is h, or its own: leave out tolerance"
-            )
-        stepper = system
-        p = stepper.momenta_given(q, given, velocity, start, parameters)
-    else:
-        method = default_method(system) if method is None else as_method(method, system)
-        system = system if monitor is None else reparametrise(system, monitor)
-        stepper = compile_stepper(system, method)
-        p = stepper.momenta_given(q, given, velocity, start, parameters)
-        if h is None and rtol is None and system.clock is None:
-            advised = tolerance if tolerance is not None or _chooses(stepper) else ADVISED
-        if advised is not None:
-            advice = advise(system, method, q, p, end - start, advised, t=start, parameters=parameters, options=options)
-            h = advice.h
-    promised = h is None and bool(stepper.interface.energy_parameter)
-    if promised:
-        h = longest_step(stepper, q, p, end - start, rtol or 0.0, t=start, parameters=parameters, options=options)
     asked = None if t_eval is None else times_of_run(t_eval, start, end)
+    wish = _Wish(h, rtol, tolerance)
+    stepper, uncompiled = _stepper(system, method, monitor, wish)
+    p = stepper.momenta_given(q, given, velocity, start, parameters)
+    along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
+    plan = _plan(stepper, uncompiled, wish, (q, p, end - start), along)
+    steps = _steps(stepper, start, end, plan)
     status, message, failure = REACHED, "The end of the span was reached.", None
     try:
-        trajectory = stepper.integrate(
-            q,
-            p,
-            **_steps(stepper, start, end, h, None if promised else rtol),
-            t=start,
-            parameters=parameters,
-            options=options,
-            events=events,
-            t_eval=None if dense_output else asked,
-        )
+        trajectory = stepper.integrate(q, p, **steps, **along, events=events, t_eval=None if dense_output else asked)
     except StepFailedError as error:
         status, message, trajectory, failure = FAILED, str(error), Trajectory.before(error), error
     ended_by = trajectory.ended_by
     if ended_by is not None and failure is None:
         status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
-    if failure is None and (broken := _broken(system, trajectory, advised, (rtol or 0.0) if promised else None)):
+    if failure is None and (broken := plan.broken(trajectory)):
         status, message = BROKEN, broken
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
 
 
-def _broken(
-    system: MechanicalSystem | Stepper, trajectory: Trajectory, advised: float | None, promised: float | None
-) -> str:
-    """What a run belies of the error advised for its end, or promised of its steps; or nothing."""
-    if advised is not None and not isinstance(system, Stepper):
-        return broken_promise(system, trajectory, advised)
-    if promised is not None:
-        return too_wrong(trajectory.step_error, trajectory.step_error_t, promised) or ""
-    return ""
+class _Wish(NamedTuple):
+    """The steps asked for; with nothing of it they choose their length."""
+
+    h: float | None
+    rtol: float | None
+    tolerance: float | None
+
+
+class _Plan(NamedTuple):
+    """The steps to take, and what a run of them belies of what was promised, in words."""
+
+    h: float | None
+    rtol: float | None
+    broken: Callable[[Trajectory], str] = lambda trajectory: ""
+
+
+def _stepper(
+    system: MechanicalSystem | Stepper, method: Method | str | None, monitor: str | Expr | None, wish: _Wish
+) -> tuple[Stepper, tuple[MechanicalSystem, Method] | None]:
+    """The stepper, and of what it was compiled if it was not given."""
+    if wish.tolerance is not None and (wish.h is not None or wish.rtol is not None or monitor is not None):
+        raise StateError(
+            "a tolerance of the end chooses steps of one length, h gives it, rtol lets each choose its own: give one, "
+            "and of h and rtol with a monitor"
+        )
+    if not isinstance(system, Stepper):
+        system = system if monitor is None else reparametrise(system, monitor)
+        chosen = default_method(system) if method is None else as_method(method, system)
+        return compile_stepper(system, chosen), (system, chosen)
+    if method is not None or monitor is not None or wish.tolerance is not None:
+        raise StateError(
+            "a compiled stepper has its method and monitor, and its step is h, or its own: leave out tolerance"
+        )
+    return system, None
+
+
+def _plan(
+    stepper: Stepper,
+    uncompiled: tuple[MechanicalSystem, Method] | None,
+    wish: _Wish,
+    motion: tuple[ArrayLike, ArrayLike, float],
+    along: dict[str, Any],
+) -> _Plan:
+    """Steps for a wish, of a motion from (q, p) over a span."""
+    if wish.h is not None:
+        return _Plan(wish.h, wish.rtol)
+    if stepper.interface.energy_parameter:
+        error = wish.rtol or 0.0
+        tau = longest_step(stepper, *motion, error, **along)
+        return _Plan(tau, None, lambda run: too_wrong(run.step_error, run.step_error_t, error) or "")
+    advised = wish.tolerance if wish.tolerance is not None or _chooses(stepper) else ADVISED
+    if wish.rtol is not None or uncompiled is None or advised is None:
+        return _Plan(None, wish.rtol)
+    (system, method), (q, p, span) = uncompiled, motion
+    h = advise(system, method, q, p, span, advised, **along).h
+    return _Plan(h, None, lambda run: broken_promise(system, run, advised))
 
 
 INSTEAD = {
@@ -202,13 +225,13 @@ def _chooses(stepper: Stepper) -> bool:
     return True
 
 
-def _steps(stepper: Stepper, start: float, end: float, h: float | None, rtol: float | None) -> dict[str, Any]:
+def _steps(stepper: Stepper, start: float, end: float, plan: _Plan) -> dict[str, Any]:
     """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
-    if rtol is not None or h is None:
-        return {"h": h, "t_end": end, "tolerance": rtol}
+    if plan.rtol is not None or plan.h is None:
+        return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
     if stepper.interface.energy_parameter:
-        return {"h": math.copysign(checked_step(h), end - start), "t_end": end}
-    steps = max(1, math.ceil(abs((end - start) / checked_step(h)) * (1.0 - 1e-12)))
+        return {"h": math.copysign(checked_step(plan.h), end - start), "t_end": end}
+    steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["broken_promise"]
@@ -20,7 +21,7 @@ ROUNDING = 1e-11
 INSTEAD = "let steps choose their length (t_end, --tolerance)"
 
 
-def broken_promise(system: MechanicalSystem, trajectory: Trajectory, tolerance: float) -> str:
+def broken_promise(system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory, tolerance: float) -> str:
     """Why the error of a run at its end is not below ``tolerance``, whatever was expected; ``""`` if nothing tells so.
 
     The worst step must be right to the tolerance; and where the energy is conserved, it must be.

@@ -53,6 +53,7 @@ class Choices:
     steps: int | None
     every: int | None
     monitor: str | None = None
+    inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
 
     def sections(self) -> dict[str, dict[str, Any]]:
         """The same as sections of a model file."""
@@ -62,6 +63,7 @@ class Choices:
             "method": {name: getattr(self, name) for name in METHOD_CHOICES},
             "run": {"step": self.step, "span": self.span, "steps": self.steps, "every": self.every},
             "parameters": dict(self.parameter),
+            "inputs": dict(self.inputs or ()),
         }
         given = {
             name: {key: _plain(x) for key, x in section.items() if x is not None} for name, section in named.items()
@@ -103,6 +105,21 @@ def _assignments(
         if not name or not equals or not math.isfinite(value):
             raise click.BadParameter(f"'{text}' is not of the form NAME=VALUE, as in g=9.81")
         result.append((name, value))
+    return tuple(result)
+
+
+def _input_files(
+    context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[tuple[str, dict[str, str]], ...]:
+    """NAME=FILE[:KIND] as entries of the section [inputs]; a file beside the shell, not beside the model."""
+    result = []
+    for text in values:
+        name, _, given = (part.strip() for part in text.partition("="))
+        found = re.fullmatch(r"(?P<file>.+?\.\w+)(:(?P<kind>[a-z]+))?", given)
+        if not name or not found:
+            raise click.BadParameter(f"'{text}' is not of the form NAME=FILE[:KIND], as in u=u.csv:cubic")
+        entry = {key: value for key, value in found.groupdict().items() if value is not None}
+        result.append((name, entry | {"file": str(Path(entry["file"]).absolute())}))
     return tuple(result)
 
 
@@ -158,6 +175,15 @@ STATE_OPTIONS = (
         metavar="NAME=VALUE",
         callback=_assignments,
         help="Value of a parameter; may be repeated.",
+    ),
+    _option(
+        "--input",
+        "inputs",
+        multiple=True,
+        metavar="NAME=FILE[:KIND]",
+        callback=_input_files,
+        help="Values of an input: columns t and value of a .csv or .npz file, between them constant, linear (so unless "
+        "said) or cubic; may be repeated.",
     ),
     _option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),

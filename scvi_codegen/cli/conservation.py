@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -22,7 +23,7 @@ LARGE_ERROR, LOST = 1e-3, 0.1
 """Relative errors from which a quantity is said to be hardly conserved, and not at all."""
 
 
-def energy_report(system: MechanicalSystem, trajectory: Trajectory) -> str:
+def energy_report(system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory) -> str:
     """One line: the largest relative energy error and its drift, the part that grows linearly."""
     energy = trajectory.energy()
     scale = abs(float(energy[0]))
@@ -55,7 +56,7 @@ def _drift(t: Array, error: Array) -> float:
     return float(centred @ error / (centred @ centred))
 
 
-def momentum_report(result: Trajectory | EnsembleTrajectory) -> Iterator[str]:
+def momentum_report(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> Iterator[str]:
     """A line a momentum map: its largest change, relative to the largest size of its terms."""
     described = result.stepper.interface
     try:

@@ -18,6 +18,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
@@ -64,7 +65,7 @@ def integrate_states(
     stepper = compile_stepper(model.system, model.method, solver=solver)
     work = _work(model, stepper, states, options)
     started, shown, interrupted = time.perf_counter(), 0, False
-    length = len(states) if model.h is None else model.step_count
+    length = work.length
     with interruptions() as caught, progress_bar(length) as advance:
 
         def look(done: int) -> None:
@@ -92,6 +93,9 @@ def _work(
     """What is to be done, compiled while Ctrl-C still ends it."""
     start = stepper, states.q, states.momenta(stepper)
     common: dict[str, Any] = {"every": model.every, "t": model.t, "parameters": states.parameters, "options": options}
+    if model.system.inputs:
+        inputs = model.all_inputs()
+        return DrivenEnsemble.of(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
         return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance or None, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)
@@ -119,7 +123,7 @@ def _way(model: Model, result: EnsembleTrajectory) -> str:
     if model.h is None:
         steps = f"{int(result.steps.min())} to {int(result.steps.max())} steps of their own lengths"
         return f"{steps} from t = {model.t:g} to t = {model.t + model.covered:g}; up to {len(result.t)} states"
-    steps = f"{counted(model.step_count, 'step')} of {model.h:g}"
+    steps = f"{counted(int(result.steps.max()), 'step')} of {model.h:g}"
     return f"{steps} from t = {model.t:g}; {counted(len(result.t), 'state')}"
 
 
@@ -132,7 +136,7 @@ def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
 def _failures(result: EnsembleTrajectory) -> Iterator[str]:
     lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
     for j in lost[:SHOWN_FAILURES]:
-        t = result.ends[0][j] if result.goals else result.t[0] + result.steps[j] * result.h
+        t = result.ends[0][j] if result.goals or result.spans else result.t[0] + result.steps[j] * result.h
         yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {result.status[j]}"
     if len(lost) > SHOWN_FAILURES:
         yield f"  and {len(lost) - SHOWN_FAILURES} more"
@@ -142,12 +146,13 @@ def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
     """The largest change of the energy of any trajectory."""
     energies = result.energy()
     sizes = np.abs(energies[0])
-    relative = bool((sizes > 0.0).all())
+    why = model.system.changes_energy
+    relative = bool((sizes > 0.0).all()) and not why
     changes = np.abs(energies - energies[0]) / (sizes if relative else 1.0)
     if not np.isfinite(changes).any():
         return "energy: no state has one"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
-    if why := model.system.changes_energy:
-        return f"energy: {why}, it changed by {abs(energies[state, worst] - energies[0, worst]):.3g} at most"
+    if why:
+        return f"energy: {why}, it changed by {changes[state, worst]:.3g} at most"
     what = "relative energy error" if relative else "energy error"
     return f"{what}: {changes[state, worst]:.2e} at most, of trajectory {worst}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,8 @@ from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, unwarned
+from scvi_codegen.runtime.driven import with_end
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.longest_step import too_wrong
 from scvi_codegen.runtime.observation import Observation
@@ -55,7 +57,7 @@ class RunOutcome:
         broken: what was promised of its steps and not kept, or ``None``.
     """
 
-    trajectory: Trajectory
+    trajectory: Trajectory | DrivenTrajectory
     run: Run
     preparation: float
     seconds: float
@@ -67,7 +69,7 @@ class RunOutcome:
     def end(self) -> tuple[float, Array, Array]:
         """Time, positions and momenta; in transformed time the run itself stands before a last, shorter step."""
         run, kept = self.run, self.trajectory
-        inside = kept.tau is not None and (kept.t[-1] - run.t) * run.h > 0.0
+        inside = run.stepper.interface.energy_parameter and (kept.t[-1] - run.t) * run.h > 0.0
         return (float(kept.t[-1]), kept.q[-1], kept.p[-1]) if inside else (run.t, run.q, run.p)
 
 
@@ -85,32 +87,62 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
     if model.system.clock is not None and model.ends_at_time:
         return _by_clock(model, run, time.perf_counter() - began)
-    preparation, seconds = time.perf_counter() - began, 0.0
-    pieces, failure = [run.record(0, every=model.every)], None
+    preparation = time.perf_counter() - began
     with interruptions() as caught, progress_bar(_length(model)) as advance:
-        portion = 1
-        while not _ended(model, run) and not caught and failure is None:
-            before, started = _reached(model, run), time.perf_counter()
-            try:
-                piece = run.record(portion if run.goal else min(portion, model.step_count - before), every=model.every)
-            except StepFailedError as error:
-                if not isinstance(error.trajectory, Trajectory):
-                    raise
-                failure, piece = error, error.trajectory
-            elapsed = time.perf_counter() - started
-            pieces.append(piece)
-            seconds += elapsed
-            advance(_reached(model, run) - before)
-            check_room(model, run.steps)
-            portion = max(1, int(portion * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
+        work, pieces = _Portions(model, run, caught, advance), []
+        for steps in model.stretches(run):
+            pieces.append(work.stretch(steps))
+            if work.failure is not None or work.stopped:
+                break
     return RunOutcome(
-        trajectory=_joined(pieces),
+        trajectory=DrivenTrajectory(tuple(pieces)) if model.system.inputs else pieces[0],
         run=run,
         preparation=preparation,
-        seconds=seconds,
-        failure=failure,
-        interrupted=bool(caught) and not _ended(model, run),
+        seconds=work.seconds,
+        failure=work.failure,
+        interrupted=work.stopped,
     )
+
+
+class _Portions:
+    """A run in short portions, so that a signal is heard; ends before a step that fails.
+
+    Attributes:
+        seconds: spent in steps.
+        failure: the error of the step that failed, or ``None``.
+        stopped: whether a signal came first.
+    """
+
+    def __init__(self, model: Model, run: Run, caught: Sequence[int], advance: Callable[[int], None]) -> None:
+        self.model, self.run, self.caught, self.advance = model, run, caught, advance
+        self.size, self.seconds, self.stopped = 1, 0.0, False
+        self.failure: StepFailedError | None = None
+
+    def stretch(self, steps: int | None) -> Trajectory:
+        """So many steps, or all that lead to the goal; fewer if there are no more."""
+        run, pieces = self.run, [self.run.record(0, every=self.model.every)]
+        last = None if steps is None else run.steps + steps
+        while self.failure is None and not (run.arrived if last is None else run.steps >= last):
+            self.stopped = bool(self.caught)
+            if self.stopped:
+                break
+            pieces.append(self._portion(self.size if last is None else min(self.size, last - run.steps)))
+        joined = _joined(pieces)
+        return with_end(joined, run) if self.model.system.inputs else joined
+
+    def _portion(self, steps: int) -> Trajectory:
+        model, run = self.model, self.run
+        before, began = _reached(model, run), time.perf_counter()
+        try:
+            piece = run.record(steps, every=model.every)
+        except StepFailedError as error:
+            self.failure, piece = error, Trajectory.before(error)
+        elapsed = time.perf_counter() - began
+        self.seconds += elapsed
+        self.advance(_reached(model, run) - before)
+        check_room(model, run.steps)
+        self.size = max(1, int(self.size * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
+        return piece
 
 
 def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
@@ -144,18 +176,19 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
     )
 
 
-def _ended(model: Model, run: Run) -> bool:
-    return run.arrived if run.goal else run.steps >= model.step_count
-
-
 def _length(model: Model) -> int:
     """Of the bar: steps, or parts of the time."""
-    return PARTS if model.h is None else model.step_count
+    return PARTS if _by_time(model) else model.step_count
 
 
 def _reached(model: Model, run: Run) -> int:
     """Of that length."""
-    return int(PARTS * (run.t - model.t) / model.covered) if run.goal else run.steps
+    return int(PARTS * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
+
+
+def _by_time(model: Model) -> bool:
+    """Whether the number of steps is not known before."""
+    return model.h is None or bool(model.system.inputs)
 
 
 def summary(model: Model, outcome: RunOutcome) -> str:
@@ -182,7 +215,7 @@ def _known(model: Model, outcome: RunOutcome) -> Known | None:
     run, trajectory = outcome.run, outcome.trajectory
     if not run.steps or outcome.failure is not None or outcome.interrupted or trajectory.t[-1] != run.t:
         return None
-    return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps)
+    return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
 
 
 def of_length(h: float | None, run: Run) -> str:
@@ -195,12 +228,14 @@ def of_length(h: float | None, run: Run) -> str:
 def _speed(outcome: RunOutcome, every: int) -> str:
     text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
     watched = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
+    if every > 1 and outcome.run.stepper.interface.inputs:  # states at breakpoints, too
+        return text
     if not watched:
         return text
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"
 
 
-def conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
+def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory) -> Iterator[str]:
     """A line for each quantity that should have been conserved: how well it was."""
     try:
         yield energy_report(model.system, trajectory)
@@ -209,7 +244,7 @@ def conserved(model: Model, trajectory: Trajectory) -> Iterator[str]:
     yield from momentum_report(trajectory)
 
 
-def worst_step(trajectory: Trajectory) -> Iterator[str]:
+def worst_step(trajectory: Trajectory | DrivenTrajectory) -> Iterator[str]:
     """How well the worst step was resolved."""
     if math.isnan(trajectory.step_error):
         yield "worst step: its error is not known, nothing tells it here"

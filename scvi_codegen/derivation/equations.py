@@ -124,7 +124,7 @@ class StepEquations:
     def _heading(self) -> Iterator[str]:
         q, p = self.state
         yield f"{self.system.name}: {self.method.title}"
-        yield f"{'H' if self.system.auxiliaries else 'L'} = {self.system.to_text()}"
+        yield f"{'H' if self.system.auxiliaries else 'L'} = {format_expression(self.system.formula)}"
         for g in self.system.constraints:
             yield f"0 = {format_expression(g)}"
         yield f"known: {', '.join(s.name for s in (*q, *p, self.time, self.step))}"

@@ -100,15 +100,21 @@ class ExactMotion:
 
     @cached_property
     def _holding(self) -> Tape:
-        """Slopes of the constraints, row by row; what their rates grow by while velocities stay; they; their rates."""
+        """G of the constraints, row by row; what their rates grow by while velocities stay; they; their rates.
+
+        Of a constraint of velocities its own slopes by them, nothing, and itself.
+        """
         q, v, t = self.system.coordinates, self.second, self.system.time
-        slopes = [g.diff(x) for g in self.system.constraints for x in q]
 
         def rate(f: sympy.Expr) -> sympy.Expr:
             return sympy.Add(f.diff(t), *(f.diff(x) * y for x, y in zip(q, v, strict=True)))
 
-        bound = self.system.constraints
-        return Tape([*slopes, *(rate(rate(g)) for g in bound), *bound, *map(rate, bound)], self.symbols)
+        given = self.system.constraints
+        rolling = [any(g.has(x) for x in v) for g in given]
+        bound = [sympy.S.Zero if own else g for g, own in zip(given, rolling, strict=True)]
+        rates = [g if own else rate(g) for g, own in zip(given, rolling, strict=True)]
+        slopes = [moving.diff(x) for moving in rates for x in v]
+        return Tape([*slopes, *map(rate, rates), *bound, *rates], self.symbols)
 
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)

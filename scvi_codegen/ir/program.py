@@ -85,7 +85,7 @@ class Program:
         straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is not.
         momentum_blocks: (B,) 1 where that guess is p0.
         moving_blocks: (B,) 1 where h times the block is a length; convergence is judged by these.
-        extrapolation: (B, B) guess for the next step.
+        extrapolation: (B, B) guess for the next step, sum_c table[c][b] z_c; below it the same for multipliers, if any.
         legendre: p and dp/dv at (q, v); where a Hamiltonian is given, v and dv/dp at (q, p).
         mass_entries: (i, j) of the slopes of ``legendre``.
         energy: L at (q, v), from which and ``legendre`` follows the energy; where a Hamiltonian is given, H at (q, p).
@@ -104,6 +104,7 @@ class Program:
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
         exchanges: names of what forces give: energy, and momentum maps; none without forces.
         constraints: what keeps the motion on them, or ``None``.
+        inputs: the place of the first of the five parameters of each function of time that is data, by name.
     """
 
     prefix: str
@@ -141,6 +142,7 @@ class Program:
     integrals: Integrals | None = None
     exchanges: tuple[str, ...] = ()
     constraints: Constraints | None = None
+    inputs: tuple[tuple[str, int], ...] = ()
 
     @property
     def dimension(self) -> int:

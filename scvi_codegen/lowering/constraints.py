@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.ir.constraints import Constraints
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.mechanics.constraints import along_motion, constraint_rates
+from scvi_codegen.mechanics.constraints import along_motion, constraint_rates, constraint_slopes, positions_held
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -17,16 +16,16 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
     """The constraints of a system, ``None`` without any."""
     if not system.constraints:
         return None
-    slopes, rates = jacobian(system.constraints, system.coordinates), constraint_rates(system)
+    slopes, rates = constraint_slopes(system), constraint_rates(system)
     return Constraints(
         formulas=tuple(map(format_expression, system.constraints)),
         kernel=system_kernel(
             system,
             "constraints",
-            system.constraints,
+            positions_held(system),
             of=system.coordinates,
             slopes=slopes.values(),
-            purpose="The constraints g, and the slopes g_q that are not 0, at u = q.",
+            purpose="The constraints g of positions, and the slopes G that are not 0, at u = q.",
         ),
         entries=tuple(slopes),
         motion=system_kernel(
@@ -34,6 +33,6 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
             "constrained_motion",
             (*forms_of(system).applied_force, *rates, *along_motion(system, rates)),
             of=(*system.coordinates, *system.velocities),
-            purpose="L_q - L_vq v - L_vt + f, then g_q v + g_t, and what that grows by where v stays, at u = (q, v).",
+            purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and what they grow by where v stays, at u = (q, v).",
         ),
     )

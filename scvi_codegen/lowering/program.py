@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import sympy
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
@@ -92,7 +93,9 @@ def lower(
         straight=tuple(int(block.straight[1]) for block in blocks),
         momentum_blocks=tuple(block.momentum for block in blocks),
         moving_blocks=tuple(int(block.moves) for block in blocks),
-        extrapolation=lower_matrix(_required_extrapolation(stages, sites.columns[m])),
+        extrapolation=lower_matrix(
+            tuple(line for columns in sites.columns.values() for line in _required_extrapolation(stages, columns))
+        ),
         legendre=_legendre_kernel(system),
         mass_entries=tuple(mass),
         energy=_energy_kernel(system),
@@ -112,6 +115,7 @@ def lower(
         integrals=_integrals(system, method, stages),
         exchanges=_exchanges(system, stages),
         constraints=constraints,
+        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
 
@@ -230,7 +234,7 @@ def _notes(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
 
 
 def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:
-    """That of the blocks at the coordinates; others are guessed to stay as they were."""
+    """That of some blocks by themselves, transposed."""
     if stages.extrapolation is None or any(block.power != 1 for block in stages.blocks):
         raise TypeError("only stage systems with velocities as unknowns can be lowered")
-    return tuple(tuple(stages.extrapolation[i][j] for j in columns) for i in columns)
+    return tuple(tuple(stages.extrapolation[i][j] for i in columns) for j in columns)

@@ -1,11 +1,12 @@
-"""Holonomic constraints g(q, t) = 0: rods, joints, surfaces, closed loops; what follows from them.
+"""Constraints: of positions, g(q, t) = 0 (rods, joints, loops), and of velocities, A v + b = 0 (rolling, skates).
 
-Motions are stationary among curves that meet them, with multipliers lambda as the forces that see to it,
+Motions meet them, with multipliers lambda as the forces that see to it and do no work in what they leave free,
 
-    d/dt L_v = L_q + f + G^T lambda,        g = 0,        G = g_q,
+    d/dt L_v = L_q + f + G^T lambda,        g = 0 with G = g_q,        or A(q, t) v + b(q, t) = 0 with G = A
 
-and meet what follows, the hidden constraints g_q v + g_t = 0, too. No index is reduced: methods take g itself at the
-points of a step (:mod:`scvi_codegen.methods.constraints`).
+(holonomic, and nonholonomic by the principle of Lagrange and d'Alembert). What is said of velocities, G v = .., is met
+by both: of holonomic constraints it is the rate g_q v + g_t, a hidden constraint. No index is reduced: methods take g
+itself at the points of a step (:mod:`scvi_codegen.methods.constraints`).
 """
 
 from __future__ import annotations
@@ -32,7 +33,11 @@ __all__ = [
     "check_constraints",
     "constraint_multipliers",
     "constraint_rates",
+    "constraint_slopes",
     "constraints_of",
+    "holonomic",
+    "positions_held",
+    "velocities_held",
     "with_reactions",
 ]
 
@@ -52,16 +57,17 @@ def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> 
 
 
 def check_constraints(system: MechanicalSystem) -> None:
-    """Raise :class:`SystemDefinitionError` for constraints in velocities, of nothing, or that depend on others."""
+    """Raise :class:`SystemDefinitionError` for constraints of nothing, that depend on others, or bend velocities."""
     names = [format_expression(g) for g in system.constraints]
     for name, g in zip(names, system.constraints, strict=True):
-        if velocities := sorted(v.name for v in g.free_symbols & set(system.velocities)):
-            raise SystemDefinitionError(
-                f"the constraint '{name}' has the velocity {velocities[0]} in it: constraints are holonomic, "
-                "g(q, t) = 0"
-            )
-        if g.free_symbols.isdisjoint(system.coordinates):
+        if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
             raise SystemDefinitionError(f"there is no coordinate in the constraint '{name}'")
+    for k, i in jacobian(list(constraint_slopes(system).values()), system.velocities):
+        name = names[list(constraint_slopes(system))[k][0]]
+        raise SystemDefinitionError(
+            f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: constraints are "
+            "g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
+        )
     if len(names) >= system.dimension:
         raise SystemDefinitionError(
             f"{len(names)} constraints leave nothing of the {system.dimension} coordinates free to move"
@@ -74,7 +80,7 @@ def check_constraints(system: MechanicalSystem) -> None:
 
 def _dependent(system: MechanicalSystem) -> int:
     """The first constraint whose gradient depends on those before it at every point tried; 0 if there is none."""
-    slopes, count = jacobian(system.constraints, system.coordinates), len(system.constraints)
+    slopes, count = constraint_slopes(system), len(system.constraints)
     tape, first = None, 0
     for point in sample_points(system.coordinates, (system.time,), system.constants):
         tape = tape or Tape(list(slopes.values()), list(point))
@@ -102,9 +108,29 @@ def constraint_multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
     return tuple(sympy.Symbol(f"lambda_{k}", real=True) for k in range(1, len(system.constraints) + 1))
 
 
+def holonomic(system: MechanicalSystem, g: Expr) -> bool:
+    """Whether a constraint is one of positions alone."""
+    return not g.free_symbols & set(system.velocities)
+
+
+def positions_held(system: MechanicalSystem) -> tuple[Expr, ...]:
+    """The g of positions; 0 in the place of a constraint of velocities."""
+    return tuple(g if holonomic(system, g) else sympy.S.Zero for g in system.constraints)
+
+
+def velocities_held(system: MechanicalSystem) -> tuple[Expr, ...]:
+    """The A v + b of velocities; 0 in the place of a constraint of positions."""
+    return tuple(sympy.S.Zero if holonomic(system, g) else g for g in system.constraints)
+
+
 def constraint_rates(system: MechanicalSystem) -> tuple[Expr, ...]:
-    """G v + g_t."""
-    return along_motion(system, system.constraints)
+    """What is said of velocities: g_q v + g_t, or A v + b."""
+    return tuple(map(sympy.Add, along_motion(system, positions_held(system)), velocities_held(system)))
+
+
+def constraint_slopes(system: MechanicalSystem) -> dict[tuple[int, int], Expr]:
+    """The entries of G that are not 0: the directions in which a constraint pushes."""
+    return jacobian(constraint_rates(system), system.velocities)
 
 
 def along_motion(system: MechanicalSystem, functions: Sequence[Expr]) -> tuple[Expr, ...]:
@@ -122,6 +148,6 @@ def with_reactions(system: MechanicalSystem, forces: Sequence[Expr]) -> tuple[Ex
     """Forces and G^T lambda, m expressions."""
     terms: list[list[Expr]] = [[force] for force in forces]
     factors = constraint_multipliers(system)
-    for (k, i), slope in jacobian(system.constraints, system.coordinates).items():
+    for (k, i), slope in constraint_slopes(system).items():
         terms[i].append(slope * factors[k])
     return tuple(sympy.Add(*row) for row in terms)

@@ -64,6 +64,7 @@ def change_coordinates(
         clock=clock,
         forces=_projected(system, positions, replaced, variables),
         constraints=tuple(g.xreplace(replaced) for g in system.constraints),
+        inputs=system.inputs,
     )
 
 

@@ -59,6 +59,8 @@ class HamiltonianSystem(MechanicalSystem):
             raise SystemDefinitionError(
                 f"{len(self.coordinates)} coordinates, but {len(self.momenta)} momenta: list one each"
             )
+        if self.constraints:
+            raise SystemDefinitionError(f"'{self.name}' has constraints, which are kept where a Lagrangian is given")
         self._check("Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
@@ -212,6 +214,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         hamiltonian=hamiltonian,
         clock=system.clock,
         forces=tuple(f.xreplace(velocities) for f in system.forces),
+        inputs=system.inputs,
     )
 
 
@@ -240,6 +243,7 @@ def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
         lagrangian=lagrangian,
         clock=system.clock,
         forces=tuple(f.xreplace(momenta) for f in system.forces),
+        inputs=system.inputs,
     )
 
 

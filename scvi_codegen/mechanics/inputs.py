@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from sympy import Expr, Symbol
+from sympy import Basic, Expr, Integer, Symbol
 
 from scvi_codegen.formulas.symbols import check_name, symbol
 
-__all__ = ["PARTS", "input_formulas", "input_parameters"]
+__all__ = ["PARTS", "input_formulas", "input_parameters", "inputs_by_name"]
 
 PARTS = ("0", "1", "2", "3", "t")
 """Of an input: coefficients by power, and the breakpoint that they count from."""
@@ -37,3 +37,9 @@ def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]
         s = time - start
         found[symbol(name)] = c0 + s * (c1 + s * (c2 + s * c3))
     return found
+
+
+def inputs_by_name(formula: Expr, inputs: Sequence[str]) -> Expr:
+    """A formula with each input as its own symbol again: its first coefficient, the others being 0."""
+    own: dict[Basic, Basic] = {symbol(part): Integer(0) for part in input_parameters(inputs)}
+    return formula.xreplace(own | {symbol(f"{name}_0"): symbol(name) for name in inputs})

@@ -99,8 +99,8 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
-            constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``
-                (:mod:`scvi_codegen.mechanics.constraints`).
+            constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``;
+                linear in velocities those of wheels and skates (:mod:`scvi_codegen.mechanics.constraints`).
             inputs: names of functions of time that are given as data with each run
                 (:mod:`scvi_codegen.mechanics.inputs`).
 
@@ -163,7 +163,7 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by symbol or by name.
             forces: expression by coordinate, as the coordinate is given or by its name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
-            constraints: expressions in coordinates and time that stay 0.
+            constraints: expressions in coordinates, time and, linearly, velocities that stay 0.
             inputs: symbols of functions of time that are given as data with each run.
         """
         if not isinstance(lagrangian, Expr):
@@ -203,20 +203,13 @@ class LagrangianSystem(MechanicalSystem):
     def from_lagranges_method(
         cls, method: LagrangesMethod, *, name: str, parameters: Mapping[Symbol | str, float] | None = None
     ) -> LagrangianSystem:
-        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces and holonomic constraints.
+        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces and constraints.
 
         Forces and torques of its ``forcelist`` act through the velocities of their points, the angular velocities of
         their frames, projected on the coordinates: f_i = sum F . dv/dq_dot_i.
-
-        Raises:
-            SystemDefinitionError: if it has nonholonomic constraints; they are refused, never dropped.
         """
         bound = [sympy.sympify(g) for g in method._hol_coneqs]  # no public name either
-        if len(method.coneqs) > len(bound):
-            raise SystemDefinitionError(
-                "this LagrangesMethod has constraints on velocities (nonhol_coneqs), which are not supported: only "
-                "holonomic ones are, g(q, t) = 0"
-            )
+        rolling = list(method.coneqs)[len(bound) :]  # after the rates of those
         lagrangian = method._L[0]  # LagrangesMethod has no public name for it
         return cls.from_sympy(
             name=name,
@@ -224,7 +217,7 @@ class LagrangianSystem(MechanicalSystem):
             coordinates=list(method.q),
             parameters=parameters,
             forces=generalised_forces(method),
-            constraints=bound,
+            constraints=[*bound, *rolling],
         )
 
     def _repr_latex_(self) -> str:

@@ -33,6 +33,7 @@ from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import of
+from scvi_codegen.mechanics.inputs import inputs_by_name
 
 __all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
 
@@ -72,7 +73,8 @@ class MechanicalSystem(ABC):
         forces: m forces beside those of the function (:mod:`scvi_codegen.mechanics.forces`), in (q, v, t) of a
             Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
         inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.mechanics.inputs`).
-        constraints: what a Lagrangian's motion keeps at 0, in (q, t) (:mod:`scvi_codegen.mechanics.constraints`).
+        constraints: what a Lagrangian's motion keeps at 0, in (q, t), or linear in v
+            (:mod:`scvi_codegen.mechanics.constraints`).
     """
 
     name: str
@@ -128,15 +130,23 @@ class MechanicalSystem(ABC):
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether time occurs in the function or a force: energy is then not conserved."""
-        return any(self.time in formula.free_symbols for formula in (self.formula, *self.forces))
+        """Whether time occurs in the function, a force or a constraint: energy is then not conserved."""
+        return any(self.time in formula.free_symbols for formula in (self.formula, *self.forces, *self.constraints))
 
     @property
     def changes_energy(self) -> str:
         """Why energy is not conserved; nothing where it is."""
         if self.forces:
             return "forces act"
+        if self._constraints_work():
+            return "constraints move, and do work"
         return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.depends_on_time else ""
+
+    def _constraints_work(self) -> bool:
+        """Whether the motions that constraints allow do not include rest: time in them, or A v + b = 0 with b."""
+        at_rest = dict.fromkeys(self.velocities, sympy.S.Zero)
+        bound = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
+        return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in bound)
 
     def key(self) -> tuple[str, ...]:
         """All that tells this system from others: equal for systems of which equal texts are generated."""
@@ -153,7 +163,11 @@ class MechanicalSystem(ABC):
 
     def to_text(self) -> str:
         """The function as text that ``from_text`` reads back."""
-        return format_expression(self.formula)
+        return self.text_of(self.formula)
+
+    def text_of(self, formula: Expr) -> str:
+        """A formula of the system's, with its inputs by their names."""
+        return format_expression(inputs_by_name(formula, self.inputs))
 
     def with_parameters(self, **values: float) -> Self:
         """Copy the system with other default values for the parameters named."""
@@ -187,9 +201,9 @@ class MechanicalSystem(ABC):
         """The forces, one on each line of a notebook's card."""
         for q, force in zip(self.coordinates, self.forces, strict=False):
             if force != 0:
-                yield f"force on {q.name}", plain(format_expression(force))
+                yield f"force on {q.name}", plain(self.text_of(force))
         for g in self.constraints:
-            yield "constraint", plain(f"{format_expression(g)} = 0")
+            yield "constraint", plain(f"{self.text_of(g)} = 0")
 
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""

@@ -1,4 +1,4 @@
-"""Stage equations of a system with holonomic constraints g(q, t) = 0: multipliers at points, and the end's momentum.
+"""Stage equations of a system with constraints: multipliers at points, and the momentum at the end.
 
 With Lobatto's points c_0 = 0 < .. < c_s = 1 as points of the quadrature, stationary is the discrete action with a
 multiplier at each,
@@ -13,8 +13,17 @@ velocity that belongs to p1,
 That is the pair of Lobatto IIIA and IIIB: order 2s in positions and momenta, symmetric, symplectic on the constrained
 phase space, RATTLE for s = 1. With Gauss's points constraints would hold nowhere but there, and the order would fall.
 
+Constraints of velocities, A v + b = 0, act by multipliers at the same points, as A^T lambda beside L_q; what they say
+is asked for at s Gauss points, where the velocity of a curve of degree s is best, and of v at the end:
+
+    A(q(c_j)) q'(c_j) + b = 0 for j = 1 .. s,                 A(q1) v + b = 0.
+
+The order is 2s, measured, and the step symmetric; it is not symplectic, nor is the motion itself. Momenta of symmetries
+along which the constraints do not push are kept. For s = 1 it is the method of McLachlan and Perlmutter.
+
 Sources: L. Jay, SIAM J. Numer. Anal. 33 (1996); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 3.5; T.
-Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017).
+Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017); R. McLachlan, M. Perlmutter, J. Nonlinear Sci.
+16 (2006); D. Martin de Diego, R. Sato Martin de Almagro, arXiv 1810.10926.
 """
 
 from __future__ import annotations
@@ -24,14 +33,24 @@ from dataclasses import replace
 import sympy
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.constraints import constraint_multipliers, constraint_rates, with_reactions
+from scvi_codegen.mechanics.constraints import (
+    constraint_multipliers,
+    constraint_rates,
+    positions_held,
+    velocities_held,
+    with_reactions,
+)
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
-from scvi_codegen.tables.basis import identity_matrix
-from scvi_codegen.tables.precision import Matrix, mp
+from scvi_codegen.tables.basis import cardinal_values
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+from scvi_codegen.tables.quadrature import gauss_legendre
 
 __all__ = ["with_constraints"]
+
+SAME = mp.mpf(10) ** -40
 
 
 def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
@@ -58,15 +77,17 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
             Row(number="end", kind="stage", momentum=-stages.end_momentum),
             *(Row(number=number, kind=kind, momentum=mp.zero, size=count) for number, kind in conditions),
         ),
-        families=(_held(system, family), _end(system, stages, points)),
+        families=(_held(system, family), *_rolling(system, stages, family), _end(system, stages, points)),
         end_position=Table.joined(stages.end_position, Table.constant(1, 1 + points)),
-        extrapolation=stages.extrapolation and _extrapolation(stages.extrapolation, family.abscissae),
+        extrapolation=stages.extrapolation and _extrapolation(stages, family.abscissae),
     )
 
 
 def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> None:
     family, s = stages.families[0], len(stages.blocks)
     ends = (family.abscissae[0], family.abscissae[-1]) == (0, 1)
+    if any(velocities_held(system)) and ends and not _is_polynomial(family):
+        raise MethodError(f"{name}, whose curves are no polynomials, does not keep the velocities of '{system.name}'")
     if ends and len(stages.families) == 1 and len(family.abscissae) == s + 1 and family.in_action:
         return
     raise MethodError(
@@ -74,6 +95,14 @@ def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> N
         "than the degree, both ends of the step among them. Take SVI(4, 'gauss-lobatto:5'), of order 8, or so; "
         "SVI(1, 'gauss-lobatto:2') is RATTLE"
     )
+
+
+def _is_polynomial(family: PointFamily) -> bool:
+    """Whether the velocity at the last point follows from those at the others, as that of a curve of degree s does."""
+    velocities, points = family.gathers[1].table.entries, family.abscissae
+    others = Table(entries=velocities[:-1], names=family.gathers[1].table.names[:-1])
+    last = _interpolated(others, cardinal_values(points[:-1], points[-1:]), "").entries[0]
+    return all(abs(x - y) < SAME for x, y in zip(last, velocities[-1], strict=True))
 
 
 def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
@@ -89,15 +118,53 @@ def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
     scatters[0] = replace(scatters[0], results=with_reactions(system, scatters[0].results))
     conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
     held = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
-    scatters.append(Scatter(results=system.constraints, table=held, power=-1, scale=scatters[0].scale))
-    products = [factor * g for factor, g in zip(factors, system.constraints, strict=True)]
+    positions = positions_held(system)
+    if any(positions):
+        scatters.append(Scatter(results=positions, table=held, power=-1, scale=scatters[0].scale))
+    products = [factor * g for factor, g in zip(factors, positions, strict=True)]
     return replace(
         family,
         gathers=tuple(gathers),
         scatters=tuple(scatters),
         scalar=sympy.Add(family.scalar, *products),
-        computes="L_q + g_q^T lambda, L_v and g",
+        computes="L_q + G^T lambda, L_v and g",
+        forced=family.forced or any(velocities_held(system)),
     )
+
+
+def _rolling(system: MechanicalSystem, stages: StageSystem, family: PointFamily) -> tuple[PointFamily, ...]:
+    """What constraints say of velocities, at s Gauss points; nothing without such constraints."""
+    held, size, rows = velocities_held(system), len(stages.blocks), len(stages.rows)
+    if not any(held):
+        return ()
+    points, gauss = len(family.abscissae), gauss_legendre(size)
+    between = cardinal_values([2 * c - 1 for c in family.abscissae], gauss.points)
+    gathers = [
+        replace(
+            gather, table=Table.joined(_interpolated(gather.table, between, name), Table.constant(size, 1 + points))
+        )
+        for gather, name in zip(family.gathers, ("A", "L"), strict=True)
+    ]
+    conditions = [[int(row == n) for row in range(size)] for n in range(size)]
+    place = Table.joined(Table.constant(size, rows + 1), Table.named("", conditions), Table.constant(size, 2))
+    return (
+        PointFamily(
+            name="rolling",
+            abscissae=gauss.abscissae,
+            weights=(mp.one,) * size,
+            weight_names=("",) * size,
+            gathers=tuple(gathers),
+            scatters=(Scatter(results=held, table=place, power=0),),
+            computes="What constraints say of velocities",
+        ),
+    )
+
+
+def _interpolated(table: Table, weights: Matrix, name: str) -> Table:
+    """The table of other points, where entries are polynomials of the points."""
+    columns = list(zip(*table.entries, strict=True))
+    lines = [[mp.fdot(zip(line, column, strict=True)) for column in columns] for line in weights]
+    return Table.named(name, lines, column=0)
 
 
 def _with_end(table: Table, rows: int, points: int) -> Table:
@@ -133,10 +200,22 @@ def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> PointFam
     )
 
 
-def _extrapolation(own: Matrix, abscissae: tuple[mp.mpf, ...]) -> Matrix:
-    """Velocities at the points as without constraints; that of the end, and multipliers, stay what they were."""
-    size, points = len(own), len(abscissae)
-    lines = [(*line, *(mp.zero,) * (1 + points)) for line in own]
-    lines.append((*(mp.zero,) * size, mp.one, *(mp.zero,) * points))
-    lines += [(*(mp.zero,) * (size + 1), *line) for line in identity_matrix(points)]
+def _extrapolation(stages: StageSystem, abscissae: Vector) -> Matrix:
+    """Velocities on the polynomial through those of the curve and the one at the end; multipliers on theirs.
+
+    The velocity at the end is as good as the step, those of the curve are not: it makes the guess one order better.
+    """
+    blocks = stages.shape.blocks if isinstance(stages.shape, Velocities) else ()
+    size, points, known = len(stages.blocks), len(abscissae), (*blocks, mp.one)
+    if len(set(known)) <= size:
+        lines = [(*line, *(mp.zero,) * (1 + points)) for line in stages.extrapolation or ()]
+        lines.append((*(mp.zero,) * size, mp.one, *(mp.zero,) * points))
+    else:
+        lines = [(*line, *(mp.zero,) * points) for line in _ahead(known)]
+    lines += [(*(mp.zero,) * (size + 1), *line) for line in _ahead(abscissae)]
     return tuple(lines)
+
+
+def _ahead(known: Vector) -> Matrix:
+    """From values at points of a step to those that their polynomial has at the same points of the next."""
+    return cardinal_values([2 * c - 1 for c in known], [2 * c + 1 for c in known])

@@ -19,6 +19,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.constraints import velocities_held
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -153,8 +154,8 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
 
 
 def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Whether the steps preserve dq ^ dp: of a symplectic method, where no forces act."""
-    return method.symplectic and not system.forces
+    """Whether the steps preserve dq ^ dp: of a symplectic method, where no forces act and nothing holds velocities."""
+    return method.symplectic and not system.forces and not any(velocities_held(system))
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:

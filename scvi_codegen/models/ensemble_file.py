@@ -19,7 +19,6 @@ parameters.
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -34,6 +33,7 @@ from numpy.typing import NDArray
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
+from scvi_codegen.models.csv_tables import parse_table
 from scvi_codegen.models.model import Model
 
 if TYPE_CHECKING:
@@ -85,9 +85,16 @@ class EnsembleStates:
             return self._table(self._momenta, model.momenta(stepper))
         default = model.velocity
         if default is None:
-            default = tuple(stepper.velocity(model.q, model.momenta(stepper), model.t, model.system.defaults))
-        states = zip(self.q, self._table(self._velocities, default), self.parameters, strict=True)
+            start = model.parameters_at_start(stepper)
+            default = tuple(stepper.velocity(model.q, model.momenta(stepper), model.t, start))
+        states = zip(self.q, self._table(self._velocities, default), self._at_start(stepper), strict=True)
         return np.array([stepper.momentum(q, v, model.t, values) for q, v, values in states])
+
+    def _at_start(self, stepper: Stepper) -> Array:
+        """(k, number of parameters), with those of inputs where the model gives them."""
+        if not self.model.inputs:
+            return self.parameters
+        return self._table(list(stepper.parameters), self.model.parameters_at_start(stepper))
 
     @property
     def _coordinates(self) -> list[str]:
@@ -168,33 +175,7 @@ def real(value: Any, where: str) -> float:
 
 
 def _read_table(text: str, check: Check) -> dict[str, Array]:
-    reader = csv.reader(text.splitlines(), skipinitialspace=True)
-    lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
-    if len(lines) < 2:
-        raise ModelFileError("a table has a header of names and at least one line of numbers")
-    names = lines[0][1]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise ModelFileError(f"the column '{repeated[0]}' is there twice")
-    if "" in names:
-        raise ModelFileError(f"column {names.index('') + 1} has no name in the first line")
-    check(names)
-    rows = [_row(cells, names, number) for number, cells in lines[1:]]
-    return dict(zip(names, np.array(rows).T, strict=True))
-
-
-def _row(cells: list[str], names: list[str], number: int) -> list[float]:
-    if len(cells) != len(names):
-        raise ModelFileError(f"line {number} must have a number for each of {len(names)} names, and has {len(cells)}")
-    values = []
-    for name, cell in zip(names, cells, strict=True):
-        try:
-            values.append(float(cell))
-        except ValueError as error:
-            raise ModelFileError(f"line {number}, {name}: '{cell}' is not a number") from error
-        if not math.isfinite(values[-1]):
-            raise ModelFileError(f"line {number}, {name}: {cell} is not a finite number")
-    return values
+    return parse_table(text, check).columns
 
 
 def _check_names(model: Model, names: Sequence[str]) -> None:

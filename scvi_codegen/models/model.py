@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.kinds import check_kind
+from scvi_codegen.mechanics.inputs import input_parameters
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import Problem
 
 if TYPE_CHECKING:
+    from scvi_codegen.models.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
+    from scvi_codegen.runtime.driven import Input
     from scvi_codegen.runtime.inputs import Array
+    from scvi_codegen.runtime.integrator import Integrator
     from scvi_codegen.runtime.run import Run
     from scvi_codegen.runtime.stepper import Stepper
 
@@ -46,6 +50,8 @@ class Model:
         steps: number of steps of h, or ``None`` if ``span`` is given.
         every: distance between kept states in steps.
         t: initial time.
+        inputs: of a system that has any, by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as
+            :meth:`Stepper.drive` takes it; all of them for a run.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, one of h and tolerance and one of span
@@ -63,6 +69,7 @@ class Model:
     steps: int | None = None
     every: int = 1
     t: float = 0.0
+    inputs: Mapping[str, InputTable] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         check_kind(SYSTEM, self.system, "system", ModelFileError)
@@ -80,6 +87,10 @@ class Model:
         if self.steps is not None:
             object.__setattr__(self, "steps", checked_count(self.steps, "steps", least=0, error=ModelFileError))
         object.__setattr__(self, "every", checked_count(self.every, "every", least=1, error=ModelFileError))
+        if self.inputs:
+            from scvi_codegen.models.input_tables import checked_tables  # here: reading a model does not wait for NumPy
+
+            object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
 
     @classmethod
     def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
@@ -117,9 +128,9 @@ class Model:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """By name: the defaults of the system, but for an energy that is that of the initial state."""
-        level = self.system.clock.energy if self.system.clock else None
-        return {given.name: value for given, value in self.system.constants.items() if given != level}
+        """By name: the defaults of the system, but for an energy that is the initial state's, and those of inputs."""
+        others = {self.system.clock.energy.name if self.system.clock else "", *input_parameters(self.system.inputs)}
+        return {given.name: value for given, value in self.system.constants.items() if given.name not in others}
 
     @property
     def step(self) -> float:
@@ -143,7 +154,50 @@ class Model:
         if self.p is not None:
             return np.array(self.p)
         assert self.velocity is not None  # by construction
-        return stepper.momentum(self.q, self.velocity, self.t, self.parameters)
+        return stepper.momentum(self.q, self.velocity, self.t, self.parameters_at_start(stepper))
+
+    def parameters_at_start(self, stepper: Stepper) -> Mapping[str, float] | Array:
+        """What the parameters are, those of inputs too where these are given."""
+        return self._driven(stepper)[1](self.t) if self.inputs else self.parameters
+
+    def stretches(self, run: Run) -> Iterator[int | None]:
+        """Has a run of this model ready for each stretch from breakpoint to breakpoint of its inputs, or for all of it.
+
+        Yields:
+            How many steps it takes; ``None`` where steps choose their length and lead to the goal of the run.
+
+        Raises:
+            ModelFileError, StateError: for inputs that are not given, or not for all of the run.
+        """
+        if not self.system.inputs:
+            yield None if run.goal else self.step_count
+            return
+        from scvi_codegen.runtime.driven import stretches  # here, as NumPy above
+
+        inputs, values = self._driven(run.stepper)
+        yield from stretches(run, inputs, self.end, values)
+
+    @property
+    def end(self) -> float:
+        """The time to which a run with inputs leads."""
+        from scvi_codegen.runtime.driven import end_of
+
+        return end_of(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
+
+    def all_inputs(self) -> Mapping[str, InputTable]:
+        """The inputs; ModelFileError unless all that the system has are given."""
+        for name in self.system.inputs:
+            if name not in self.inputs:
+                way = f'[inputs] {name} = {{ file = "{name}.csv" }}, or --input {name}=FILE'
+                raise ModelFileError(f"the input {name} is not given: {way}")
+        return self.inputs
+
+    def _driven(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
+        """The inputs, and what they make of the parameters at a time."""
+        from scvi_codegen.runtime.driven import checked_inputs, parameters_of
+
+        found = checked_inputs(stepper, self.all_inputs())
+        return found, parameters_of(stepper, self.parameters, found)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
         """The run of this model from its initial state, to be advanced by :attr:`step_count` steps or to its end."""
@@ -162,7 +216,7 @@ class Model:
             t=self.t,
             t_end=self.t + self.covered if h is None else None,
             tolerance=self.tolerance or None if h is None else None,
-            parameters=self.parameters,
+            parameters=self.parameters_at_start(stepper),
             options=options,
         )
 

@@ -9,9 +9,14 @@
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
+    # inputs = ["u"]                                    # functions of time that are data
 
     [forces]                                            # on coordinates; left out: 0
     q = "F*cos(w*t)"
+
+    [inputs]                                            # of the inputs named above; see models/input_files.py
+    # u = { file = "u.csv", kind = "cubic" }            # beside this file; or constant, linear (left out: that)
+    # w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
 
     [parameters]                                        # default values; the section may be left out
     m = 1.0
@@ -51,16 +56,14 @@ from __future__ import annotations
 
 import os
 import re
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
-from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -68,7 +71,11 @@ from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, fitted, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD, Model, check_length, real
+from scvi_codegen.models.model_document import document_of, motion_of
 from scvi_codegen.models.problems import Problem, problem
+
+if TYPE_CHECKING:
+    from scvi_codegen.models.input_tables import InputTable
 
 __all__ = ["catalogue_model", "dump_model", "load_model", "parse_model", "save_model"]
 
@@ -77,18 +84,16 @@ Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "constraints")
-SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "catalogue", "monitor")
+SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
 RUN_KEYS = ("step", "tolerance", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
-SECTIONS = ("system", "forces", "parameters", "initial", "method", "run")
+SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance"}, {"span", "steps"})
 """One of each is given."""
 NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("span",)}
 """Keys, or their alternatives, without which there is nothing to run."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
 """Arguments that a method laid over another takes from it, if it has them."""
-SHORT_VECTOR = 4
-TEXT_WIDTH = 100
 
 
 @takes(path=PATH)
@@ -105,7 +110,7 @@ def load_model(path: str | os.PathLike[str], given: Document | None = None) -> M
     except UnicodeDecodeError as error:
         raise ModelFileError(f"{path} is not a text file in UTF-8: {error.reason} at byte {error.start}") from error
     try:
-        return parse_model(text, given)
+        return parse_model(text, given, folder=Path(path).parent)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
 
@@ -126,8 +131,14 @@ def catalogue_model(name: str, given: Document | None = None) -> Model:
     return _read_model({"system": {"catalogue": name}}, given or {})
 
 
-def parse_model(text: str, given: Document | None = None) -> Model:
-    """The model described by TOML text; see the module's docstring. Raises as :func:`load_model`."""
+def parse_model(text: str, given: Document | None = None, *, folder: str | os.PathLike[str] = ".") -> Model:
+    """The model described by TOML text; see the module's docstring. Raises as :func:`load_model`.
+
+    Args:
+        text: of the file.
+        given: sections laid over it.
+        folder: where the tables of inputs are.
+    """
     document = read_toml(text)
     _check_keys(document, SECTIONS, "section")
     for name, content in document.items():
@@ -135,14 +146,14 @@ def parse_model(text: str, given: Document | None = None) -> Model:
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
     for name, known in KEYS.items():
         _check_keys(document.get(name, {}), known, "key", f"[{name}]")
-    return _read_model(document, given or {})
+    return _read_model(document, given or {}, folder)
 
 
 def dump_model(model: Model) -> str:
     """TOML text that :func:`parse_model` reads back as an equal model. Raises as :func:`save_model`."""
     import tomli_w  # here, because reading does not need it
 
-    text = tomli_w.dumps(_document(model), multiline_strings=True)
+    text = tomli_w.dumps(document_of(model), multiline_strings=True)
     again = parse_model(text)
     if again != model:
         part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
@@ -153,56 +164,12 @@ def dump_model(model: Model) -> str:
     return text
 
 
-def _document(model: Model) -> dict[str, Any]:
-    clock = model.system.clock
-    system = clock.plain if clock and clock.plain else model.system
-    names = [coordinate.name for coordinate in system.coordinates]
-    kind = "hamiltonian" if system.auxiliaries else "lagrangian"
-    momenta = {"momenta": [p.name for p in system.auxiliaries]} if system.auxiliaries else {}
-    document: dict[str, Any] = {
-        "system": {"name": system.name, "coordinates": names, **momenta, kind: _wrapped(system.to_text())}
-    }
-    forces = zip(names, system.forces, strict=False)
-    if acting := {name: _wrapped(format_expression(force)) for name, force in forces if force != 0}:
-        document["forces"] = acting
-    if system.constraints:
-        document["system"]["constraints"] = [format_expression(g) for g in system.constraints]
-    if clock:
-        document["system"]["monitor"] = clock.monitor
-    if system.parameters:
-        document["parameters"] = model.parameters
-    return {**document, **_motion(model, names)}
-
-
-def _motion(model: Model, names: Sequence[str]) -> dict[str, Any]:
-    """The sections beside the system."""
-    vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
-    initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
-    specification = model.method.specification()
-    method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification.items()}
-    length = {"steps": model.steps} if model.span is None else {"span": model.span}
-    step = {"tolerance": model.tolerance} if model.h is None else {"step": model.h}
-    run = {**step, **length, "every": model.every}
-    return {"initial": {"t": model.t, **initial}, "method": method, "run": run}
-
-
-def _wrapped(formula: str) -> str:
-    """A formula, on several lines if it is long."""
-    lines = textwrap.wrap(formula, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
-    return lines[0] if len(lines) == 1 else "\n".join(["", *lines, ""])
-
-
-def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[str, float]:
-    """A short vector as a list, a long one by name."""
-    return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))
-
-
-def _read_model(document: Document, given: Document) -> Model:
+def _read_model(document: Document, given: Document, folder: str | os.PathLike[str] = ".") -> Model:
     entry = _read_catalogue(document.get("system", {}))
     document, given = _with_own_step(document), _with_own_step(given)
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
-        document = _laid_over(_motion(Model.from_problem(entry), names), document)
+        document = _laid_over(motion_of(Model.from_problem(entry), names), document)
     chosen = _chosen_method(document, given)
     document = {**_laid_over(document, given), "method": chosen}
     if entry is None:
@@ -214,7 +181,8 @@ def _read_model(document: Document, given: Document) -> Model:
         system = _in_section("[system]", lambda: reparametrise(system, monitor))
     state = _read_state(document["initial"], system)
     method = _read_method(fitted(document["method"], system))
-    return Model(system=system, method=method, **state, **_read_run(document["run"]))
+    inputs = _read_inputs(document.get("inputs", {}), folder)
+    return Model(system=system, method=method, inputs=inputs, **state, **_read_run(document["run"]))
 
 
 def _chosen_method(document: Document, given: Document) -> Section:
@@ -316,6 +284,8 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     if "hamiltonian" in section:
         if "constraints" in section:
             raise ModelFileError("[system] has constraints beside a hamiltonian: they are kept with a lagrangian")
+        if "inputs" in section:
+            raise ModelFileError("[system] has inputs beside a hamiltonian: they are taken with a lagrangian")
         if "dissipation" in section:
             raise ModelFileError("[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]")
         common["hamiltonian"] = _text(section, "hamiltonian", "[system]")
@@ -325,7 +295,8 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
         raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
     common["lagrangian"] = _text(section, "lagrangian", "[system]")
     common["dissipation"] = _text(section, "dissipation", "[system]") if "dissipation" in section else None
-    common["constraints"] = _names(section, "constraints") if "constraints" in section else ()
+    for key in ("constraints", "inputs"):
+        common[key] = _names(section, key) if key in section else ()
     return _in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 
@@ -353,6 +324,14 @@ def _read_vector(value: Any, names: Sequence[str], key: str) -> tuple[float, ...
         raise ModelFileError(f"{where} must be a list of numbers or a table by coordinate, not {value!r}")
     check_length(value, names, where)
     return tuple(real(item, f"{where}, {name},") for name, item in zip(names, value, strict=True))
+
+
+def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> dict[str, InputTable]:
+    if not section:
+        return {}
+    from scvi_codegen.models.input_files import read_input  # here: other models are read without NumPy
+
+    return {name: read_input(name, entry, folder) for name, entry in section.items()}
 
 
 def _read_method(section: Section) -> Method:

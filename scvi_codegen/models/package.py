@@ -190,6 +190,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
 
 def _example(model: Model, *, controlled: bool) -> ExampleRun:
     """The whole run of the model in at most about twenty lines of output."""
+    from scvi_codegen.models.input_tables import tables_of_example
     from scvi_codegen.rendering.text import ExampleRun
 
     clock = model.system.clock
@@ -199,7 +200,9 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
         )
     if model.h is None and not controlled:
         raise MethodError(f"{model.method.name} has no steps that choose their length (tolerance): give a step h")
-    momenta = model.p if model.p is not None else _momenta(model)
+    given = model.all_inputs() if model.inputs else {}
+    inputs, parameters = tables_of_example(model.system, given, model.t)
+    momenta = model.p if model.p is not None else _momenta(model, parameters)
     if clock and model.ends_at_time:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
     else:
@@ -208,7 +211,7 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
     return ExampleRun(
         q=model.q,
         p=momenta,
-        parameters=model.system.defaults,
+        parameters=parameters,
         t=model.t,
         h=model.h,
         span=model.covered,
@@ -217,10 +220,12 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
         every=every,
         outputs=steps // every,
         to_end=bool(clock) and model.ends_at_time,
+        inputs=inputs,
+        end=model.end if inputs else 0.0,
     )
 
 
-def _momenta(model: Model) -> tuple[float, ...]:
+def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
     """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
     from scvi_codegen.formulas.tape import evaluate
     from scvi_codegen.mechanics.forms import forms_of
@@ -232,7 +237,7 @@ def _momenta(model: Model) -> tuple[float, ...]:
         raise StateError("velocities do not determine the momenta of this Hamiltonian: give p, not q_dot")
     rate = _rate(system, model.q, ()) if system.clock else 1.0
     symbols = (*system.coordinates, *system.velocities, system.time, *system.parameters)
-    numbers = (*model.q, *(rate * mp.mpf(v) for v in model.velocity or ()), model.t, *system.defaults)
+    numbers = (*model.q, *(rate * mp.mpf(v) for v in model.velocity or ()), model.t, *parameters)
     point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))
     try:
         return tuple(float(evaluate(expression, point)) for expression in forms_of(system).momentum)
@@ -284,6 +289,22 @@ int status = ${prefix}_advance_to(&run, t_end, tolerance, most_steps, most_steps
 """
 
 
+INPUTS = """
+Inputs ($inputs) are tables, `${prefix}_input` each. Steps end at their breakpoints; until `t_end`:
+
+```c
+for (long long steps; (steps = ${prefix}_next_steps(&run, t_end, h, inputs, parameters)) > 0;)
+  status = ${prefix}_advance(&run, steps, every, parameters, NULL, t, q, p, iterations, &report, workspace);
+```
+"""
+
+
+def _further(text: str, interface: Interface) -> str:
+    """A part of the description that not every folder has."""
+    inputs = ", ".join(f"`{name}`" for name in interface.inputs)
+    return Template(text).substitute(prefix=interface.prefix, inputs=inputs)
+
+
 def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None, controlled: bool) -> str:
     defaults = zip(interface.parameters, interface.defaults, strict=True)
     listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
@@ -298,7 +319,7 @@ def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None
             coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
             parameters=(f"Parameters, with default values: {listed}." if listed else "There are no parameters.")
             + Template(CLOCK if interface.energy_parameter else "").substitute(energy=interface.energy_parameter),
-            control=Template(CONTROL).substitute(prefix=interface.prefix) if controlled else "",
+            control=_further(CONTROL * controlled + INPUTS * bool(interface.inputs), interface),
             integrate=f"\ntrajectory = {interface.prefix}.stepper.integrate(q0, p0, t_end=t_end)" if controlled else "",
             origin="`model.toml` is what it was generated from." if with_model else "",
         )

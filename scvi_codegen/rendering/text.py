@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Literal, TypeAlias, cast, get_args
+from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.derivatives import Derivatives
@@ -62,6 +62,14 @@ LARGEST_INLINED = 150
 3 per cent, a chain of 64 masses 20."""
 
 
+class ExampleInput(NamedTuple):
+    """A function of time: (n + 1,) breakpoints, and from each on coefficients of powers of the time since, (n, 4)."""
+
+    name: str
+    breakpoints: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExampleRun:
     """What the generated ``main.c`` runs: initial state, step, and how often it prints.
@@ -72,6 +80,8 @@ class ExampleRun:
         tolerance: of steps that choose their length.
         controlled: whether the integrator has these.
         to_end: whether it goes on to the end of the span, in steps of tau whose number is not known before.
+        inputs: of a system that has any, if they are given; ``parameters`` has their values at the start.
+        end: of a run with inputs.
     """
 
     q: tuple[float, ...]
@@ -85,6 +95,8 @@ class ExampleRun:
     every: int
     outputs: int
     to_end: bool = False
+    inputs: tuple[ExampleInput, ...] = ()
+    end: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,6 +219,8 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
     """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     target = TARGETS[precision]
     target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
+    for each in start.inputs:
+        target.check((*each.breakpoints, *chain(*each.coefficients)))
     context = {
         "interface": interface,
         "prefix": interface.prefix,

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.runtime.ensemble import Ensemble, EnsembleParameters, momenta_of_each
+from scvi_codegen.runtime.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 

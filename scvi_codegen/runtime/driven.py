@@ -5,17 +5,18 @@ Steps end at breakpoints; the compensated sums go on across them. See :mod:`scvi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.dense_output import checked_times
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -24,11 +25,23 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.integrator import Integrator
     from scvi_codegen.runtime.run import Run
 
-__all__ = ["DrivenTrajectory", "Input", "checked_inputs", "drive", "end_of", "parameters_of"]
-
-Number = TypeVar("Number", bound=np.generic)
+__all__ = [
+    "Input",
+    "Stretch",
+    "checked_inputs",
+    "drive",
+    "end_of",
+    "input_of",
+    "later",
+    "parameters_at",
+    "parameters_of",
+    "planned",
+    "stretches",
+    "with_end",
+]
 
 POWERS = 4
+ALL = slice(None)
 NEGLIGIBLE_STEP = 1e-9
 """Of a step: what is left before a breakpoint that is not worth one."""
 
@@ -39,22 +52,26 @@ class Input:
 
     Attributes:
         breakpoints: (n + 1,) ascending times.
-        coefficients: (4, n) of powers of the time since the breakpoint before, ascending.
+        pieces: (n, 5) parameters from each to the next: coefficients of powers of the time since it, ascending, and
+            itself; (n, k, 5) of k trajectories.
     """
 
     breakpoints: Array
-    coefficients: Array
+    pieces: Array
 
-    def parameters(self, name: str, t: float) -> dict[str, float]:
-        """Values of the parameters of an input for the piece in which t lies."""
-        piece = int(np.searchsorted(self.breakpoints, t, side="right")) - 1
-        piece = min(max(piece, 0), len(self.breakpoints) - 2)
-        values = {f"{name}_{k}": float(c) for k, c in enumerate(self.coefficients[:, piece])}
-        return values | {f"{name}_t": float(self.breakpoints[piece])}
+    def parameters(self, t: float, part: slice = ALL) -> Array:
+        """(5,) for the piece in which t lies, or those of a part of the trajectories."""
+        piece = int(self.breakpoints.searchsorted(t, side="right")) - 1
+        found: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
+        return found[part] if found.ndim == 2 else found
 
 
-def checked_inputs(stepper: Integrator, given: Mapping[str, Any] | None) -> dict[str, Input]:
+def checked_inputs(
+    stepper: Integrator, given: Mapping[str, Any] | None, trajectories: int | None = None
+) -> dict[str, Input]:
     """Inputs as users give them: (t, values), (t, values, kind), or a piecewise polynomial of SciPy's.
+
+    With a number of trajectories each may have values of its own, a row each.
 
     Raises:
         StateError: for names that are no inputs, inputs that are not given, and data that make no function of time.
@@ -66,17 +83,19 @@ def checked_inputs(stepper: Integrator, given: Mapping[str, Any] | None) -> dict
             raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
     if missing := [name for name in names if name not in given]:
         raise StateError(f"the input {missing[0]} is not given: inputs={{'{missing[0]}': (t, values)}}")
-    return {name: _input(name, value) for name, value in given.items()}
+    return {name: input_of(name, value, trajectories) for name, value in given.items()}
 
 
-def _input(name: str, given: Any) -> Input:
+def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
+    """One of them; raises as :func:`checked_inputs`."""
     if callable(given) and not hasattr(given, "c"):
         raise StateError(
             f"the input {name} is a function of Python's, which C cannot call in the middle of a step: give values, "
             f"{name}=(t, values) or scipy.interpolate.CubicSpline(t, values)"
         )
     if hasattr(given, "c") and hasattr(given, "x"):
-        return _from_pieces(name, np.array(given.x, dtype=float), np.array(given.c, dtype=float)[::-1])
+        ascending = np.moveaxis(np.array(given.c, dtype=float)[::-1], 1, -1)
+        return _from_pieces(name, np.array(given.x, dtype=float), ascending, trajectories)
     if not isinstance(given, tuple) or len(given) not in (2, 3):
         raise StateError(f"the input {name} is given as (t, values), or (t, values, 'cubic'), not {given!r:.60}")
     t, values = (
@@ -85,41 +104,44 @@ def _input(name: str, given: Any) -> Input:
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in KINDS:
         raise StateError(f"the input {name} is {' or '.join(KINDS)} between its values, not {kind!r}")
-    if t.ndim != 1 or t.shape != values.shape or len(t) < 2:
+    if t.ndim != 1 or len(t) < 2 or values.shape not in (t.shape, (trajectories, *t.shape)):
+        rows = "" if trajectories is None else f", values also for each of {trajectories} trajectories"
         raise StateError(
-            f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each"
+            f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each{rows}"
         )
-    if (np.diff(t) <= 0.0).any():
-        raise StateError(f"the times of the input {name} do not ascend")
-    return _from_pieces(name, t, KINDS[kind](t, values))
+    if (late := np.flatnonzero(np.diff(t) <= 0.0)).size:
+        k = int(late[0])
+        raise StateError(f"the times of the input {name} do not ascend: {t[k + 1]:g} after {t[k]:g}")
+    return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
 
 
 def _constant(t: Array, values: Array) -> Array:
-    return values[np.newaxis, :-1]
+    return values[np.newaxis, ..., :-1]
 
 
 def _linear(t: Array, values: Array) -> Array:
-    return np.array([values[:-1], np.diff(values) / np.diff(t)])
+    return np.array([values[..., :-1], np.diff(values) / np.diff(t)])
 
 
 def _cubic(t: Array, values: Array) -> Array:
     from scipy.interpolate import CubicSpline  # here: slow to import
 
-    found: Array = CubicSpline(t, values).c[::-1]
-    return found
+    return np.moveaxis(CubicSpline(t, values, axis=-1).c[::-1], 1, -1)
 
 
 KINDS: dict[str, Callable[[Array, Array], Array]] = {"constant": _constant, "linear": _linear, "cubic": _cubic}
 
 
-def _from_pieces(name: str, breakpoints: Array, ascending: Array) -> Input:
-    if ascending.ndim != 2 or len(ascending) > POWERS or not np.isfinite(ascending).all():
+def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: int | None) -> Input:
+    shaped = ascending.shape[1:-1] in ((), (trajectories,))
+    if not shaped or len(ascending) > POWERS or not np.isfinite(ascending).all():
         raise StateError(
             f"the pieces of the input {name} are polynomials of degree 3 at most, with finite coefficients"
         )
-    coefficients = np.zeros((POWERS, ascending.shape[1]))
-    coefficients[: len(ascending)] = ascending
-    return Input(breakpoints, coefficients)
+    pieces = np.zeros((ascending.shape[-1], *ascending.shape[1:-1], POWERS + 1))
+    pieces[..., : len(ascending)] = ascending.T
+    pieces.T[POWERS] = breakpoints[:-1]
+    return Input(breakpoints, pieces)
 
 
 def drive(
@@ -141,24 +163,81 @@ def drive(
         values: the parameters of the piece in which a time lies.
         progress: called with the steps done.
     """
-    forward, h, pieces = np.sign(t_end - run.t), run.h, []
-    ends = _ends(run.t, t_end, inputs)
-    for end in ends:
-        middle = run.t + 0.5 * (end - run.t)
-        if run.goal is not None:
-            run.change(parameters=values(middle), goal=replace(run.goal, t_end=end))
-            pieces.append(run.record(every=every, progress=progress))
-        else:
-            run.change(parameters=values(middle), h=h)
-            whole = int(np.floor((end - run.t) / h + NEGLIGIBLE_STEP))
-            if whole:
-                pieces.append(run.record(whole, every=every, progress=progress))
-            if forward * (end - run.t) > NEGLIGIBLE_STEP * abs(h):
-                run.change(h=end - run.t)
-                pieces.append(run.record(1, progress=progress))
-        if pieces and pieces[-1].ended_by is not None:
+    pieces: list[Trajectory] = []
+    first = run.steps
+    told = None if progress is None else lambda _: progress(run.steps - first)
+    for steps in stretches(run, inputs, t_end, values):
+        pieces.append(with_end(run.record(steps, every=every, progress=told), run))
+        if pieces[-1].ended_by is not None:
             break
-    return DrivenTrajectory(tuple(pieces))
+    return DrivenTrajectory(tuple(pieces or [run.record(0)]))
+
+
+def stretches(
+    run: Run, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
+) -> Iterator[int | None]:
+    """Has the run ready for each stretch without a breakpoint or another step inside.
+
+    Yields:
+        How many steps it takes; ``None`` where steps choose their length and lead to the goal of the run.
+    """
+    if run.goal is None:
+        for stretch in planned(run.t, t_end, run.h, inputs):
+            run.change(parameters=values(stretch.middle), h=stretch.h)
+            yield stretch.steps
+        return
+    for end in _ends(run.t, t_end, inputs):
+        run.change(parameters=values(run.t + 0.5 * (end - run.t)), goal=replace(run.goal, t_end=end))
+        yield None
+
+
+class Stretch(NamedTuple):
+    """Steps of one length in one piece of all inputs.
+
+    Attributes:
+        start: when they begin, in two pieces as runs carry them.
+        middle: a time in that piece.
+    """
+
+    steps: int
+    h: float
+    start: tuple[float, float]
+    middle: float
+
+
+def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Stretch]:
+    """By steps of h, and one that is shorter where a breakpoint or the end comes before theirs."""
+    forward, now, found = np.sign(t_end - t), (t, 0.0), []
+    for end in _ends(t, t_end, inputs):
+        middle = now[0] + 0.5 * (end - now[0])
+        if whole := int(np.floor((end - now[0]) / h + NEGLIGIBLE_STEP)):
+            found.append(Stretch(whole, h, now, middle))
+            now = later(now, h, whole)
+        if forward * (end - now[0]) > NEGLIGIBLE_STEP * abs(h):
+            found.append(Stretch(1, end - now[0], now, middle))
+            now = later(now, end - now[0], 1)
+    return found
+
+
+def later(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]:
+    """A time in two pieces, so many steps on."""
+    high, low = map(float, times_after(now[0], h, steps))
+    total = high + (low + now[1])
+    return total, (low + now[1]) - (total - high)
+
+
+def with_end(piece: Trajectory, run: Run) -> Trajectory:
+    """A stretch with the state that it ends at, whatever the number of that."""
+    if piece.t[-1] == run.t or piece.ended_by is not None:
+        return piece
+    return replace(
+        piece,
+        t=np.append(piece.t, run.t),
+        q=np.append(piece.q, [run.q], axis=0),
+        p=np.append(piece.p, [run.p], axis=0),
+        iterations=np.append(piece.iterations, np.int32(0)),
+        lengths=np.append(piece.lengths, run.h),
+    )
 
 
 def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
@@ -173,121 +252,36 @@ def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
                 f"the input {name} is given from t = {first:g} to {last:g}; the run is from {low:g} to {high:g}"
             )
         inner |= {float(x) for x in data.breakpoints if low < x < high}
-    ends = sorted(inner, reverse=t_end < t)
-    return [*ends, t_end]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DrivenTrajectory:
-    """States along a run with inputs, and what follows from them, each with the parameters of its piece.
-
-    Attributes:
-        pieces: trajectories from breakpoint to breakpoint, the first state of each the last of the one before.
-    """
-
-    pieces: tuple[Trajectory, ...]
-
-    @property
-    def t(self) -> Array:
-        """(n,) times."""
-        return self._joined(lambda piece: piece.t)
-
-    @property
-    def q(self) -> Array:
-        """(n, m) positions."""
-        return self._joined(lambda piece: piece.q)
-
-    @property
-    def p(self) -> Array:
-        """(n, m) momenta."""
-        return self._joined(lambda piece: piece.p)
-
-    @property
-    def velocity(self) -> Array:
-        """(n, m) velocities."""
-        return self._joined(lambda piece: piece.velocity)
-
-    @property
-    def iterations(self) -> NDArray[np.int32]:
-        """(n,) iterations since the state before."""
-        return self._joined(lambda piece: piece.iterations)
-
-    @property
-    def steps(self) -> int:
-        """Taken since the start."""
-        return self.pieces[-1].steps
-
-    @property
-    def stepper(self) -> Integrator:
-        """The compiled integrator."""
-        return self.pieces[0].stepper
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def energy(self) -> Array:
-        """(n,) energies p.v - L."""
-        return self._joined(lambda piece: piece.energy())
-
-    def momentum_maps(self) -> Array:
-        """(n, k) values of what symmetries conserve."""
-        return self._joined(lambda piece: piece.momentum_maps())
-
-    def multipliers(self) -> Array:
-        """(n, c) multipliers of the constraints."""
-        return self._joined(lambda piece: piece.multipliers())
-
-    def work(self) -> Array:
-        """(n,) work of the forces since the first state."""
-        return self._summed(lambda piece: piece.work())
-
-    def impulses(self) -> Array:
-        """(n, k) what forces gave to momentum maps since the first state."""
-        return self._summed(lambda piece: piece.impulses())
-
-    def at(self, t: ArrayLike) -> tuple[Array, Array]:
-        """States between those kept, as of :meth:`Trajectory.at`."""
-        times = checked_times(t, "t")
-        flat, m = times.ravel(), self.stepper.dimension
-        q, p = np.empty((2, len(flat), m))
-        forward = self.pieces[0].forward
-        ends = forward * np.array([piece.t[-1] for piece in self.pieces])
-        number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)
-        for k in np.unique(number):
-            q[number == k], p[number == k] = self.pieces[k].at(flat[number == k])
-        return q.reshape(*times.shape, m), p.reshape(*times.shape, m)
-
-    def _joined(self, part: Callable[[Trajectory], NDArray[Number]]) -> NDArray[Number]:
-        first, *others = (part(piece) for piece in self.pieces)
-        return np.concatenate([first, *(other[1:] for other in others)])
-
-    def _summed(self, part: Callable[[Trajectory], Array]) -> Array:
-        found = [part(piece) for piece in self.pieces]
-        for before, after in pairwise(found):
-            after += before[-1]
-        return np.concatenate([found[0], *(each[1:] for each in found[1:])])
+    ends = sorted(inner, reverse=bool(t_end < t))
+    return [*ends, *([t_end] if t_end != t else [])]
 
 
 def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
     """Where a run with inputs leads."""
-    if t_end is not None:
-        return t_end
-    if h is None or steps is None:
-        raise StateError(
-            "a run with inputs leads to t_end, with h or by steps that choose their length, or takes steps of h"
-        )
-    return float(times_after(t, h, steps)[0])
+    t = checked_number(t, "the time t")
+    if (t_end is None) == (steps is None):
+        raise StateError("a run with inputs leads to t_end or takes steps of h: give one of t_end and steps")
+    if t_end is None:
+        if h is None:
+            raise StateError("steps that choose their length have no number: give t_end, or h and steps")
+        return float(times_after(t, checked_step(h), checked_count(steps, "steps", least=0))[0])
+    end = checked_number(t_end, "t_end")
+    if h is not None and (end - t) * checked_step(h) < 0.0:
+        raise StateError(f"steps of h = {h:g} do not lead from t = {t:g} to t_end = {end:g}")
+    return end
 
 
 def parameters_of(stepper: Integrator, given: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:
     """The values of all parameters at a time, those of inputs by their pieces."""
-    return partial(_parameters_at, stepper, given, inputs)
+    return partial(parameters_at, stepper.parameters, stepper._parameters(given), inputs)
 
 
-def _parameters_at(stepper: Integrator, given: Any, inputs: Mapping[str, Input], t: float) -> Array:
-    values: Array = stepper._parameters(given)
-    names: Sequence[str] = stepper.parameters
+def parameters_at(
+    names: Sequence[str], others: Array, inputs: Mapping[str, Input], t: float, part: slice = ALL
+) -> Array:
+    """(p,) values by names, or (k, p) of a part of many trajectories: others, but for those of inputs."""
+    values = others[part].copy()
     for name, data in inputs.items():
-        for key, value in data.parameters(name, t).items():
-            values[names.index(key)] = value
+        first = names.index(f"{name}_0")
+        values[..., first : first + POWERS + 1] = data.parameters(t, part)
     return values

@@ -11,10 +11,10 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native import building
-from scvi_codegen.native.arguments import checked_number, checked_step, empty_array, real_array
+from scvi_codegen.native.arguments import checked_number, checked_step, empty_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
-from scvi_codegen.runtime.constraints import consistent
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runtime.inputs import Array, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
@@ -35,17 +35,12 @@ from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = [
+    "Change",
     "Ensemble",
-    "EnsembleParameters",
     "LaneBlock",
-    "checked_ensemble",
-    "consistent_ensemble",
+    "Portion",
     "integrate_ensemble",
-    "momenta_of_each",
-    "parameters_of_each",
 ]
-
-EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
 FIRST_PORTION = 64
 """Steps of a block before the first look at the clock."""
@@ -74,6 +69,26 @@ def integrate_ensemble(
     return work.result()
 
 
+class Change(NamedTuple):
+    """Another step, and other parameters: those of a part of the trajectories, (number of it, number of parameters)."""
+
+    h: float
+    parameters: Callable[[slice], Array]
+
+
+class Portion(NamedTuple):
+    """Steps of one call.
+
+    Attributes:
+        every: distance between the states kept.
+        change: before them, or ``None``.
+    """
+
+    steps: int
+    every: int
+    change: Change | None = None
+
+
 class Ensemble:
     """An ensemble to be integrated: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``."""
 
@@ -94,14 +109,13 @@ class Ensemble:
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
         self.steps = checked_count(steps, "steps", least=0)
         self.every = checked_count(every, "every", least=1)
-        start_q, start_p = checked_ensemble(stepper, q, p)
+        start_q, start_p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.count = len(start_q)
-        self.parameters = parameters_of_each(stepper, parameters, self.count)
         if not stepper.has_energy(parameters):
             for j in range(self.count):
                 level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
                 self.parameters[j, level] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
-        kept = self.steps // self.every + 1
+        kept = self.row(self.steps)
         self.q, self.p = (empty_array((kept, self.count, stepper.dimension)) for _ in "qp")
         self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = start_q, start_p
@@ -114,6 +128,29 @@ class Ensemble:
 
     def __len__(self) -> int:
         return self.count
+
+    @property
+    def length(self) -> int:
+        """What ``progress`` counts up to: steps."""
+        return self.steps
+
+    def row(self, step: int) -> int:
+        """Of the first state kept that comes after ``step``."""
+        return step // self.every + 1
+
+    def portions(self, begin: int, size: int) -> Iterator[Portion]:
+        """What leads ``size`` steps on, in as many calls of C as are needed."""
+        yield Portion(size, self.every)
+
+    def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
+        """H, time and parameters of trajectory j after ``step`` steps."""
+        high, low = times_after(self.t0, self.h, step)
+        return self.h, (float(high), float(low)), self.parameters[j]
+
+    def kept_times(self) -> Array:
+        """(n,) of the states, by steps of h."""
+        number = self.every * np.arange(len(self.q), dtype=np.float64)
+        return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
 
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""
@@ -184,9 +221,8 @@ class Ensemble:
     def result(self) -> EnsembleTrajectory:
         """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
         unfinished = (self.status == OK) & (self.done < self.steps)
-        number = self.every * np.arange(len(self.q), dtype=np.float64)
         return EnsembleTrajectory(
-            t=times_after(self.t0 if self.times is None else 0.0, self.h, number)[0],
+            t=self.kept_times(),
             times=self.times,
             q=self.q,
             p=self.p,
@@ -206,6 +242,8 @@ class LaneBlock:
         self.memory = binding.new("block *")
         binding.function("start")(self.memory, work.t0, work.h)
         self.active = np.frombuffer(binding.buffer(self.memory.active), dtype=np.float64)
+        lanes = np.frombuffer(binding.buffer(self.memory.parameters), dtype=np.float64).reshape(-1, len(self.active))
+        self.parameters = lanes[: work.parameters.shape[1]]
         self.count, self.step = min(len(self.active), work.count - first), 0
         self.left: dict[int, _Alone] = {}
         self._fill()
@@ -241,16 +279,45 @@ class LaneBlock:
 
     def advance(self, size: int) -> None:
         """``size`` steps on."""
+        for portion in self.work.portions(self.step, size):
+            if portion.change is not None:
+                self._change(portion.change.h, portion.change.parameters(slice(self.first, self.first + self.count)))
+            self._advance(portion.steps, portion.every)
+
+    def _change(self, h: float, own: Array) -> None:
+        """Another step, before which what the curve of the last one says of the next is forgotten, and parameters."""
+        for lane, alone in self.left.items():
+            alone.change(h, own[lane])
+        self.parameters[:, : self.count] = own.T
+        self.parameters[:, self.count :] = own[-1:].T
+        if h == self.memory.h:
+            return
+        self.memory.h, self.memory.guess = h, 0
+        if self.binding.constant("NEEDS_VELOCITIES"):
+            self._take_velocities(own)
+
+    def _take_velocities(self, parameters: Array) -> None:
+        """Into the memory at the points, as before the first step; lanes that have none rest."""
+        at_points = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
+        at_points = at_points.reshape(-1, self.work.stepper.dimension, len(self.active))
+        q, p, t = self.lanes("q").T, self.lanes("p").T, float(self.memory.t)
+        for lane in np.flatnonzero(self.active[: self.count] > 0.0):
+            try:
+                at_points[:, :, lane] = self.work.stepper.velocity(q[lane], p[lane], t, parameters[lane])
+            except StateError:
+                self.active[lane] = 0.0
+
+    def _advance(self, size: int, every: int) -> None:
         work, begin, self.step = self.work, self.step, self.step + size
         if len(self.left) < self.count:
-            row = begin // work.every + 1
+            row = work.row(begin)
             stride = work.count * work.stepper.dimension
             place = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
             self.binding.function("advance")(
                 self.memory,
                 self.count,
                 size,
-                work.every,
+                every,
                 self.binding.options(work.options),
                 self.binding.pointer(work.q) + place,
                 self.binding.pointer(work.p) + place,
@@ -259,9 +326,9 @@ class LaneBlock:
         running = self.active[: self.count] > 0.0
         work.done[self.first : self.first + self.count][running] = self.step
         for lane in np.flatnonzero(~running):
-            self._leave(int(lane), begin)
+            self._leave(int(lane), begin, every)
 
-    def _leave(self, lane: int, begin: int) -> None:
+    def _leave(self, lane: int, begin: int, every: int) -> None:
         """What a call that began after ``begin`` steps stored of a resting lane gives way to a run of its own."""
         work, j = self.work, self.first + lane
         if lane not in self.left:
@@ -269,9 +336,9 @@ class LaneBlock:
             q, p, *carries = (self.lanes(name)[:, lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
             self.left[lane] = _Alone(work, j, q, p, step, (carries[0], carries[1]))
             begin = step
-        rows = slice(begin // work.every + 1, self.step // work.every + 1)
+        rows = slice(work.row(begin), work.row(self.step))
         work.q[rows, j] = work.p[rows, j] = np.nan
-        self.left[lane].advance_to(self.step)
+        self.left[lane].advance_to(self.step, every)
 
 
 class _SingleBlock:
@@ -282,8 +349,11 @@ class _SingleBlock:
 
     def advance(self, size: int) -> None:
         """``size`` steps on."""
-        self.step += size
-        self.run.advance_to(self.step)
+        for portion in self.run.work.portions(self.step, size):
+            self.step += portion.steps
+            if portion.change is not None:
+                self.run.change(portion.change.h, portion.change.parameters(slice(self.run.j, self.run.j + 1))[0])
+            self.run.advance_to(self.step, portion.every)
 
 
 class _Alone:
@@ -295,26 +365,29 @@ class _Alone:
         self.work, self.j = work, j
         self.run: Memory | None = None
         work.done[j] = step
+        h, time, parameters = work.placed(step, j)
         try:
-            run = Memory.started(
-                work.stepper, q, p, h=work.h, t=work.t0, parameters=work.parameters[j], options=work.options
-            )
+            run = Memory.started(work.stepper, q, p, h=h, t=work.t0, parameters=parameters, options=work.options)
         except StateError:  # a sum of finite terms that overflowed
             work.status[j] = "not finite"
         else:
             if carries is not None:
-                high, low = times_after(work.t0, work.h, step)
-                run.resume_at(step, (float(high), float(low)), carries)
+                run.resume_at(step, time, carries)
             self.run = run
 
-    def advance_to(self, step: int) -> None:
+    def change(self, h: float, parameters: Array) -> None:
+        """Go on with others."""
+        if self.run is not None:
+            self.run.change(h=h, parameters=parameters)
+
+    def advance_to(self, step: int, every: int) -> None:
         """On to ``step``, unless it failed before."""
         work, j, run = self.work, self.j, self.run
         if run is None:
             return
-        row = run.steps // work.every + 1
+        row = work.row(run.steps)
         try:
-            trajectory = record_states(run, step - run.steps, every=work.every)
+            trajectory = record_states(run, step - run.steps, every=every)
         except StepFailedError as failure:
             work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
         work.done[j] = run.steps
@@ -322,76 +395,3 @@ class _Alone:
         work.q[rows, j], work.p[rows, j] = trajectory.q[1:], trajectory.p[1:]
         if work.times is not None:
             work.times[rows, j] = trajectory.t[1:]
-
-
-def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[Array, Array]:
-    """Initial positions and momenta, (k, m) each."""
-    positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
-    if positions.shape != momenta.shape:
-        raise StateError(f"q has shape {positions.shape}, p {momenta.shape}")
-    return positions, momenta
-
-
-def momenta_of_each(
-    stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
-    velocity: ArrayLike | None,
-    t: float,
-    parameters: EnsembleParameters,
-) -> ArrayLike:
-    """The momenta of states that are given by one of p and velocity, each with its parameters."""
-    name, given = stepper.momentum_or_velocity(p, velocity)
-    if name == "p":
-        return given
-    at, positions, velocities = checked_number(t, "the time t"), _states(stepper, q, "q"), _states(stepper, given, name)
-    if positions.shape != velocities.shape:
-        raise StateError(f"q has shape {positions.shape}, velocity {velocities.shape}")
-    values = parameters_of_each(stepper, parameters, len(positions))
-    states = zip(positions, velocities, values, strict=True)
-    return np.array([stepper.momentum(position, v, at, value) for position, v, value in states])
-
-
-def consistent_ensemble(
-    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
-) -> tuple[Array, Array]:
-    """Initial states put on the constraints, each with its parameters (:func:`consistent`)."""
-    at, (positions, momenta) = checked_number(t, "the time t"), checked_ensemble(stepper, q, p)
-    values = parameters_of_each(stepper, parameters, len(positions))
-    found = [consistent(stepper, q, p, at, own) for q, p, own in zip(positions, momenta, values, strict=True)]
-    q0, p0 = (np.array(part) for part in zip(*found, strict=True))
-    return q0, p0
-
-
-def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
-    """(k, m) finite numbers."""
-    array = real_array(value, name)
-    if array.ndim == 1:
-        array = array[np.newaxis]
-    if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
-        raise StateError(f"{name} must have shape (k, {stepper.dimension}), not {array.shape}")
-    if not np.isfinite(array).all():
-        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(array)))
-        raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}")
-    return array
-
-
-def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
-    """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
-    names = stepper.parameters
-    values = np.tile(stepper.defaults, (count, 1))
-    if isinstance(given, Mapping):
-        for name, value in given.items():
-            column = real_array(value, f"the parameter {name}")
-            if column.shape not in ((), (count,)):
-                raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
-            values[:, parameter_index(stepper.interface, name)] = column
-    elif given is not None:
-        array = real_array(given, "parameters")
-        if array.shape not in ((len(names),), (count, len(names))):
-            raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
-        values[:] = array
-    if not np.isfinite(values).all():
-        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
-        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}")
-    return values

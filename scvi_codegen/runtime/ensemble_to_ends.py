@@ -20,7 +20,8 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.ensemble import PROGRESS_SECONDS, EnsembleParameters, checked_ensemble, parameters_of_each
+from scvi_codegen.runtime.ensemble import PROGRESS_SECONDS
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
@@ -77,9 +78,8 @@ class EnsembleToEnds:
         if stepper.interface.energy_parameter:
             raise StateError("in transformed time steps of tau have one length: give h and steps")
         self.stepper, self.options = stepper.controlled(), checked_options(options)
-        self.q, self.p = checked_ensemble(stepper, q, p)
-        self.parameters = parameters_of_each(stepper, parameters, len(self.q))
         self.t0, self.every = checked_number(t, "the time t"), checked_count(every, "every", least=1)
+        self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.goals = self._goals(t_end, tolerance)
         self.t_eval = None
         if t_eval is not None:
@@ -102,6 +102,11 @@ class EnsembleToEnds:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def length(self) -> int:
+        """What ``progress`` counts up to: trajectories."""
+        return len(self)
 
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -42,6 +42,8 @@ class EnsembleTrajectory:
             ``"vanished"``, ``"interrupted"``).
         steps: (k,) steps completed.
         h: step size, 0 where steps choose their length.
+        spans: with inputs, rows of states and the parameters in them of a part of the trajectories; ``parameters`` has
+            zeros in place of inputs.
         goals: of each trajectory whose steps choose their length, else none.
         parameters: (k, number of parameters).
         stepper: the compiled integrator.
@@ -58,6 +60,7 @@ class EnsembleTrajectory:
     stepper: Integrator = field(repr=False)
     times: Array | None = None
     goals: tuple[Goal, ...] = ()
+    spans: tuple[tuple[slice, Callable[[slice], Array]], ...] = field(default=(), repr=False)
 
     def __len__(self) -> int:
         return len(self.status)
@@ -89,11 +92,10 @@ class EnsembleTrajectory:
     def energy(self) -> Array:
         """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
         energies = np.full(self.q.shape[:2], np.nan)
-        for j in range(len(self)):
-            good = self._reached(j)
+        for j, good, parameters in self._with_parameters():
             try:
                 energies[good, j] = self.stepper.energy(
-                    self.q[good, j], self.p[good, j], self._times()[good, j], self.parameters[j]
+                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
                 )
             except StateError:
                 continue
@@ -109,15 +111,23 @@ class EnsembleTrajectory:
 
     def _momentum_maps(self) -> tuple[Array, Array]:
         values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
-        for j in range(len(self)):
-            good = self._reached(j)
+        for j, good, parameters in self._with_parameters():
             try:
                 values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
-                    self.q[good, j], self.p[good, j], self._times()[good, j], self.parameters[j]
+                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
                 )
             except StateError:
                 continue
         return values, sizes
+
+    def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
+        """Trajectories, rows of states that there are, and the parameters in them."""
+        for rows, parameters in self.spans or ((slice(None), self.parameters.__getitem__),):
+            own = parameters(slice(None))
+            for j in range(len(self)):
+                good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
+                if good.size:
+                    yield j, good, own[j]
 
     @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
@@ -191,11 +201,13 @@ class EnsembleTrajectory:
 
     def _quantities(self) -> dict[str, Array]:
         times = np.nan_to_num(self._times())
-        found = [
-            quantities(self.stepper, self.parameters[j], times[:, j], self.q[:, j], self.p[:, j])
-            for j in range(len(self))
-        ]
-        return {name: np.stack([part[name] for part in found], axis=1) for name in found[0]}
+        found: dict[str, Array] = {}
+        for j, good, parameters in self._with_parameters():
+            part = quantities(self.stepper, parameters, times[good, j], self.q[good, j], self.p[good, j])
+            for name, values in part.items():
+                shape = (*self.q.shape[:2], *values.shape[1:])
+                found.setdefault(name, np.full(shape, np.nan))[good, j] = values
+        return found
 
     def _reached(self, j: int) -> NDArray[np.bool_]:
         """(n,) which states of a trajectory there are."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.arguments import checked_number, checked_step
 
 __all__ = ["Goal"]
 
@@ -33,3 +33,16 @@ class Goal:
         if not 0.0 < allowed < 1.0:
             raise StateError(f"the tolerance is a relative error between 0 and 1, not {allowed:g}")
         return cls(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
+
+    @classmethod
+    def monitored(cls, monitor: str, h: float | None, t_end: float | None, tolerance: float | None) -> Goal:
+        """Where a run leads whose steps a monitor chooses."""
+        if h is None or t_end is None or tolerance is not None:
+            raise StateError(
+                f"the monitor {monitor} chooses how long steps are: give their length h in the time that it transforms "
+                "to, and t_end, where they lead"
+            )
+        tau = checked_step(h)
+        if tau < 0.0:
+            raise StateError(f"steps of h = {h:g} in the time of a monitor are positive; t_end says where they lead")
+        return cls(t_end=checked_number(t_end, "t_end"), tau=tau)

@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import step_failure
-from scvi_codegen.runtime.exchanges import steps_between
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.linearised import Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.retaken import refuse_strays, steps_between
 
 __all__ = ["Gradient", "carried", "pulled_back", "sensitivity"]
 
@@ -28,8 +28,6 @@ MOST_STEPS = 1024
 """Of a piece, where all states are kept."""
 SAME_LENGTH = 1e-9
 """Of a step: by how much rounded times may seem to change it."""
-SAME_STATE = 1e-6
-"""Of the largest number of a state: roots lie further apart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,16 +125,8 @@ def _forward(states: KeptStates, changes: Array) -> Array:
 def _carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Along the steps of a piece, whose ends are held against the states it is made of."""
     ends = states.stepper.linearise(starts, vectors, states.parameters, states.options, back=back)
-    found, known = (np.concatenate(pair, axis=1) for pair in (ends, (starts.q[1:], starts.p[1:])))
-    sizes = np.maximum(np.abs(known).max(axis=1), np.abs(np.concatenate([starts.q, starts.p], axis=1)[:-1]).max(axis=1))
-    strays = np.flatnonzero(~(np.abs(found - known).max(axis=1) <= SAME_STATE * sizes))
-    if strays.size:
-        t, h = float(starts.t[strays[0]]), float(starts.h[strays[0]])
-        raise StateError(
-            f"the steps from t = {t:g}, taken again, do not lead to the state kept at t = {t + h:g}: their equations "
-            "have several solutions (take shorter steps), or the motion is too sensitive between the two (keep all "
-            "states, every=1)"
-        )
+    known = np.concatenate([starts.q, starts.p], axis=1)
+    refuse_strays(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
 
 
 def _pieces(states: KeptStates) -> Iterator[tuple[int, int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +13,18 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
 
-__all__ = ["Array", "Parameters", "checked_parameters", "checked_states", "checked_vector", "parameter_index"]
+__all__ = [
+    "Array",
+    "Parameters",
+    "check_inputs_given",
+    "checked_parameters",
+    "checked_states",
+    "checked_vector",
+    "columns_of_inputs",
+    "inputs_not_given",
+    "missing_input",
+    "parameter_index",
+]
 
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -69,6 +81,32 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}")
     return values
+
+
+def inputs_not_given(interface: Interface, parameters: Any) -> tuple[str, ...]:
+    """The inputs of which parameters say nothing; all in order say everything."""
+    if parameters is not None and not isinstance(parameters, Mapping):
+        return ()
+    return tuple(name for name in interface.inputs if f"{name}_0" not in (parameters or {}))
+
+
+def check_inputs_given(interface: Interface, parameters: Any) -> None:
+    """Raise :class:`StateError` where a step would take an input for 0 that nobody gave."""
+    if missing := inputs_not_given(interface, parameters):
+        raise missing_input(missing[0])
+
+
+def missing_input(name: str) -> StateError:
+    """How it is said."""
+    return StateError(
+        f"the input {name} is not given: stepper.drive(..., inputs={{'{name}': (t, values)}}) follows data, "
+        f"run.hold({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
+    )
+
+
+def columns_of_inputs(interface: Interface) -> list[int]:
+    """Places of the parameters that inputs are made of: coefficients by power, and the breakpoint they count from."""
+    return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
 
 
 def parameter_index(interface: Interface, name: str) -> int:

@@ -13,10 +13,12 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
+    check_inputs_given,
     checked_parameters,
     checked_states,
     checked_vector,
@@ -57,24 +59,35 @@ class Integrator(LinearisedMethod):
             StepFailedError: if the stage equations cannot be solved.
         """
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
-        values = self.parameters_at(q0, p0, parameters)
+        check_inputs_given(self.interface, parameters)
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
-        report = self.binding.new("report *")
-        status = self.binding.function("step")(
+        given = (q0, p0, self.parameters_at(q0, p0, parameters))
+        self._solve(self.binding, "step", t, h, given, options, (q1, p1))
+        return q1, p1
+
+    def _solve(
+        self,
+        binding: Binding,
+        name: str,
+        t: float,
+        h: float,
+        given: Sequence[Array],
+        options: SolverOptions | None,
+        found: Sequence[Array],
+    ) -> None:
+        """Have C solve the equations of a step and fill the arrays ``found``; StepFailedError if it does not."""
+        report = binding.new("report *")
+        status = binding.function(name)(
             checked_number(t, "the time t"),
             checked_step(h),
-            self.binding.pointer(q0),
-            self.binding.pointer(p0),
-            self.binding.pointer(values),
-            self.binding.options(options),
-            self.binding.pointer(q1),
-            self.binding.pointer(p1),
+            *map(binding.pointer, given),
+            binding.options(options),
+            *map(binding.pointer, found),
             report,
-            self.binding.workspace(),
+            binding.workspace(),
         )
         if status:
             raise step_failure(status, report, step=0, h=h)
-        return q1, p1
 
     def parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
         """(k,) values in order; in transformed time the energy is that of the state (q, p) unless it is given."""
@@ -256,25 +269,10 @@ class Integrator(LinearisedMethod):
                 f"{self.interface.method} keeps no account of forces on {self.interface.system}: SVI, SCVI and Gauss "
                 "methods do, and StoermerVerlet with the solver 'newton', where forces act"
             )
-        q0, p0 = self._vector(q, "q"), self._vector(p, "p")
-        q1, p1, given = np.empty_like(q0), np.empty_like(p0), np.empty(len(self.interface.exchange_names))
-        binding = self.binding.with_function("exchanges")
-        report = binding.new("report *")
-        status = binding.function("exchanges")(
-            checked_number(t, "the time t"),
-            checked_step(h),
-            binding.pointer(q0),
-            binding.pointer(p0),
-            binding.pointer(self._parameters(parameters)),
-            binding.options(options),
-            binding.pointer(q1),
-            binding.pointer(p1),
-            binding.pointer(given),
-            report,
-            binding.workspace(),
-        )
-        if status:
-            raise step_failure(status, report, step=0, h=h)
+        check_inputs_given(self.interface, parameters)
+        state = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
+        q1, p1, given = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
+        self._solve(self.binding.with_function("exchanges"), "exchanges", t, h, state, options, (q1, p1, given))
         return q1, p1, given
 
     def step_positions(
@@ -308,25 +306,11 @@ class Integrator(LinearisedMethod):
                 f"{self.interface.method} has no discrete Lagrangian for {self.interface.system}; "
                 "SVI, SCVI and Gauss methods have, where no forces act"
             )
-        start, end = self._vector(q0, "q0"), self._vector(q1, "q1")
-        p0, p1, action = np.empty_like(start), np.empty_like(start), np.empty(1)
+        check_inputs_given(self.interface, parameters)
+        ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
+        p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)
         binding = self.binding.with_function("discrete_legendre")
-        report = binding.new("report *")
-        status = binding.function("discrete_legendre")(
-            checked_number(t, "the time t"),
-            checked_step(h),
-            binding.pointer(start),
-            binding.pointer(end),
-            binding.pointer(self._parameters(parameters)),
-            binding.options(options),
-            binding.pointer(p0),
-            binding.pointer(p1),
-            binding.pointer(action),
-            report,
-            binding.workspace(),
-        )
-        if status:
-            raise step_failure(status, report, step=0, h=h)
+        self._solve(binding, "discrete_legendre", t, h, ends, options, (p0, p1, action))
         return p0, p1, float(action[0])
 
     def _transform(

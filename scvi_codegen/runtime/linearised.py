@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.compiled_method import CompiledMethod
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector
+from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_parameters, checked_vector
 
 __all__ = ["LinearisedMethod", "Sensitivity", "Starts"]
 
@@ -132,6 +132,7 @@ class LinearisedMethod(CompiledMethod):
         """(q1, p1) and (2m, count) derivatives by the first of what is given."""
         q0, p0 = checked_vector(self.interface, q, "q"), checked_vector(self.interface, p, "p")
         starts = Starts.chain(q0, p0, np.array([checked_number(t, "the time t")]), np.array([checked_step(h)]))
+        check_inputs_given(self.interface, parameters)
         values = checked_parameters(self.interface, parameters)
         vectors = np.zeros((2, count, self.given))
         vectors[0] = np.eye(count, self.given)

@@ -12,7 +12,15 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector, parameter_index
+from scvi_codegen.runtime.inputs import (
+    Array,
+    Parameters,
+    checked_parameters,
+    checked_vector,
+    inputs_not_given,
+    missing_input,
+    parameter_index,
+)
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["Memory"]
@@ -28,6 +36,8 @@ class Memory:
     Attributes:
         stepper: the compiled integrator.
         goal: where steps that choose their length lead, ``None`` for steps of h.
+
+    A step of a system with inputs waits until each of them was given (:meth:`hold`, or its parameters).
     """
 
     def __init__(
@@ -37,9 +47,10 @@ class Memory:
         parameters: Array,
         options: SolverOptions | None,
         goal: Goal | None = None,
+        awaited: tuple[str, ...] = (),
     ) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
-        self.goal = goal
+        self.goal, self._awaited = goal, awaited
 
     @classmethod
     def started(
@@ -65,7 +76,8 @@ class Memory:
             binding.pointer(p0),
         )
         goal = h if isinstance(h, Goal) else None
-        return cls(stepper, memory, stepper.parameters_at(q0, p0, parameters), checked_options(options), goal)
+        values, awaited = stepper.parameters_at(q0, p0, parameters), inputs_not_given(interface, parameters)
+        return cls(stepper, memory, values, checked_options(options), goal, awaited)
 
     @classmethod
     def restored(
@@ -94,7 +106,11 @@ class Memory:
             )
         if not stepper.has_energy(parameters):
             raise StateError("a saved run in transformed time goes on with its own energy: give its run.parameters")
-        return cls(stepper, memory, checked_parameters(stepper.interface, parameters), checked_options(options), goal)
+        values, awaited = (
+            checked_parameters(stepper.interface, parameters),
+            inputs_not_given(stepper.interface, parameters),
+        )
+        return cls(stepper, memory, values, checked_options(options), goal, awaited)
 
     @property
     def h(self) -> float:
@@ -123,6 +139,9 @@ class Memory:
             parameters: by name, others staying what they are; or all in order.
         """
         interface = self.stepper.interface
+        if parameters is not None:
+            missing = inputs_not_given(interface, parameters)
+            self._awaited = tuple(name for name in self._awaited if name in missing)
         if isinstance(parameters, Mapping):
             values = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
             parameters = {**values, **parameters}
@@ -144,6 +163,8 @@ class Memory:
                 raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
             first = parameter_index(self.stepper.interface, f"{name}_0")
             self._parameters[first : first + 5] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
+        if self._awaited:
+            self._awaited = tuple(name for name in self._awaited if name not in inputs)
 
     @property
     def steps(self) -> int:
@@ -208,6 +229,8 @@ class Memory:
         Returns:
             The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
         """
+        if self._awaited and steps:
+            raise missing_input(self._awaited[0])
         binding, goal = self.stepper.binding, self.goal
         report = binding.new("report *")
         status = binding.function("advance_to" if goal else "advance")(

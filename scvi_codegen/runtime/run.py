@@ -8,7 +8,7 @@ from typing import Any
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
@@ -22,7 +22,10 @@ class Run(Memory):
     """An integration under way: :class:`Memory`, and the recording of its states."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_restored, (self.stepper, self.save(), self._parameters, self._options, self.goal))
+        known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
+        for name in self._awaited:
+            del known[f"{name}_0"]
+        return (_restored, (self.stepper, self.save(), known, self._options, self.goal))
 
     def record(
         self, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
@@ -50,6 +53,6 @@ class Run(Memory):
 
 
 def _restored(
-    stepper: Integrator, saved: bytes, parameters: Array, options: SolverOptions | None, goal: Goal | None
+    stepper: Integrator, saved: bytes, parameters: Parameters, options: SolverOptions | None, goal: Goal | None
 ) -> Run:
     return Run.restored(stepper, saved, parameters=parameters, options=options, goal=goal)

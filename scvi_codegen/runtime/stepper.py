@@ -17,14 +17,17 @@ from numpy.typing import ArrayLike
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
-from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.driven import DrivenTrajectory, checked_inputs, drive, end_of, parameters_of
-from scvi_codegen.runtime.ensemble import consistent_ensemble, integrate_ensemble, momenta_of_each
+from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, parameters_of
+from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
+from scvi_codegen.runtime.ensemble import integrate_ensemble
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.events import Event, EventLike
@@ -135,7 +138,7 @@ class Stepper(Integrator):
         every: int = 1,
         t: float = 0.0,
         t_eval: ArrayLike | None = None,
-        parameters: Mapping[str, ArrayLike] | Sequence[Any] | Array | None = None,
+        parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
@@ -164,8 +167,6 @@ class Stepper(Integrator):
         if self.interface.monitor:
             raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
         p = momenta_of_each(self, q, p, velocity, t, parameters)
-        if self.interface.constraints:
-            q, p = consistent_ensemble(self, q, p, t, parameters)
         if h is None and steps is None and t_end is not None:
             work = EnsembleToEnds(
                 self,
@@ -217,7 +218,7 @@ class Stepper(Integrator):
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
         if self.interface.monitor:
-            goal = _monitored(self.interface.monitor, h, t_end, tolerance)
+            goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
             return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
         if h is None and self.interface.energy_parameter:
             raise StateError("in transformed time steps of tau have one length: give h")
@@ -282,6 +283,54 @@ class Stepper(Integrator):
         )
         return drive(run, data, end, every=checked_count(every, "every", least=1), values=values, progress=progress)
 
+    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
+    def drive_ensemble(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        inputs: Mapping[str, Any],
+        h: float,
+        velocity: ArrayLike | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+    ) -> EnsembleTrajectory:
+        """Run k trajectories with inputs, by common steps that end at all breakpoints.
+
+        Args:
+            inputs: as of :meth:`drive`, the same for all trajectories; with values of shape (k, n) each has its own.
+            h: of steps; one that ends at a breakpoint is shorter.
+            steps, t_end: one of both.
+            q, p, velocity, every, t, parameters, options, progress, threads: as of :meth:`integrate_ensemble`.
+
+        Returns:
+            An :class:`EnsembleTrajectory` with the states of :meth:`drive`, equal to round-off.
+
+        Raises:
+            StateError: as :meth:`drive`.
+        """
+        work = DrivenEnsemble.of(
+            self,
+            q,
+            p,
+            velocity=velocity,
+            inputs=inputs,
+            h=h,
+            t_end=end_of(t, h, steps, t_end),
+            every=every,
+            t=t,
+            parameters=parameters,
+            options=options,
+        )
+        work.run(progress=progress, threads=threads)
+        return work.result()
+
     def project(
         self,
         q: ArrayLike,
@@ -306,7 +355,8 @@ class Stepper(Integrator):
     def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """The lambda with which g_q^T lambda are the forces that keep a state on its constraints: (c,), or (n, c).
 
-        d/dt L_v = L_q + f + g_q^T lambda: of ``x**2 + y**2 = l**2`` the tension of the rod is -2 l lambda. It is what
+        d/dt L_v = L_q + f + G^T lambda, G = g_q, or g_v of a constraint of velocities: of ``x**2 + y**2 = l**2`` the
+        tension of the rod is -2 l lambda. It is what
         the state itself says, as exact as the state.
         """
         found = multipliers(self, q, p, t, parameters)
@@ -334,7 +384,7 @@ class Stepper(Integrator):
         With h only where a monitor chooses the steps.
         """
         if self.interface.monitor:
-            goal = _monitored(self.interface.monitor, h, t_end, tolerance)
+            goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
             return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
         if h is not None:
             raise StateError("the bytes of a run hold its h: leave it out")
@@ -342,19 +392,6 @@ class Stepper(Integrator):
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
         return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
-
-
-def _monitored(monitor: str, h: float | None, t_end: float | None, tolerance: float | None) -> Goal:
-    """Where a run leads whose steps a monitor chooses."""
-    if h is None or t_end is None or tolerance is not None:
-        raise StateError(
-            f"the monitor {monitor} chooses how long steps are: give their length h in the time that it transforms to, "
-            "and t_end, where they lead"
-        )
-    tau = checked_step(h)
-    if tau < 0.0:
-        raise StateError(f"steps of h = {h:g} in the time of a monitor are positive; t_end says where they lead")
-    return Goal(t_end=checked_number(t_end, "t_end"), tau=tau)
 
 
 def _said(trajectory: Trajectory) -> Trajectory:

@@ -1,10 +1,11 @@
-/* States on the constraints g(q, t) = 0, and the multipliers that keep them there. Before it: legendre.h, newton.h, the
- * kernels constraints and constrained_motion, and CONSTRAINT_ENTRY, the places of the slopes g_q. */
+/* States on the constraints g(q, t) = 0, or A v + b = 0 (their g is 0, that their rate), and the multipliers that keep
+ * them there. Before it: legendre.h, newton.h, the kernels constraints and constrained_motion, and CONSTRAINT_ENTRY,
+ * the places of the slopes G = g_q, or A. */
 
 #define MOST_PROJECTIONS 100
 #define SETTLED REAL(1e-6) /* of a state, what an update may still want that rounding does not let come nearer */
 
-/* Factors of the matrix [L_vv, g_q^T; g_q, 0] of a state, and room for a right-hand side. */
+/* Factors of the matrix [L_vv, G^T; G, 0] of a state, and room for a right-hand side. */
 typedef struct {
   real *matrix, *pivot, *x;
 } saddle;
@@ -39,7 +40,7 @@ static int factorise_saddle(real t, const real *u, const real *parameters, const
   return factorise(at->matrix, &shape, at->pivot) ? OK : SINGULAR;
 }
 
-/* x and y with L_vv x + g_q^T y = a (0 if NULL), g_q x = b. */
+/* x and y with L_vv x + G^T y = a (0 if NULL), G x = b. */
 static void solve_saddle(const saddle *at, const real *a, const real *b, real *x, real *y)
 {
   const band shape = band_of(SITES, 1);
@@ -62,7 +63,7 @@ static real largest_of(const real *x)
   return largest;
 }
 
-/* g and g_q v + g_t at a state, and the velocity. */
+/* g and the rates G v + .. at a state, and the velocity. */
 static int constrained(real t, const real *q, const real *p, const real *parameters, real *u, real *g, real *rate,
     real *workspace)
 {
@@ -173,7 +174,7 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
   return OK;
 }
 
-/* lambda of d/dt L_v = L_q + f + g_q^T lambda at states: L_vv a - g_q^T lambda = F, g_q a = - what rates grow by. */
+/* lambda of d/dt L_v = L_q + f + G^T lambda at states: L_vv a - G^T lambda = F, G a = - what rates grow by. */
 int NAME(multipliers)(long long count, const real *t, const real *q, const real *p, const real *parameters,
     real *multiplier, real *workspace)
 {

@@ -154,7 +154,7 @@ def test_a_catalogue_reference_may_be_changed():
     ("old", "new", "message"),
     [
         ("[run]", "[rum]", "unknown section 'rum' in the file; did you mean 'run'?"),
-        ("[method]", "[zzz]", "Known: system, forces, parameters, initial, method, run"),
+        ("[method]", "[zzz]", "Known: system, forces, inputs, parameters, initial, method, run"),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("every", "evry", "unknown key 'evry' in [run]; did you mean 'every'?"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sabotage import Case
-from samples import driven_duffing, linkage, pumped_cart_pole, turning_wire
+from samples import driven_duffing, linkage, pumped_cart_pole, sleigh, turning_wire
 
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
@@ -35,6 +35,7 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
     "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
     "linkage": (linkage(), (0.0, 1.0, 1.94, 1.5), (0.1, 0.2, 0.0, 0.3), 0.02),
+    "sleigh": (sleigh(), (0.3, -0.4, 0.5), (1.155222551473559, 0.8681156930772079, 0.56), 0.1),
     "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
 }
@@ -74,7 +75,8 @@ WHOLE = """
     pendulum/svi driven/svi kepler/svi-3 round/svi-8 double/svi double/lobatto-svi cart/svi pendulum/hermite
     pendulum/splines pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss
     kepler/printed double/printed double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss
-    linkage/lobatto-svi wire/lobatto-svi double/gauss-position kepler/radau-iia double/radau-ia kepler/lobatto
+    linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
+    double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
 """
 CASES = {name: case(name) for name in WHOLE.split()}

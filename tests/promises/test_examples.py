@@ -6,11 +6,14 @@ import os
 import re
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from scvi_codegen.cli import main
@@ -58,7 +61,7 @@ def output_of(name: str, tmp_path: Path) -> str:
 
 def test_every_example_is_tried_here():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
-    assert {path.stem for path in EXAMPLES.glob("*.toml")} == set(ENERGY_ERRORS)
+    assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower"}
 
 
 @pytest.mark.parametrize("name", ENERGY_ERRORS)
@@ -72,6 +75,24 @@ def test_model_files_run_and_keep_their_energy(name, tmp_path):
     model = load_model(EXAMPLES / f"{name}.toml")
     with np.load(output) as written:
         assert len(written["t"]) == model.step_count // model.every + 1
+
+
+def test_the_shaken_tower_moves_as_its_equations_say(tmp_path):
+    """By DOP853 from breakpoint to breakpoint of SciPy's spline through the same table."""
+    result = CliRunner().invoke(main, ["run", str(EXAMPLES / "shaken_tower.toml"), "-o", str(tmp_path / "run.csv")])
+    assert result.exit_code == 0, result.output
+    assert "too long" not in result.output
+    times, values = np.loadtxt(EXAMPLES / "ground_motion.csv", delimiter=",", skiprows=1).T
+    ground, state = CubicSpline(times, values), [0.02, 0.03, 0.0, 0.0]
+
+    def motion(t, y):
+        between = -60.0 * (y[1] - y[0]) - 0.5 * (y[3] - y[2])
+        return [y[2], y[3], -60.0 * (y[0] - ground(t)) - between, between]
+
+    for span in pairwise(times):
+        state = solve_ivp(motion, span, state, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    last = np.loadtxt(tmp_path / "run.csv", delimiter=",", skiprows=1)[-1]
+    assert last[:5] == pytest.approx([8.0, *state], abs=1e-8)
 
 
 def test_kepler_conservation_tells_the_methods_apart(tmp_path):

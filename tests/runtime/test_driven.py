@@ -1,5 +1,6 @@
 """Inputs given as data: exact where the motion is, in order between breakpoints, held by a sampled controller."""
 
+import pickle
 import time
 
 import numpy as np
@@ -16,7 +17,10 @@ from scvi_codegen import (
     StateError,
     StoermerVerlet,
     SystemDefinitionError,
+    change_coordinates,
     compile_stepper,
+    hamiltonian_of,
+    lagrangian_of,
 )
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
@@ -100,13 +104,13 @@ def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
     run = stepper.start([0.3], [0.0], h=0.01)
     states = []
     for _ in range(50):
-        run.hold(u=-2.0 * run.q[0] - 0.5 * run.p[0])
+        run.hold(u=-2.0 * run.q[0] - 0.5 * run.p[0], w=0.0)
         run.skip(4)
         states.append((run.q[0], run.p[0]))
     assert abs(run.q[0]) < 0.2
     again = stepper.start([0.3], [0.0], h=0.01)
     for k in range(50):
-        again.change(parameters={"u_0": -2.0 * again.q[0] - 0.5 * again.p[0]})
+        again.change(parameters={"u_0": -2.0 * again.q[0] - 0.5 * again.p[0], "w_0": 0.0})
         again = stepper.restore(again.save(), parameters=again.parameters)
         again.skip(4)
         assert (again.q[0], again.p[0]) == states[k]
@@ -127,6 +131,62 @@ def test_from_sympy_and_what_scipy_gives():
         assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), atol=1e-14)
 
 
+@pytest.mark.parametrize("t_end", [2.3, 2.05])
+def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
+    """Nothing but what is kept depends on it: states between, work and iterations are those of all states."""
+    stepper = compile_stepper(pendulum, SVI(3))
+    given = {"inputs": {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, "h": 0.1, "t_end": t_end}
+    told = []
+    full = stepper.drive([0.3], [0.1], **given, progress=told.append)
+    assert told[-1] == full.steps == sum(map(len, full.pieces)) - len(full.pieces)
+    assert told == sorted(told)
+    fewer = stepper.drive([0.3], [0.1], **given, every=3)
+    assert {0.0, *KNOTS[1:5][KNOTS[1:5] <= t_end].tolist(), t_end} <= set(np.round(fewer.t, 14))
+    assert len(fewer) < len(full) / 1.5
+    kept = np.isin(full.t, fewer.t)
+    assert kept.sum() == len(fewer)
+    assert (fewer.q == full.q[kept]).all()
+    assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
+    assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
+    assert len(stepper.drive([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
+
+
+def test_files_hold_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
+    stepper = compile_stepper(pendulum, SVI(4))
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0])}
+    run = stepper.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3, parameters={"c": 0.3}, events="q_dot")
+    run.save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        assert (file["q"] == run.q).all()
+        assert dict(zip(file["parameter_names"].tolist(), file["parameters"].tolist(), strict=True)) == {"c": 0.3}
+    table = run.to_xarray()
+    w = np.interp(run.t, [0.0, 1.0, 3.0], [0.0, 0.5, 0.0])
+    assert_allclose(table["energy"], run.p[:, 0] ** 2 / 2 - (1 + w) * np.cos(run.q[:, 0]), rtol=1e-14)
+    assert len(run.to_dataframe()) == len(run)
+    (turns,) = run.events
+    assert_allclose(run.at(turns.t)[1], 0.0, atol=1e-9)
+    assert len(turns) == np.count_nonzero(np.diff(np.sign(run.p[:, 0])))
+    run.plot(tmp_path / "run.png")
+    assert 0.0 < run.step_error < 1e-4
+    assert run.step_error_t in run.t
+
+
+def test_momentum_maps_with_inputs():
+    """A push inside of a pair leaves its momentum alone."""
+    pair = LagrangianSystem.from_text(
+        name="pair",
+        coordinates=["x", "y"],
+        lagrangian="x_dot**2/2 + y_dot**2 - (x - y - u)**2/2",
+        inputs=["u"],
+    )
+    run = compile_stepper(pair, SVI(3)).drive(
+        [0.0, 1.0], velocity=[0.5, 0.1], inputs={"u": (KNOTS, VALUES)}, h=0.1, t_end=2.3
+    )
+    assert np.ptp(run.energy()) > 0.1
+    assert [name.split()[0] for name in run.stepper.momentum_map_names] == ["momentum", "boost"]
+    assert np.abs(run.momentum_errors()).max(axis=0) == pytest.approx([0.0, 0.0], abs=4e-15)
+
+
 @pytest.mark.parametrize(
     ("inputs", "said"),
     [
@@ -135,6 +195,7 @@ def test_from_sympy_and_what_scipy_gives():
         ({"u": np.sin, "w": (KNOTS, VALUES)}, "C cannot call"),
         ({"u": (KNOTS[::-1], VALUES), "w": (KNOTS, VALUES)}, "do not ascend"),
         ({"u": (KNOTS, VALUES[:3]), "w": (KNOTS, VALUES)}, "shape"),
+        ({"u": (KNOTS, np.tile(VALUES, (3, 1))), "w": (KNOTS, VALUES)}, "shape"),
         ({"u": (KNOTS, VALUES, "quintic"), "w": (KNOTS, VALUES)}, "constant or linear or cubic"),
         ({"u": (KNOTS, [np.nan] * 6), "w": (KNOTS, VALUES)}, "nan"),
         ({"u": (KNOTS[:3], VALUES[:3]), "w": (KNOTS, VALUES)}, "is given from t = 0 to 0.9"),
@@ -154,3 +215,51 @@ def test_names_and_runs_without_an_end(pendulum):
         stepper.start([0.3], [0.0], h=0.1).hold(v=1.0)
     with pytest.raises(SystemDefinitionError, match="q"):
         LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + q", inputs=["q"])
+
+
+def test_ways_that_lead_nowhere_and_a_run_of_no_time(pendulum):
+    stepper, inputs = compile_stepper(pendulum, SVI(2)), {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}
+    with pytest.raises(StateError, match="one of t_end and steps"):
+        stepper.drive([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
+    with pytest.raises(StateError, match=r"steps of h = -0.1 do not lead from t = 0 to t_end = 2"):
+        stepper.drive([0.3], [0.0], inputs=inputs, h=-0.1, t_end=2.0)
+    for h in (0.1, None):
+        still = stepper.drive([0.3], [0.2], inputs=inputs, h=h, t=1.0, t_end=1.0)
+        assert (still.t.tolist(), still.q.tolist(), still.p.tolist()) == ([1.0], [[0.3]], [[0.2]])
+
+
+def test_an_input_that_nobody_gave_is_not_zero(pendulum):
+    """Wherever a step would be taken; what is given by a name, in order, or held, is taken."""
+    stepper, state = compile_stepper(pendulum, SVI(2)), ([0.3], [0.0])
+    for step in (
+        lambda: stepper.step(*state, 0.1),
+        lambda: stepper.jacobian(*state, 0.1),
+        lambda: stepper.exchanged(*state, 0.1),
+        lambda: stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 1.0}),
+        lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
+        lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
+        lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], t_end=1.0),
+    ):
+        with pytest.raises(StateError, match=r"the input [uw] is not given"):
+            step()
+    given = stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 0.7, "w_0": 0.0})
+    run = stepper.start(*state, h=0.1)
+    run.hold(w=0.0)
+    run = pickle.loads(pickle.dumps(run))
+    with pytest.raises(StateError, match="the input u"):
+        run.skip(1)
+    run.hold(u=0.7)
+    assert np.array_equal(run.record(2).q, given.q)
+    lanes = stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2, parameters=given.parameters)
+    assert_allclose(lanes.q[:, 0], given.q, rtol=1e-15)
+
+
+def test_inputs_stay_in_other_coordinates_and_other_forms(pendulum):
+    inputs, data = ("u", "w"), {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
+    expected = compile_stepper(pendulum, SVI(4)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    dual, half = hamiltonian_of(pendulum), change_coordinates(pendulum, {"q": "2*z"}, coordinates=["z"])
+    assert dual.inputs == lagrangian_of(dual).inputs == half.inputs == inputs
+    found = compile_stepper(dual, SVI(4)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    assert_allclose(found.q, expected.q, atol=1e-8)
+    found = compile_stepper(half, SVI(4)).drive([0.15], [0.2], inputs=data, h=0.05, t_end=2.3)
+    assert_allclose(2.0 * found.q, expected.q, atol=1e-13)

@@ -1,5 +1,7 @@
 """Tangent maps of runs, and what they say of motions; those of steps are in test_sensitivity."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -57,6 +59,12 @@ def test_what_has_no_derivative():
         run.tangent([1.0, 2.0])
     with pytest.raises(StateError, match="whole steps"):
         stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=4, t_eval=[0.03, 0.1]).tangent()
+    with pytest.raises(StateError, match="no steps"):
+        stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=0).lyapunov_exponents()
+    elsewhere = run.q.copy()
+    elsewhere[2] += 0.01
+    with pytest.raises(StateError, match=r"t = 0\.05, taken again, does not lead where it led"):
+        replace(run, q=elsewhere).tangent()
     clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4))
     with pytest.raises(MethodError, match="no derivatives"):
         clocked.jacobian(kepler.q, [0.0, 1.0], 0.1)

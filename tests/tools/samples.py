@@ -63,6 +63,18 @@ def linkage() -> LagrangianSystem:
     )
 
 
+def sleigh() -> LagrangianSystem:
+    """Chaplygin's, between springs: its blade at (x, y) goes where it points, its mass is d ahead of it."""
+    return LagrangianSystem.from_text(
+        name="sleigh",
+        coordinates=["x", "y", "a"],
+        lagrangian="""m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 + m*d*a_dot*(y_dot*cos(a) - x_dot*sin(a))
+            - k*(x**2 + 2*y**2)/2""",
+        parameters={"m": 1.3, "J": 0.7, "d": 0.2, "k": 0.5},
+        constraints=["x_dot*sin(a) - y_dot*cos(a)"],
+    )
+
+
 def turning_wire() -> LagrangianSystem:
     """A bead on a straight wire that turns: one constraint, with time, on coordinates that the masses couple."""
     return LagrangianSystem.from_text(

@@ -67,7 +67,7 @@ def test_what_is_sabotaged_passes_whole(name: str) -> None:
     assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.KEPT}
 
 
-@pytest.mark.parametrize("name", ["linkage/lobatto-svi", "wire/lobatto-svi"])
+@pytest.mark.parametrize("name", ["linkage/lobatto-svi", "wire/lobatto-svi", "sleigh/lobatto-svi"])
 def test_constrained_motions_are_certified(name: str) -> None:
     """Against the motion that index reduction gives in 60 digits, along the constrained phase space."""
     certificate = certified(CASES[name])

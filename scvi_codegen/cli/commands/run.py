@@ -93,6 +93,9 @@ def run(
     symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
     and all times are of t.
 
+    A system with inputs, functions of time that are data, takes their values from the section [inputs] of its file or
+    from --input: a table with columns t and value. Steps end where a piece of an input does.
+
     With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
 
     \b
@@ -130,6 +133,8 @@ def run(
     wanted = {"tolerance": tolerance, "advise": advise}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
+    if model.system.inputs:
+        _check_driven(advise, recorded=recorded)
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
@@ -176,6 +181,13 @@ def _check_combination(
     for name, value in (("plot", plot), *wanted.items()):
         if ensemble is not None and value is not None:
             raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
+
+
+def _check_driven(advise: float | None, *, recorded: bool) -> None:
+    if advise is not None:
+        raise click.UsageError("--advise finds steps for motions without inputs: give --tolerance in its place")
+    if recorded:
+        raise click.UsageError("a run with inputs is kept in memory and written to a file (-o NAME.npz), no folder")
 
 
 def _run_one(

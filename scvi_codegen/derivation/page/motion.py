@@ -35,7 +35,10 @@ def system_section(system: MechanicalSystem) -> Section:
         ]
     if system.constraints:
         contents += [
-            Paragraph("Constraints hold; their multipliers lambda act beside L_q as the forces g_q^T lambda:"),
+            Paragraph(
+                "Constraints hold, g = 0; their multipliers lambda act beside L_q as the forces G^T lambda, where G is "
+                "g_q, or g_v where velocities are held:"
+            ),
             *formulas([Formula(g, Symbol(f"g_{k}")) for k, g in enumerate(system.constraints, 1)], "constraint"),
         ]
     if system.parameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sympy import Symbol
 
 from scvi_codegen.lowering.families import argument_name
-from scvi_codegen.mechanics.constraints import constraint_rates
+from scvi_codegen.mechanics.constraints import constraint_rates, positions_held, velocities_held
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter
@@ -37,8 +37,10 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Sym
 
 def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
     """What a scatter takes from the kernel at a point; of a scalar's gradient, scatters are parallel to gathers."""
-    if system.constraints and scatter.results in (system.constraints, constraint_rates(system)):
-        return Symbol(f"{'g' if scatter.results == system.constraints else 'g_dot'}_{place}")
+    if system.constraints and scatter.results == positions_held(system):
+        return Symbol(f"g_{place}")
+    if system.constraints and scatter.results in (velocities_held(system), constraint_rates(system)):
+        return Symbol(f"g_dot_{place}")
     if family.scalar is None:
         forms = forms_of(system)
         known = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}

@@ -1,0 +1,68 @@
+"""Tables in CSV: a header of names, then a line of numbers each; blank lines count for nothing."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import ModelFileError
+
+__all__ = ["CsvTable", "parse_table"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CsvTable:
+    """Numbers in columns.
+
+    Attributes:
+        columns: (n,) values by name, in the order of the file.
+        lines: (n,) the line of the file, from 1, that each stands in; none for a file without lines.
+    """
+
+    columns: dict[str, NDArray[np.float64]]
+    lines: tuple[int, ...]
+
+    def place(self, k: int) -> str:
+        """Where row k stands."""
+        return f"line {self.lines[k]}" if self.lines else f"row {k}"
+
+
+def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> CsvTable:
+    """The table in a text, with a look at its names before its numbers.
+
+    Raises:
+        ModelFileError: naming the column or line at fault.
+    """
+    reader = csv.reader(text.splitlines(), skipinitialspace=True)
+    lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
+    if len(lines) < 2:
+        raise ModelFileError("a table has a header of names and at least one line of numbers")
+    names = lines[0][1]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ModelFileError(f"the column '{repeated[0]}' is there twice")
+    if "" in names:
+        raise ModelFileError(f"column {names.index('') + 1} has no name in the first line")
+    if check is not None:
+        check(names)
+    rows = [_row(cells, names, number) for number, cells in lines[1:]]
+    return CsvTable(dict(zip(names, np.array(rows).T, strict=True)), tuple(number for number, _ in lines[1:]))
+
+
+def _row(cells: list[str], names: list[str], number: int) -> list[float]:
+    if len(cells) != len(names):
+        raise ModelFileError(f"line {number} must have a number for each of {len(names)} names, and has {len(cells)}")
+    values = []
+    for name, cell in zip(names, cells, strict=True):
+        try:
+            values.append(float(cell))
+        except ValueError as error:
+            raise ModelFileError(f"line {number}, {name}: '{cell}' is not a number") from error
+        if not math.isfinite(values[-1]):
+            raise ModelFileError(f"line {number}, {name}: {cell} is not a finite number")
+    return values

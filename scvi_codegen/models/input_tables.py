@@ -1,0 +1,59 @@
+"""Inputs of a model: functions of time as tables of plain numbers, which compare and are written as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scvi_codegen.errors import ModelFileError, StateError
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.rendering.text import ExampleInput
+from scvi_codegen.runtime.driven import POWERS, input_of, parameters_at
+
+__all__ = ["InputTable", "checked_tables", "tables_of_example"]
+
+
+class InputTable(NamedTuple):
+    """A function of time, as :meth:`Stepper.drive` takes it: n ascending times, n values, and what is between them."""
+
+    t: tuple[float, ...]
+    values: tuple[float, ...]
+    kind: str = "linear"
+
+
+def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[str, InputTable]:
+    """Tables by name, plain and known to be functions of time; some may be missing.
+
+    Raises:
+        ModelFileError: for a name that is no input of the system, and what is no table.
+    """
+    found = {}
+    for name, table in given.items():
+        if name not in system.inputs:
+            raise ModelFileError(
+                f"'{name}' is no input of '{system.name}', which has {', '.join(system.inputs) or 'none'}"
+            )
+        if not isinstance(table, tuple):
+            raise ModelFileError(f"the input {name} of a model is a table, (t, values) or (t, values, kind)")
+        try:
+            input_of(name, tuple(table))
+        except StateError as error:
+            raise ModelFileError(str(error)) from error
+        t, values = (tuple(np.asarray(part, dtype=float).tolist()) for part in table[:2])
+        found[name] = InputTable(t, values, *table[2:])
+    return found
+
+
+def tables_of_example(
+    system: MechanicalSystem, inputs: Mapping[str, InputTable], t: float
+) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
+    """Inputs as C takes them, all or none, and all parameters at t."""
+    data = {name: input_of(name, tuple(inputs[name])) for name in system.inputs if inputs}
+    tables = tuple(
+        ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))
+        for name, each in data.items()
+    )
+    names = [parameter.name for parameter in system.parameters]
+    return tables, tuple(parameters_at(names, np.array(system.defaults), data, t).tolist())

@@ -1,0 +1,70 @@
+"""A model as the sections of a model file."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from scvi_codegen.models.model import Model
+
+if TYPE_CHECKING:
+    from scvi_codegen.models.input_tables import InputTable
+
+__all__ = ["document_of", "motion_of"]
+
+SHORT_VECTOR = 4
+TEXT_WIDTH = 100
+
+
+def document_of(model: Model) -> dict[str, Any]:
+    """All sections, in the order of a file."""
+    clock = model.system.clock
+    system = clock.plain if clock and clock.plain else model.system
+    names = [coordinate.name for coordinate in system.coordinates]
+    kind = "hamiltonian" if system.auxiliaries else "lagrangian"
+    momenta = {"momenta": [p.name for p in system.auxiliaries]} if system.auxiliaries else {}
+    document: dict[str, Any] = {
+        "system": {"name": system.name, "coordinates": names, **momenta, kind: _wrapped(system.to_text())}
+    }
+    forces = zip(names, system.forces, strict=False)
+    if acting := {name: _wrapped(system.text_of(force)) for name, force in forces if force != 0}:
+        document["forces"] = acting
+    if system.constraints:
+        document["system"]["constraints"] = [system.text_of(g) for g in system.constraints]
+    if clock:
+        document["system"]["monitor"] = clock.monitor
+    if system.inputs:
+        document["system"]["inputs"] = list(system.inputs)
+    if model.inputs:
+        document["inputs"] = {name: _written_out(table) for name, table in model.inputs.items()}
+    if model.parameters:
+        document["parameters"] = model.parameters
+    return {**document, **motion_of(model, names)}
+
+
+def _written_out(table: InputTable) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in table._asdict().items()}
+
+
+def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
+    """The sections beside the system."""
+    vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
+    initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
+    specification = model.method.specification()
+    method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification.items()}
+    length = {"steps": model.steps} if model.span is None else {"span": model.span}
+    step = {"tolerance": model.tolerance} if model.h is None else {"step": model.h}
+    run = {**step, **length, "every": model.every}
+    return {"initial": {"t": model.t, **initial}, "method": method, "run": run}
+
+
+def _wrapped(formula: str) -> str:
+    """A formula, on several lines if it is long."""
+    lines = textwrap.wrap(formula, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return lines[0] if len(lines) == 1 else "\n".join(["", *lines, ""])
+
+
+def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[str, float]:
+    """A short vector as a list, a long one by name."""
+    return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))

@@ -1,0 +1,140 @@
+"""Ensembles whose inputs are data: common steps and breakpoints, one input for all trajectories or one for each.
+
+Lanes go on across breakpoints, with the parameters of the next pieces; sums stay compensated.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.driven import Input, Stretch, checked_inputs, later, parameters_at, planned
+from scvi_codegen.runtime.ensemble import Change, Ensemble, Portion
+from scvi_codegen.runtime.ensemble_states import (
+    EnsembleParameters,
+    checked_ensemble,
+    momenta_of_each,
+    parameters_of_each,
+)
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["DrivenEnsemble"]
+
+
+class DrivenEnsemble(Ensemble):
+    """An ensemble with inputs, to be integrated from t to t_end; arguments as of :class:`Ensemble`.
+
+    Attributes:
+        stretches: that lead to t_end.
+        ends: of each, the number of steps up to there.
+        numbers: of the steps after which states are kept.
+    """
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        q: ArrayLike,
+        p: ArrayLike,
+        data: Mapping[str, Input],
+        *,
+        h: float,
+        t_end: float,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+    ) -> None:
+        self.data = data
+        self.stretches = planned(checked_number(t, "the time t"), checked_number(t_end, "t_end"), checked_step(h), data)
+        self.ends = list(accumulate(stretch.steps for stretch in self.stretches))
+        steps, every = sum(stretch.steps for stretch in self.stretches), checked_count(every, "every", least=1)
+        self.numbers = sorted({*range(0, steps + 1, every), *self.ends})
+        super().__init__(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
+        self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        stepper: Integrator,
+        q: ArrayLike,
+        p: ArrayLike | None,
+        *,
+        inputs: Mapping[str, Any],
+        velocity: ArrayLike | None = None,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        **others: Any,
+    ) -> DrivenEnsemble:
+        """From inputs and initial states as users give them."""
+        if stepper.interface.monitor:
+            raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
+        count = len(checked_ensemble(stepper, q, q)[0])
+        data = checked_inputs(stepper, inputs, count)
+        start = parameters_at(stepper.parameters, parameters_of_each(stepper, parameters, count), data, t)
+        p = momenta_of_each(stepper, q, p, velocity, t, start)
+        return cls(stepper, q, p, data, t=t, parameters=start, **others)
+
+    def row(self, step: int) -> int:
+        """Of the first state kept that comes after ``step``."""
+        return bisect_right(self.numbers, step)
+
+    def portions(self, begin: int, size: int) -> Iterator[Portion]:
+        """From breakpoint to breakpoint; the last step of a stretch alone, where its state is kept out of turn."""
+        end, step = begin + size, begin
+        while step < end:
+            k = bisect_right(self.ends, step)
+            last, entering = self.ends[k], step == self._first(k)
+            odd = last % self.every != 0
+            until = min(end, last - 1 if odd and step < last - 1 else last)
+            every = last if odd and until == last else self.every
+            yield Portion(until - step, every, self._change(self.stretches[k]) if entering else None)
+            step = until
+
+    def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
+        """H, time and parameters of trajectory j after ``step`` steps."""
+        if not self.stretches:
+            return super().placed(step, j)
+        k = min(bisect_right(self.ends, step), len(self.ends) - 1)
+        stretch = self.stretches[k]
+        now = later(stretch.start, stretch.h, step - self._first(k))
+        return stretch.h, now, self._change(stretch).parameters(slice(j, j + 1))[0]
+
+    def _first(self, k: int) -> int:
+        """Steps before a stretch."""
+        return self.ends[k] - self.stretches[k].steps
+
+    def _change(self, stretch: Stretch) -> Change:
+        return Change(
+            stretch.h, partial(parameters_at, self.stepper.parameters, self.parameters, self.data, stretch.middle)
+        )
+
+    def kept_times(self) -> Array:
+        """(n,) of the states."""
+        after = [bisect_left(self.ends, step) for step in self.numbers[1:]]
+        times = [
+            later(self.stretches[k].start, self.stretches[k].h, step - self._first(k))[0]
+            for step, k in zip(self.numbers[1:], after, strict=True)
+        ]
+        return np.array([self.t0, *times])
+
+    def result(self) -> EnsembleTrajectory:
+        """With the parameters of each piece for the states in it; one at a breakpoint belongs to the piece before."""
+        last = [bisect_right(self.numbers, end) for end in self.ends]
+        spans = [
+            (slice(first, end), self._change(stretch).parameters)
+            for first, end, stretch in zip([0, *last], last, self.stretches, strict=False)
+        ]
+        return replace(super().result(), spans=tuple(spans))

@@ -1,0 +1,207 @@
+"""The result of a run whose inputs are data: trajectories from breakpoint to breakpoint, as one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.files.export import States, to_dataframe, write_states
+from scvi_codegen.files.labelled import to_dataset
+from scvi_codegen.kinds import MAPPING, PATH, takes
+from scvi_codegen.runtime.dense_output import checked_times
+from scvi_codegen.runtime.events import Crossings
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs
+from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.trajectory import Trajectory, relative_changes
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from scvi_codegen.pictures.plots import Plots
+    from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["DrivenTrajectory"]
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenTrajectory:
+    """States along a run with inputs, and what follows from them, each with the parameters of its piece.
+
+    Attributes:
+        pieces: trajectories from breakpoint to breakpoint, the first state of each the last of the one before.
+    """
+
+    pieces: tuple[Trajectory, ...]
+
+    @property
+    def t(self) -> Array:
+        """(n,) times."""
+        return self._joined(lambda piece: piece.t)
+
+    @property
+    def q(self) -> Array:
+        """(n, m) positions."""
+        return self._joined(lambda piece: piece.q)
+
+    @property
+    def p(self) -> Array:
+        """(n, m) momenta."""
+        return self._joined(lambda piece: piece.p)
+
+    @property
+    def velocity(self) -> Array:
+        """(n, m) velocities."""
+        return self._joined(lambda piece: piece.velocity)
+
+    @property
+    def iterations(self) -> NDArray[np.int32]:
+        """(n,) iterations since the state before."""
+        return self._joined(lambda piece: piece.iterations)
+
+    @property
+    def steps(self) -> int:
+        """Taken since the start."""
+        return self.pieces[-1].steps
+
+    @property
+    def stepper(self) -> Integrator:
+        """The compiled integrator."""
+        return self.pieces[0].stepper
+
+    @property
+    def h(self) -> float:
+        """Of the first step."""
+        return self.pieces[0].h
+
+    @property
+    def parameters(self) -> Array:
+        """(k,) values of the first piece; those of inputs are others in each."""
+        return self.pieces[0].parameters
+
+    @property
+    def events(self) -> tuple[Crossings, ...]:
+        """The zero crossings found, parallel to ``stepper.events``."""
+        return tuple(map(_in_a_row, zip(*(piece.events for piece in self.pieces), strict=True)))
+
+    @property
+    def step_error(self) -> float:
+        """As of :class:`Trajectory`: the run knows its worst step."""
+        return self.pieces[-1].step_error
+
+    @property
+    def step_error_t(self) -> float:
+        """When that began."""
+        return self.pieces[-1].step_error_t
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def energy(self) -> Array:
+        """(n,) energies p.v - L."""
+        return self._joined(lambda piece: piece.energy())
+
+    def momentum_maps(self) -> Array:
+        """(n, k) values of what symmetries conserve."""
+        return self._joined(lambda piece: piece.momentum_maps())
+
+    def momentum_errors(self) -> Array:
+        """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        found = [
+            self.stepper.momentum_maps_and_sizes(piece.q, piece.p, piece.t, piece.parameters) for piece in self.pieces
+        ]
+        values, sizes = (_after_another(part) for part in zip(*found, strict=True))
+        return relative_changes(values, sizes)
+
+    def constraint_values(self) -> tuple[Array, Array]:
+        """(n, c) values of the constraints, and of their rates, at the states."""
+        found = zip(*(piece.constraint_values() for piece in self.pieces), strict=True)
+        g, rate = (_after_another(part) for part in found)
+        return g, rate
+
+    def multipliers(self) -> Array:
+        """(n, c) multipliers of the constraints."""
+        return self._joined(lambda piece: piece.multipliers())
+
+    def work(self) -> Array:
+        """(n,) work of the forces since the first state."""
+        return self._summed(lambda piece: piece.work())
+
+    def impulses(self) -> Array:
+        """(n, k) what forces gave to momentum maps since the first state."""
+        return self._summed(lambda piece: piece.impulses())
+
+    def at(self, t: ArrayLike) -> tuple[Array, Array]:
+        """States between those kept, as of :meth:`Trajectory.at`."""
+        times = checked_times(t, "t")
+        flat, m = times.ravel(), self.stepper.dimension
+        q, p = np.empty((2, len(flat), m))
+        forward = self.pieces[0].forward
+        ends = forward * np.array([piece.t[-1] for piece in self.pieces])
+        number = np.minimum(np.searchsorted(ends, forward * flat), len(ends) - 1)
+        for k in np.unique(number):
+            q[number == k], p[number == k] = self.pieces[k].at(flat[number == k])
+        return q.reshape(*times.shape, m), p.reshape(*times.shape, m)
+
+    @property
+    def plot(self) -> Plots:
+        """Pictures, as of :attr:`Trajectory.plot`."""
+        from scvi_codegen.pictures.plots import Plots
+
+        return Plots(self)
+
+    def states(self, units: Mapping[str, str] | None = None) -> States:
+        """The states as :mod:`scvi_codegen.files.export` writes them; parameters are those that are no inputs'."""
+        own = {self.stepper.parameters[k] for k in columns_of_inputs(self.stepper.interface)}
+        found = [quantities(self.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
+        told = {name: _after_another([each[name] for each in found]) for name in found[0]}
+        common, piece = self.pieces[0].states(units), (self.t, self.q, self.p, self.iterations)
+        return replace(
+            common,
+            count=len(self),
+            pieces=lambda: iter([piece]),
+            parameters={name: value for name, value in common.parameters.items() if name not in own},
+            quantities=lambda *_: told,
+        )
+
+    @takes(path=PATH, units=MAPPING)
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+        """Write a file as :meth:`Trajectory.save` does."""
+        write_states(self.states(units), path)
+
+    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """As of :meth:`Trajectory.to_xarray`."""
+        return to_dataset(self.states(units).labelled())
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """As of :meth:`Trajectory.to_dataframe`."""
+        return to_dataframe(self.states())
+
+    def _joined(self, part: Callable[[Trajectory], NDArray[Number]]) -> NDArray[Number]:
+        return _after_another([part(piece) for piece in self.pieces])
+
+    def _summed(self, part: Callable[[Trajectory], Array]) -> Array:
+        found = [part(piece) for piece in self.pieces]
+        for before, after in pairwise(found):
+            after += before[-1]
+        return _after_another(found)
+
+
+def _after_another(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Arrays along states of pieces, the first of each being the last of the one before."""
+    first, *others = parts
+    return np.concatenate([first, *(other[1:] for other in others)])
+
+
+def _in_a_row(found: Sequence[Crossings]) -> Crossings:
+    """Crossings of one event in all pieces."""
+    t, q, p = (np.concatenate([getattr(each, name) for each in found]) for name in ("t", "q", "p"))
+    return Crossings(event=found[0].event, t=t, q=q, p=p)

@@ -1,0 +1,94 @@
+"""Initial states and parameters of ensembles as users give them, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.constraints import consistent
+from scvi_codegen.runtime.inputs import Array, check_inputs_given, parameter_index
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["EnsembleParameters", "checked_ensemble", "momenta_of_each", "parameters_of_each", "start_of_ensemble"]
+
+EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
+
+
+def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[Array, Array]:
+    """Initial positions and momenta, (k, m) each."""
+    positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
+    if positions.shape != momenta.shape:
+        raise StateError(f"q has shape {positions.shape}, p {momenta.shape}")
+    return positions, momenta
+
+
+def momenta_of_each(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    velocity: ArrayLike | None,
+    t: float,
+    parameters: EnsembleParameters,
+) -> ArrayLike:
+    """The momenta of states that are given by one of p and velocity, each with its parameters."""
+    name, given = stepper.momentum_or_velocity(p, velocity)
+    if name == "p":
+        return given
+    at, positions, velocities = checked_number(t, "the time t"), _states(stepper, q, "q"), _states(stepper, given, name)
+    if positions.shape != velocities.shape:
+        raise StateError(f"q has shape {positions.shape}, velocity {velocities.shape}")
+    values = parameters_of_each(stepper, parameters, len(positions))
+    states = zip(positions, velocities, values, strict=True)
+    return np.array([stepper.momentum(position, v, at, value) for position, v, value in states])
+
+
+def start_of_ensemble(
+    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
+) -> tuple[Array, Array, Array]:
+    """(k, m) positions and momenta, put on the constraints where there are any, and (k, number of parameters)."""
+    check_inputs_given(stepper.interface, parameters)
+    positions, momenta = checked_ensemble(stepper, q, p)
+    values = parameters_of_each(stepper, parameters, len(positions))
+    if stepper.interface.constraints:
+        for k, own in enumerate(values):
+            positions[k], momenta[k] = consistent(stepper, positions[k], momenta[k], t, own)
+    return positions, momenta, values
+
+
+def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
+    """(k, m) finite numbers."""
+    array = real_array(value, name)
+    if array.ndim == 1:
+        array = array[np.newaxis]
+    if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
+        raise StateError(f"{name} must have shape (k, {stepper.dimension}), not {array.shape}")
+    if not np.isfinite(array).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(array)))
+        raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}")
+    return array
+
+
+def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
+    """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
+    names = stepper.parameters
+    values = np.tile(stepper.defaults, (count, 1))
+    if isinstance(given, Mapping):
+        for name, value in given.items():
+            column = real_array(value, f"the parameter {name}")
+            if column.shape not in ((), (count,)):
+                raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
+            values[:, parameter_index(stepper.interface, name)] = column
+    elif given is not None:
+        array = real_array(given, "parameters")
+        if array.shape not in ((len(names),), (count, len(names))):
+            raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
+        values[:] = array
+    if not np.isfinite(values).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
+        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}")
+    return values

@@ -1,0 +1,81 @@
+"""The steps of a run taken again, from each kept state to the next: for what a run does not store of them.
+
+Newton's iteration solves them anew, from a straight line. That it found the run's own root is checked, not believed:
+where the steps from a kept state do not lead to the next, there is an error instead of an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.dense_output import whole_steps
+from scvi_codegen.runtime.kept_states import Array, KeptStates
+
+__all__ = ["refuse_strays", "retaken", "steps_between"]
+
+Found = TypeVar("Found")
+
+SAME_STATE = 1e-6
+"""Of the largest number of a state: roots lie further apart, and rounding seldom grows so far between kept states."""
+WHOLE = 1e-9
+"""Of a step: what a span may differ from so many whole ones."""
+
+
+def retaken(
+    states: KeptStates, step: Callable[[Array, Array, float, float], tuple[Array, Array, Found]]
+) -> Iterator[list[Found]]:
+    """What each step gives, step by step from one kept state to the next.
+
+    Args:
+        states: at whole steps.
+        step: of (q, p, h, t), gives (q1, p1, found).
+
+    Raises:
+        StateError: if the states do not stand at whole steps, or the steps lead elsewhere.
+        StepFailedError: if Newton's iteration does not converge.
+    """
+    for k, (start, length, end) in enumerate(
+        zip(states.t[:-1].tolist(), states.lengths[:-1].tolist(), states.t[1:].tolist(), strict=True)
+    ):
+        count, given = steps_between(length, end - start), []
+        q, p = states.q[k], states.p[k]
+        for j in range(count):
+            q, p, found = step(q, p, length if count > 1 else end - start, start + j * length)
+            given.append(found)
+        known = np.concatenate([states.q[k : k + 2], states.p[k : k + 2]], axis=1)
+        refuse_strays(states.t[k : k + 1], np.concatenate([q, p])[np.newaxis], known[1:], known[:1])
+        yield given
+
+
+def steps_between(length: float, span: float) -> int:
+    """How many steps of a length; 1 for a last one that an event or the end cut short."""
+    if np.isnan(length):
+        raise StateError("this is known of whole steps: integrate without t_eval, and with every=1")
+    count = int(whole_steps(np.array([span]), np.array([length]))[0])
+    if count > 1 and abs(span - count * length) > WHOLE * abs(length):
+        raise StateError("this is known of whole steps: keep all states (every=1)")
+    return max(1, count)
+
+
+def refuse_strays(t: Array, found: Array, known: Array, before: Array) -> None:
+    """Raise :class:`StateError` for the first of n steps from t, solved anew, that does not lead where it led.
+
+    Beside the largest number of a state: of a momentum that is kept at 0 all is rounding.
+
+    Args:
+        t: (n,) times at which the steps begin.
+        found, known: (n, 2m) states at their ends.
+        before: (n, 2m) states at their starts.
+    """
+    sizes = np.maximum(np.abs(known).max(axis=1), np.abs(before).max(axis=1))
+    strays = np.flatnonzero(~(np.abs(found - known).max(axis=1) <= SAME_STATE * sizes))
+    if strays.size:
+        raise StateError(
+            f"what begins at t = {t[strays[0]]:g}, taken again, does not lead where it led in the run: the equations "
+            "of a step have several solutions (take shorter steps), or the motion is too sensitive between the kept "
+            "states (keep all, every=1)"
+        )

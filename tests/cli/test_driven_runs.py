@@ -1,0 +1,150 @@
+"""``scvi-codegen run`` of a system with inputs: its tables, its files, what it refuses, and where it stops."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+
+from scvi_codegen import compile_stepper, load_model
+from scvi_codegen.cli import main
+from scvi_codegen.cli.running import integrate_model
+from scvi_codegen.runtime.run import Run
+
+MODEL = """
+[system]
+name = "pushed pendulum"
+coordinates = ["q"]
+lagrangian = "q_dot**2/2 + cos(q)"
+inputs = ["u"]
+[forces]
+q = "u"
+[inputs]
+u = { t = [0.0, 1.0, 1.55, 3.0], values = [0.0, 2.0, -1.0, 0.5] }
+[initial]
+q = [0.3]
+p = [0.1]
+[method]
+method = "svi:4"
+[run]
+step = 0.1
+span = 2.3
+"""
+
+
+@pytest.fixture(autouse=True)
+def model(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("pushed.toml").write_text(MODEL)
+    Path("u.csv").write_text("t,value\n0,1\n1,0\n2,0.5\n3,-1\n")
+    return load_model("pushed.toml")
+
+
+def invoke(*words):
+    return CliRunner().invoke(main, ["run", "pushed.toml", *words], prog_name="scvi-codegen")
+
+
+def output_of(*words):
+    result = invoke(*words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_a_run_is_that_of_drive_and_its_file_too(model):
+    text = output_of("-o", "run.npz", "--plot", "run.png", "--every", "2")
+    expected = compile_stepper(model.system, model.method).drive(
+        model.q, model.p, inputs=dict(model.inputs), h=0.1, t_end=2.3, every=2
+    )
+    with np.load("run.npz") as file:
+        assert (file["t"] == expected.t).all()
+        assert (file["q"] == expected.q).all()
+        assert (file["p"] == expected.p).all()
+    assert Path("run.png").stat().st_size > 1000
+    assert "24 steps of 0.1 from t = 0 to t = 2.3" in text  # one more than without a breakpoint within a step
+    assert "in the digits that a second run confirms" in text
+
+
+def test_inputs_of_the_command_line_replace_those_of_the_file(model):
+    (Path("elsewhere")).mkdir()
+    Path("pushed.toml").rename("elsewhere/pushed.toml")
+    words = ["run", "elsewhere/pushed.toml", "--input", "u=u.csv:cubic", "--tolerance", "1e-13", "-o", "run.csv"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    table = ([0.0, 1.0, 2.0, 3.0], [1.0, 0.0, 0.5, -1.0], "cubic")
+    expected = compile_stepper(model.system, "svi:8").drive(model.q, model.p, inputs={"u": table}, t_end=2.3)
+    found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
+    assert_allclose(found[-1, :3], [2.3, expected.q[-1, 0], expected.p[-1, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--input", "u"], "not of the form NAME=FILE"),
+        (["--input", "v=u.csv"], "'v' is no input of 'pushed pendulum', which has u"),
+        (["--input", "u=u.csv:quintic"], "constant or linear or cubic"),
+        (["--input", "u=none.csv"], "none.csv: it cannot be read"),
+        (["--span", "4"], "the input u is given from t = 0 to 3; the run is from 0 to 4"),
+        (["-o", "long.run"], "-o NAME.npz"),
+        (["--advise", "1e-9"], "give --tolerance in its place"),
+        (["--parameter", "u_0=1"], "no parameter 'u_0'"),
+    ],
+)
+def test_what_is_refused(words, said):
+    result = invoke(*words)
+    assert result.exit_code == 2, result.output
+    assert said in result.stderr
+
+
+def test_an_ensemble_of_them(model):
+    Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
+    Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
+    text = output_of("--ensemble", "many.csv", "-o", "many.npz")
+    model = load_model("pushed.toml")
+    stepper = compile_stepper(model.system, model.method)
+    given = {"inputs": dict(model.inputs), "h": 0.1, "t_end": 2.3}
+    expected = [stepper.drive([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
+    with np.load("many.npz") as file:
+        assert (file["t"] == expected[0].t).all()
+        assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), atol=2e-15)
+    assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states kept of each" in text
+    changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
+    assert f"it changed by {changes:.3g} at most" in text
+    Path("pushed.toml").write_text(MODEL.replace("step = 0.1", "tolerance = 0.0"))
+    assert "give a step h" in invoke("--ensemble", "many.csv").stderr
+
+
+def test_an_input_that_is_not_given():
+    Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
+    assert "the input u is not given" in invoke().stderr
+    assert "final state" in output_of("--input", "u=u.csv")
+
+
+def test_a_step_that_fails_leaves_the_stretches_before_it(model):
+    """Towards the end the push has no numbers left."""
+    Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
+    result = invoke("-o", "run.csv")
+    assert result.exit_code == 1
+    assert "states up to there were kept: run.csv" in result.stderr
+    found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
+    assert 1.0 < found[-1, 0] < 1.5
+    assert 1.0 in found[:, 0]
+
+
+def test_a_signal_stops_between_portions(model, monkeypatch):
+    record, sent = Run.record, []
+
+    def interrupted(run, steps=None, **settings):
+        found = record(run, steps, **settings)
+        if run.t > 1.2 and not sent:
+            sent.append(os.kill(os.getpid(), signal.SIGTERM))
+        return found
+
+    monkeypatch.setattr(Run, "record", interrupted)
+    outcome = integrate_model(model)
+    assert outcome.interrupted
+    assert outcome.failure is None
+    assert 1.2 < outcome.trajectory.t[-1] < 2.0
+    assert outcome.trajectory.t[0] == 0.0

@@ -1,0 +1,186 @@
+"""Constraints of velocities: order 2s, closed forms of sleigh and disk, what is kept, what they go with."""
+
+import numpy as np
+import pytest
+import sympy
+from numpy.testing import assert_allclose
+from samples import sleigh
+from scipy.integrate import solve_ivp
+from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
+
+from scvi_codegen import (
+    SVI,
+    LagrangianSystem,
+    MethodError,
+    StateError,
+    SystemDefinitionError,
+    compile_stepper,
+    derive,
+    symmetries,
+)
+from scvi_codegen.methods.method import is_symplectic
+
+START = np.array([0.3, -0.4, 0.5]), np.array([1.1 * np.cos(0.5), 1.1 * np.sin(0.5), 0.8])
+
+
+def lobatto(s):
+    return SVI(s, f"gauss-lobatto:{s + 1}")
+
+
+def by_accelerations(t, state):
+    """The sleigh of ``samples``: its equations and the rate of its constraint, solved for accelerations."""
+    x, y, a, vx, vy, w = state
+    m, j, d, k, sine, cosine = 1.3, 0.7, 0.2, 0.5, np.sin(a), np.cos(a)
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = [[m, 0, -m * d * sine], [0, m, m * d * cosine], [-m * d * sine, m * d * cosine, j]]
+    matrix[:3, 3] = -sine, cosine, 0.0
+    matrix[3, :2] = sine, -cosine
+    found = np.linalg.solve(
+        matrix, [m * d * w * w * cosine - k * x, m * d * w * w * sine - 2 * k * y, 0.0, -w * (vx * cosine + vy * sine)]
+    )
+    return [vx, vy, w, *found[:3]]
+
+
+@pytest.mark.parametrize(("s", "steps"), [(1, 20), (2, 10), (3, 10), (4, 5)])
+def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
+    end = solve_ivp(by_accelerations, (0.0, 2.0), np.concatenate(START), method="DOP853", rtol=1e-13, atol=1e-14)
+    stepper, errors = compile_stepper(sleigh(), lobatto(s)), []
+    for n in (steps, 2 * steps):
+        run = stepper.integrate(START[0], velocity=START[1], h=2.0 / n, steps=n)
+        errors.append(np.abs(np.concatenate([run.q[-1], run.velocity[-1]]) - end.y[:, -1]).max())
+        assert np.abs(run.constraint_values()).max() < 2e-15
+    assert abs(np.log2(errors[0] / errors[1]) - 2 * s) < 0.3
+    back = stepper.step(run.q[-1], run.p[-1], -run.h, 2.0)
+    assert_allclose(back, (run.q[-2], run.p[-2]), atol=2e-15)
+    if s > 2:
+        free = stepper.integrate(START[0], velocity=START[1], t_end=2.0)
+        assert_allclose(free.q[-1], end.y[:3, -1], atol=1e-11)
+
+
+def test_chaplygins_sleigh_turns_into_its_track():
+    """Without springs: speed V tanh(k t), rate of turning W sech(k t), k = m d V / J; from a turn on the spot."""
+    m, j, d, turning = 1.3, 0.7, 0.2, 0.9
+    speed = np.sqrt(j / m) * turning
+    k = m * d * speed / j
+    stepper = compile_stepper(sleigh().with_parameters(k=0.0), lobatto(4))
+    run = stepper.integrate([0.0, 0.0, 0.0], velocity=[0.0, 0.0, turning], h=0.25, steps=80)
+    heading = 2 * turning / k * np.arctan(np.tanh(k * run.t / 2))
+    assert_allclose(run.q[:, 2], heading, atol=1e-10)
+    assert_allclose(run.velocity[:, 2], turning / np.cosh(k * run.t), atol=1e-10)
+    assert_allclose(np.hypot(*run.velocity.T[:2]), speed * np.tanh(k * run.t), atol=1e-10)
+
+
+def test_a_disk_rolls_in_circles_and_keeps_what_nothing_pushes():
+    disk = LagrangianSystem.from_text(
+        name="rolling disk",
+        coordinates=["x", "y", "a", "b"],
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 + K*b_dot**2/2",
+        parameters={"m": 1, "J": 0.25, "K": 0.5, "r": 1},
+        constraints=["x_dot = r*b_dot*cos(a)", "y_dot = r*b_dot*sin(a)"],
+    )
+    names = [symmetry.name for symmetry in symmetries(disk)]
+    assert "momentum of a" in names
+    assert "momentum of b" not in names
+    stepper = compile_stepper(disk, lobatto(3))
+    run = stepper.integrate(
+        [0.0, 0.0, 0.3, 0.0], velocity=[2 * np.cos(0.3), 2 * np.sin(0.3), 0.7, 2.0], h=0.1, steps=200
+    )
+    assert_allclose(run.q[:, 0], 2 / 0.7 * (np.sin(0.3 + 0.7 * run.t) - np.sin(0.3)), atol=2e-12)
+    kept = names.index("momentum of a")
+    assert np.abs(run.momentum_errors()[:, kept]).max() < 1e-15
+    centripetal = -np.sin(run.q[:, 2]) * 2 * 0.7, np.cos(run.q[:, 2]) * 2 * 0.7
+    assert_allclose(run.multipliers().T, centripetal, atol=1e-11)
+
+
+def test_energy_does_not_drift():
+    """Not because areas are kept, which they are not: steps are symmetric, and the motion is reversible."""
+    system = sleigh()
+    assert not is_symplectic(lobatto(2), system)
+    run = compile_stepper(system, lobatto(3)).integrate(START[0], velocity=START[1], h=0.2, steps=50_000, every=10)
+    energy = run.energy() - run.energy()[0]
+    assert np.abs(energy).max() < 5e-8
+    assert abs(energy[-500:].mean() - energy[:500].mean()) < 1e-8
+
+
+def test_beside_constraints_of_positions_and_in_motion():
+    """On a slope x = 4 z: the same as with z left out; and dragged, x_dot = cos(t)."""
+    common = {"parameters": {"m": 1.0, "J": 0.3, "g": 9.81}, "name": "sleigh on a slope"}
+    skate = "x_dot*sin(a) - y_dot*cos(a)"
+    space = LagrangianSystem.from_text(
+        coordinates=["x", "y", "z", "a"],
+        lagrangian="m*(x_dot**2 + y_dot**2 + z_dot**2)/2 + J*a_dot**2/2 - m*g*z",
+        constraints=[skate, "z = x**2/4"],
+        **common,
+    )
+    plane = LagrangianSystem.from_text(
+        coordinates=["x", "y", "a"],
+        lagrangian="m*(x_dot**2*(1 + x**2/4) + y_dot**2)/2 + J*a_dot**2/2 - m*g*x**2/4",
+        constraints=[skate],
+        **common,
+    )
+    x, v = 0.8, 0.5
+    one = compile_stepper(space, lobatto(4)).integrate(
+        [x, 0.0, x * x / 4, 0.6],
+        velocity=[v * np.cos(0.6), v * np.sin(0.6), x / 2 * v * np.cos(0.6), 0.4],
+        h=0.02,
+        steps=100,
+    )
+    other = compile_stepper(plane, lobatto(4)).integrate(
+        [x, 0.0, 0.6], velocity=[v * np.cos(0.6), v * np.sin(0.6), 0.4], h=0.02, steps=100
+    )
+    assert_allclose(one.q[:, [0, 1, 3]], other.q, atol=1e-12)
+    assert np.abs(one.constraint_values()).max() < 2e-15
+    dragged = LagrangianSystem.from_text(
+        coordinates=["x", "y", "a"],
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 + J*a_dot**2/2 - m*g*y",
+        constraints=["x_dot = cos(t)"],
+        **common,
+    )
+    assert dragged.changes_energy == "constraints move, and do work"
+    run = compile_stepper(dragged, lobatto(3)).integrate([0, 0, 0], velocity=[1, 0, 0], h=0.1, steps=30)
+    assert_allclose(run.q[:, 0], np.sin(run.t), atol=1e-9)
+    assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), atol=1e-13)
+
+
+def test_from_sympys_mechanics():
+    x, y, a = dynamicsymbols("x y a")
+    m, j, d, k = sympy.symbols("m J d k")
+    vx, vy, w = (q.diff() for q in (x, y, a))
+    lagrangian = (m * (vx**2 + vy**2) + j * w**2) / 2 + m * d * w * (vy * sympy.cos(a) - vx * sympy.sin(a))
+    method = LagrangesMethod(
+        lagrangian - k * (x**2 / 2 + y**2), [x, y, a], nonhol_coneqs=[vx * sympy.sin(a) - vy * sympy.cos(a)]
+    )
+    values = {m: 1.3, j: 0.7, d: 0.2, k: 0.5}
+    found = LagrangianSystem.from_lagranges_method(method, name="sleigh", parameters=values)
+    one, other = (compile_stepper(system, lobatto(2)) for system in (found, sleigh()))
+    p = other.momentum(*START)
+    assert_allclose(one.step(START[0], p, 0.1), other.step(START[0], p, 0.1), rtol=1e-14)
+
+
+def test_what_is_refused():
+    skate = {"name": "skate", "coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2"}
+    with pytest.raises(SystemDefinitionError, match="not linear in the velocity x_dot"):
+        LagrangianSystem.from_text(**skate, constraints=["x_dot**2 = y"])
+    with pytest.raises(SystemDefinitionError, match="says nothing"):
+        LagrangianSystem.from_text(
+            name="s",
+            coordinates=["x", "y", "z"],
+            lagrangian="x_dot**2 + y_dot**2 + z_dot**2",
+            constraints=["x_dot = y*z_dot", "2*x_dot = 2*y*z_dot"],
+        )
+    with pytest.raises(MethodError, match="does not keep the constraints"):
+        compile_stepper(sleigh(), SVI(3))
+    with pytest.raises(MethodError, match="no polynomials"):
+        compile_stepper(sleigh(), SVI(3, "gauss-lobatto:4", space="trigonometric:0.5"))
+    stepper = compile_stepper(sleigh(), lobatto(2))
+    with pytest.raises(StateError, match=r"the rate of x_dot\*sin\(a\) - y_dot\*cos\(a\) is"):
+        stepper.integrate([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0], h=0.1, steps=1)
+    q, p = stepper.project([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0])
+    assert np.abs(stepper.constraint_values(q, p)[1]).max() < 1e-15
+    assert_allclose(q, [0.0, 0.0, 0.5], atol=0.0)
+
+
+def test_the_derivation_shows_what_is_said_of_velocities():
+    text = derive(sleigh(), lobatto(1)).to_text()
+    assert "0 = x_dot*sin(a) - y_dot*cos(a)" in text
+    assert "lambda_1" in text

@@ -1,0 +1,144 @@
+"""Generated folders of systems with inputs: C goes from breakpoint to breakpoint as Python does, to the bit."""
+
+import re
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from style import check_style
+
+from scvi_codegen import SVI, Gauss, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_model, load_package
+from scvi_codegen.models.package import generate_package
+from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.runtime.driven import checked_inputs, parameters_of, stretches
+
+KNOTS, VALUES = (0.0, 0.37, 0.9, 1.41, 2.05, 2.6), (0.0, 1.2, -0.7, 0.4, 1.9, -1.0)
+STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -ffp-contract=off"
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A pushed pendulum whose hook is shaken."""
+    system = LagrangianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        lagrangian="(1 + w)*q_dot**2/2 + cos(q)",
+        parameters={"c": 0.2},
+        forces={"q": "u - c*q_dot"},
+        inputs=["w", "u"],
+    )
+    inputs = {"u": (KNOTS, VALUES, "cubic"), "w": ((-1.0, 0.5, 1.41, 3.0), (0.0, 0.3, 0.1, 0.2))}
+    return Model(system=system, method=SVI(4), q=(0.3,), velocity=(0.5,), h=0.03, span=2.3, inputs=inputs)
+
+
+def states_printed(folder, flags=STRICT):
+    """(n, 4) t, q, p and changes of the energy that the example prints."""
+    subprocess.run(["make", f"CFLAGS={flags}"], cwd=folder, check=True, capture_output=True)
+    command = [str(folder / f"{folder.name}_main")]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return np.loadtxt(printed.splitlines(), comments="#"), printed
+
+
+@pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
+@pytest.mark.parametrize(("h", "t"), [(0.03, 0.0), (-0.07, 2.55)])
+def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):
+    model = replace(model, method=method, h=h, t=t)
+    states, printed = states_printed(generate_package(model, tmp_path / "pushed"))
+    stepper = compile_stepper(model.system, method, flags=PORTABLE_FLAGS)
+    run = stepper.drive(model.q, states[:1, 2], inputs=dict(model.inputs), h=h, t=t, t_end=t + np.copysign(2.3, h))
+    rows = np.isin(run.t, states[:, 0])
+    assert rows.sum() == len(states) > 10
+    assert (states[:, 1] == run.q[rows, 0]).all()
+    assert (states[:, 2] == run.p[rows, 0]).all()
+    assert states[-1, 0] == run.t[-1]
+    assert_allclose(states[:, 2][0], stepper.momentum(model.q, model.velocity, t, model.parameters_at_start(stepper)))
+    assert_allclose(states[:, 3], (run.energy() - run.energy()[0])[rows], atol=2e-3)
+    (apart,) = re.findall(r"end away from there by (\S+)", printed) or ["0"]
+    assert abs(float(apart)) < 1e-2
+
+
+def test_steps_that_choose_their_length_go_from_breakpoint_to_breakpoint(model, tmp_path):
+    model = replace(model, h=None, tolerance=0.0)
+    states, _ = states_printed(generate_package(model, tmp_path / "pushed"))
+    stepper = compile_stepper(model.system, model.method)
+    run = stepper.drive(model.q, velocity=model.velocity, inputs=dict(model.inputs), t_end=2.3)
+    assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], atol=3e-13)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_stretches_of_c_are_those_of_python(model, seed):
+    """Breakpoints anywhere, some of them together, or a rounding apart; steps that are longer than pieces."""
+    generator = np.random.default_rng(seed)
+    times = np.unique(np.concatenate([[-0.1, 3.1], generator.uniform(0.0, 3.0, 12), 0.1 * np.arange(9)]))
+    other = np.unique(np.concatenate([times[::3], np.nextafter(times[1::3], 9.0), [-0.1, 3.1]]))
+    given = {"u": (times, generator.normal(size=len(times)), "cubic")}
+    given["w"] = other, generator.uniform(0, 0.1, len(other))
+    stepper = compile_stepper(model.system, model.method)
+    t, end = ((0.0, 3.0), (3.0, 0.05))[seed % 2]
+    h = np.copysign(generator.uniform(0.05, 0.3), end - t)
+    inputs = checked_inputs(stepper, given)
+    ours, theirs = (stepper.start([0.3], [0.1], h=h, t=t) for _ in range(2))
+    table, kept = _tables(stepper, inputs)
+    values = np.array(stepper.defaults)
+    next_steps = stepper.binding.function("next_steps")
+    for n in stretches(ours, inputs, end, parameters_of(stepper, None, inputs)):
+        ours.skip(n)
+        assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == n
+        assert theirs.h == ours.h
+        assert (values == ours.parameters).all()
+        theirs.change(parameters=values)
+        theirs.skip(n)
+    assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == 0
+    assert len(kept) == 4
+    assert (theirs.t, theirs.q, theirs.p) == (ours.t, ours.q, ours.p)
+
+
+def _tables(stepper, inputs):
+    """The same data as C takes them, and what must not be forgotten before C has used them."""
+    table, kept = stepper.binding.new(f"input[{len(inputs)}]"), []
+    for entry, name in zip(table, stepper.interface.inputs, strict=True):
+        data = inputs[name]
+        kept += [np.ascontiguousarray(data.breakpoints), np.ascontiguousarray(data.pieces[:, :4])]
+        entry.t, entry.coefficients = map(stepper.binding.pointer, kept[-2:])
+        entry.pieces, entry.piece = len(data.pieces), 0
+    return table, kept
+
+
+def test_a_folder_is_driven_from_python_too(model, tmp_path):
+    folder = generate_package(model, tmp_path / "pushed")
+    assert load_model(folder / "model.toml") == model
+    given = {"inputs": dict(model.inputs), "h": 0.03, "t_end": 2.3}
+    run = load_package(folder).drive(model.q, velocity=model.velocity, **given)
+    same = compile_stepper(model.system, model.method).drive(model.q, velocity=model.velocity, **given)
+    assert_allclose(run.q, same.q, atol=1e-14)
+    assert "pushed_next_steps" in (folder / "README.md").read_text()
+
+
+def test_without_data_the_inputs_are_nought(model, tmp_path):
+    folder = generate_package(replace(model, inputs={}), tmp_path / "still")
+    states, _ = states_printed(folder)
+    run = compile_stepper(model.system, model.method).integrate(
+        model.q, states[0, 2:3], h=0.03, steps=round(2.3 / 0.03), parameters={"c": 0.2}
+    )
+    assert (np.isin(states[:, 0], run.t)).all()
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_on_a_microcontroller(model, precision, tmp_path):
+    folder = generate_package(model, tmp_path / "pushed", embedded=precision)
+    states, _ = states_printed(folder, STRICT.replace("-Wconversion", ""))
+    run = compile_stepper(model.system, model.method).drive(
+        model.q, velocity=model.velocity, inputs=dict(model.inputs), h=0.03, t_end=2.3
+    )
+    size = 1e-13 if precision == "double" else 3e-6
+    assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], atol=size)
+    assert abs(len(states) - 20) < 6
+
+
+@pytest.mark.parametrize("method", [SVI(4), StoermerVerlet()], ids=lambda method: method.name)
+def test_the_text_is_in_style(model, method, tmp_path):
+    folder = generate_package(replace(model, method=method), tmp_path / "pushed")
+    for path in [*folder.glob("*.[ch]"), folder / "support" / "inputs.h"]:
+        check_style(path.read_text())

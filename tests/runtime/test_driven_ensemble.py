@@ -1,0 +1,197 @@
+"""Ensembles with inputs: each trajectory is that of ``drive``, with values of its own or common ones."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.interpolate import CubicSpline
+
+from scvi_codegen import SCVI, SVI, Gauss, LagrangianSystem, StateError, StoermerVerlet, compile_stepper
+
+KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
+VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
+COUNT = 11
+"""More than a block of lanes, and no multiple of one."""
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """Pushed by u, its hook shaken by w."""
+    return LagrangianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + (1 + w)*cos(q)",
+        parameters={"c": 0.2},
+        forces={"q": "u - c*q_dot"},
+        inputs=["u", "w"],
+    )
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    """Masses that depend on positions: its sweeps begin with velocities."""
+    return LagrangianSystem.from_text(
+        name="coupled",
+        coordinates=["x", "y"],
+        lagrangian="(1 + x**2/4)*x_dot**2/2 + x_dot*y_dot/3 + (1 + w/5)*y_dot**2 - x**4/4 - (x - y)**2/2",
+        parameters={"c": 0.2},
+        forces={"x": "u - c*x_dot"},
+        inputs=["u", "w"],
+    )
+
+
+def own_values(seed=1):
+    """(COUNT, 6) of u, and (COUNT,) of c."""
+    generator = np.random.default_rng(seed)
+    return VALUES * generator.uniform(0.5, 1.5, (COUNT, 1)), generator.uniform(0.1, 0.3, COUNT)
+
+
+def of_one(inputs, j):
+    """The inputs of a trajectory."""
+    return {
+        name: (t, values[j] if np.ndim(values) == 2 else values, *kind) for name, (t, values, *kind) in inputs.items()
+    }
+
+
+def check_against_drive(stepper, start, inputs, tolerance, **given):
+    """Times equal those of single runs, states to round-off."""
+    _, c = own_values()
+    runs = stepper.drive_ensemble(*start, inputs=inputs, parameters={"c": c}, **given)
+    assert runs.ok.all()
+    for j in range(COUNT):
+        run = stepper.drive(start[0][j], start[1][j], inputs=of_one(inputs, j), parameters={"c": c[j]}, **given)
+        assert (runs.t == run.t).all()
+        assert runs.steps[j] == run.steps
+        assert_allclose(runs.q[:, j], run.q, rtol=0, atol=tolerance)
+        assert_allclose(runs.p[:, j], run.p, rtol=0, atol=tolerance)
+        assert_allclose(runs.energy()[:, j], run.energy(), rtol=0, atol=4 * tolerance)
+    return runs
+
+
+def starts(m):
+    return np.random.default_rng(2).uniform(-1, 1, (2, COUNT, m))
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+@pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
+@pytest.mark.parametrize("method", [SVI(3), StoermerVerlet(), Gauss(2)], ids=lambda method: method.name)
+def test_each_trajectory_is_that_of_drive(pendulum, method, kind):
+    stepper = compile_stepper(pendulum, method)
+    assert stepper.ensemble is not None
+    inputs = {"u": (KNOTS, own_values()[0], kind), "w": ([0.0, 3.0], [0.0, 0.3])}
+    check_against_drive(stepper, starts(1), inputs, 2e-15, h=0.1, t_end=2.3)
+    check_against_drive(stepper, starts(1), inputs, 2e-15, h=-0.1, t=2.55, t_end=0.02, every=3)
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+def test_other_sweeps_begin_anew_after_a_shorter_step(coupled):
+    stepper = compile_stepper(coupled, SVI(3))
+    assert stepper.ensemble is not None
+    assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
+    inputs = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}
+    check_against_drive(stepper, starts(2), inputs, 2e-14, h=0.05, t_end=2.3)
+
+
+def test_methods_without_lanes_are_equal_to_the_bit(pendulum):
+    stepper = compile_stepper(pendulum, SCVI(2), solver="newton")
+    assert stepper.ensemble is None
+    inputs = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}
+    check_against_drive(stepper, starts(1), inputs, 0.0, h=0.02, t_end=2.3, every=4)
+
+
+def test_velocities_are_taken_with_the_inputs_of_the_start(coupled):
+    stepper = compile_stepper(coupled, SVI(3))
+    q, v = starts(2)
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
+    runs = stepper.drive_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
+    assert_allclose(runs.p[0, :, 1], v[:, 0] / 3 + 2 * (1 + np.arange(COUNT) / 5) * v[:, 1])
+
+
+def test_splines_of_scipy(pendulum):
+    stepper, (u, _) = compile_stepper(pendulum, SVI(3)), own_values()
+    w, given = ([0.0, 3.0], [0.0, 0.3]), {"h": 0.05, "steps": 40}
+    by_values = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, u, "cubic"), "w": w}, **given)
+    by_spline = stepper.drive_ensemble(*starts(1), inputs={"u": CubicSpline(KNOTS, u, axis=1), "w": w}, **given)
+    assert by_values.t[-1] == 2.0
+    assert (by_values.q == by_spline.q).all()
+
+
+def test_a_trajectory_that_fails_leaves_the_others_alone():
+    """The third pendulum's push has no square root in the fourth piece."""
+    system = LagrangianSystem.from_text(
+        name="root",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + cos(q)",
+        forces={"q": "sqrt(u)"},
+        inputs=["u"],
+    )
+    stepper, u = compile_stepper(system, SVI(3)), np.abs(own_values()[0]) + 0.1
+    fine = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    u[2, 4] = -3.0
+    runs = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    others = np.arange(COUNT) != 2
+    assert runs.ok.tolist() == others.tolist()
+    assert (runs.q[:, others] == fine.q[:, others]).all()
+    good = np.isfinite(runs.q[:, 2, 0])
+    assert 1.4 < runs.t[good][-1] < 2.05
+    assert good[: good.sum()].all()
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
+def test_a_lane_whose_sweeps_fail_goes_on_alone_across_breakpoints():
+    """Stiff from the second piece on, where Newton's iteration alone leads on."""
+    system = LagrangianSystem.from_text(
+        name="stiffening", coordinates=["q"], lagrangian="q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs=["u"]
+    )
+    stepper, u = compile_stepper(system, SVI(2)), np.tile(VALUES**2, (COUNT, 1))
+    u[4, 2:] = 4000.0
+    q, p = starts(1)
+    runs = stepper.drive_ensemble(q, p, inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    assert runs.ok.all()
+    run = stepper.drive(q[4], p[4], inputs={"u": (KNOTS, u[4])}, h=0.1, t_end=2.3)
+    assert_allclose(runs.q[:, 4], run.q, atol=1e-11)
+    assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
+
+
+def test_threads_portions_and_every_change_nothing(pendulum):
+    stepper = compile_stepper(pendulum, SVI(3))
+    inputs, told = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}, []
+    given = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
+    full = stepper.drive_ensemble(*starts(1), **given, progress=told.append)
+    fewer = stepper.drive_ensemble(*starts(1), **given, every=100, threads=1)
+    assert told[-1] == full.steps[0]
+    rows = np.isin(full.t, fewer.t)
+    assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
+    assert (full.q[rows] == fewer.q).all()
+    assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
+
+
+def test_files_tell_the_energies_of_each_piece(pendulum, tmp_path):
+    stepper = compile_stepper(pendulum, SVI(3))
+    w = np.outer(np.arange(COUNT), [0.0, 0.1])
+    runs = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3)
+    table = runs.to_xarray()
+    rising = 1 + np.outer(runs.t, np.arange(COUNT)) / 30
+    assert_allclose(table["energy"], runs.p[:, :, 0] ** 2 / 2 - rising * np.cos(runs.q[:, :, 0]), atol=1e-14)
+    runs.save(tmp_path / "runs.csv")
+    assert (tmp_path / "runs.csv").read_text().splitlines()[0] == "trajectory,t,q,p_q"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"inputs": {"u": (KNOTS, np.tile(VALUES, (COUNT - 1, 1))), "w": (KNOTS, VALUES)}},
+            "for each of 11 trajectories",
+        ),
+        ({"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES, "quintic")}}, "constant or linear or cubic"),
+        ({"inputs": {"u": (KNOTS, VALUES)}}, "the input w is not given"),
+        ({"t_end": 4.0}, "is given from t = 0 to 2.6"),
+        ({"t_end": None}, "t_end"),
+        ({"every": 0}, "every"),
+        ({"h": 0.0}, "h"),
+    ],
+)
+def test_what_is_refused(pendulum, change, said):
+    given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3} | change
+    with pytest.raises(StateError, match=said):
+        compile_stepper(pendulum, SVI(3)).drive_ensemble(*starts(1), **given)
