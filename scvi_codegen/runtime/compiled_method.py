@@ -85,6 +85,11 @@ class CompiledMethod:
         """The C text that lends Newton's iteration, derived when first asked for; ``None`` if none is borrowed."""
         return self._fallback()
 
+    @property
+    def derivatives(self) -> Source | None:
+        """The C text with the derivatives of steps, derived when first asked for; ``None`` in transformed time."""
+        return self._tangent()
+
     def prepare(self) -> None:
         """Compile now what is otherwise compiled when a step first needs it: Newton's iteration behind sweeps.
 
@@ -96,7 +101,7 @@ class CompiledMethod:
     def tangent(self) -> Binding:
         """The library with derivatives of steps, compiled when first asked for; MethodError where there is none."""
         if self._with_tangent is None:
-            source = self._tangent()
+            source = self.derivatives
             if source is None:
                 raise MethodError(f"there are no derivatives of the steps of '{self.title}'")
             binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)

@@ -195,6 +195,8 @@ class _Model:
             raise StateError(
                 "momenta follow from velocities by way of the parameters: give p, or let the state be found, too"
             )
+        if not wanted and not state:
+            raise StateError("there is nothing to find: no parameter is unknown, and the initial state is known")
         values = checked_parameters(stepper.interface, parameters)
         momenta = stepper.momenta_given(q, p, velocity, measurements.start, values)
         places = [2 * m + stepper.parameters.index(name) for name in wanted]

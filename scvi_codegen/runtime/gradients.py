@@ -55,7 +55,7 @@ def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
         StateError: for directions of another shape, and states that do not stand at whole steps.
     """
     size = 2 * states.stepper.dimension
-    given = np.eye(size) if directions is None else real_array(directions, "directions")
+    given = np.eye(size) if directions is None else _finite(directions, "directions")
     if given.ndim not in (1, 2) or len(given) != size:
         raise StateError(f"directions have shape ({size},) or ({size}, k), not {given.shape}")
     changes = np.zeros((given.size // size, states.stepper.given))
@@ -72,7 +72,7 @@ def sensitivity(states: KeptStates) -> Sensitivity:
 def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
     """The transpose of :func:`sensitivity` applied to (n, 2m) or (n, 2m, c) slopes of functions by the states."""
     size, m = 2 * states.stepper.dimension, states.stepper.dimension
-    slopes = real_array(cotangents, "cotangents")
+    slopes = _finite(cotangents, "cotangents")
     if slopes.ndim not in (2, 3) or slopes.shape[:2] != (len(states), size):
         shape = f"({len(states)}, {size})"
         raise StateError(
@@ -97,6 +97,13 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
         t=found[-2],
         h=found[-1] if _has_one_length(states) else None,
     )
+
+
+def _finite(given: ArrayLike, name: str) -> Array:
+    array = real_array(given, name)
+    if not np.isfinite(array).all():
+        raise StateError(f"there are {name} that are not finite")
+    return array
 
 
 def _forward(states: KeptStates, changes: Array) -> Array:

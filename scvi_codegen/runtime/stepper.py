@@ -44,7 +44,7 @@ class Stepper(ConstrainedStates):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        texts = (self.ensemble, self._controlled(), self.fallback, self._tangent())
+        texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives)
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events))
 
     @takes(StateError, progress=FUNCTION)

@@ -30,7 +30,7 @@ def templates(name: str) -> list[str]:
     """What the C of a case is made from."""
     own = case(name)
     stepper = compile_stepper(own.system, own.method(), flags=QUICK_FLAGS)
-    texts = (stepper.source, stepper.ensemble, stepper.fallback)
+    texts = (stepper.source, stepper.ensemble, stepper.fallback, stepper.derivatives)
     return sorted({file for text in texts if text for file in text.files if file.startswith("support/")})
 
 

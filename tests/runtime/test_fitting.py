@@ -1,9 +1,10 @@
 """Parameters and initial states from measurements: against DOP853 and curve_fit, and errors that mean what they say."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
+import scipy.optimize
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS, linkage
 from scipy.integrate import solve_ivp
@@ -154,6 +155,7 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"deviations": -1.0}, "deviations are a positive number"),
         ({"start": 1.0}, "before the first measurement"),
         ({"state": False}, "give p, or let the state be found"),
+        ({"state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to find"),
         ({"bounds": {"k": (0, 1)}}, "'k' is not among the unknowns"),
         ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
         ({"h": 0.0}, "the step h is 0"),
@@ -170,6 +172,13 @@ def test_times_ascend_and_constraints_are_not_fitted():
     bars = compile_stepper(linkage(), SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
     with pytest.raises(MethodError, match="constraints are not fitted"):
         fit(bars, [0.0, 0.1], np.zeros((2, 4)), q=[0, 1, 1.94, 1.5], p=np.zeros(4), h=0.1)
+
+
+def test_a_search_that_ends_nowhere_says_so(monkeypatch):
+    search = partial(scipy.optimize.least_squares, max_nfev=1)
+    monkeypatch.setattr(scipy.optimize, "least_squares", search)
+    with pytest.raises(FitError, match=r"no least squares were found: .* Give a nearer first guess"):
+        fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
 
 
 def test_residuals_are_drawn():

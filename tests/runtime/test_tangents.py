@@ -1,67 +1,12 @@
-"""Derivatives of steps and runs: by differences in 60 digits, symplectic, and what they say of motions."""
+"""Tangent maps of runs, and what they say of motions; those of steps are in test_sensitivity."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from certified_cases import STATES
 from numpy.testing import assert_allclose
 
-from scvi_codegen import (
-    SCVI,
-    SVI,
-    Gauss,
-    MethodError,
-    SpectralCollocation,
-    StateError,
-    StoermerVerlet,
-    compile_stepper,
-    problem,
-    reparametrise,
-)
-from scvi_codegen.exact.step import derived_step
-from scvi_codegen.tables.precision import mp
-
-CASES = {
-    "pendulum/svi-1": ("pendulum", SVI(1)),
-    "kepler/svi-4": ("kepler", SVI(4)),
-    "double/svi-3": ("double", SVI(3)),
-    "double/scvi": ("double", SCVI(2)),
-    "cart/gauss": ("cart", Gauss(3)),
-    "kepler/verlet": ("kepler", StoermerVerlet()),
-    "vortices/svi": ("vortices", SVI(2)),
-    "linkage/svi": ("linkage", SVI(2, "gauss-lobatto:3")),
-    "sleigh/svi": ("sleigh", SVI(2, "gauss-lobatto:3")),
-    "double/sc": ("double", SpectralCollocation(3)),
-}
-
-
-def by_differences(system, method, q, p, h, t):
-    """Of the paper's equations, solved in 60 digits."""
-    step, width, z, columns = derived_step(system, method), mp.mpf(10) ** -20, [*map(mp.mpf, (*q, *p))], []
-    for k in range(len(z)):
-        ends = []
-        for sign in (1, -1):
-            moved = list(z)
-            moved[k] += sign * width
-            end = step(moved[: len(q)], moved[len(q) :], h, mp.mpf(t))
-            ends.append(np.array([*end.q, *end.p]))
-        columns.append(((ends[0] - ends[1]) / (2 * width)).astype(float))
-    return np.array(columns).T
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_derivative_of_a_step(name):
-    known, method = CASES[name]
-    system, q, p, h = STATES[known]
-    stepper = compile_stepper(system, method)
-    if system.constraints:
-        q, p = stepper.project(q, p)
-    found, exact = stepper.jacobian(q, p, h, 0.3), by_differences(system, method, q, p, h, 0.3)
-    assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
-    if method.symplectic and not system.constraints:
-        omega = np.kron([[0, 1], [-1, 0]], np.eye(len(q)))
-        assert np.abs(found.T @ omega @ found - omega).max() < 4e-15
+from scvi_codegen import SVI, MethodError, StateError, compile_stepper, problem, reparametrise
 
 
 def test_runs_carry_directions():
