@@ -24,7 +24,50 @@ from scvi_codegen.pictures.overview import plot_trajectory
 __all__ = ["run"]
 
 
-@click.command()
+ABOUT = """\
+Integrate MODEL and print what was conserved and where it ended.
+
+A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
+asked for.
+
+With --tolerance each step has the length that its error allows. With --advise one step for all is chosen by short
+pilot runs, for the error wanted at the end; advice and evidence are printed, and a run that belies them ends with
+exit status 1.
+
+With --monitor steps are of one length in a time tau that runs the slower the faster the motion is; the map stays
+symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
+and all times are of t.
+
+A system with inputs, functions of time that are data, takes their values from the section [inputs] of its file or
+from --input: a table with columns t and value. Steps end where a piece of an input does.
+
+With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
+
+\b
+  [grid]
+  q1 = { from = 0.5, to = 1.5, count = 11 }
+  q2_dot = [0.9, 1.0, 1.1]
+  mu = 2.0
+
+A table is a CSV file with the names in its first line. Names are those of coordinates, velocities (q1_dot) or
+momenta (p_q1), and parameters; MODEL gives the others. An .npz file has arrays q and p of shape (states,
+trajectories, coordinates); a .csv file has a line a state.
+
+Into a folder (-o long.run) the states are written as they are computed, with all that the run needs to go on. It
+may be killed at any time; --resume continues it bit for bit, with --steps or --span further than it was meant to
+go. The memory in use does not grow. 'scvi-codegen export' makes one file of it.
+
+\b
+Examples:
+  scvi-codegen run outer-solar-system --plot orbits.png
+  scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
+  scvi-codegen run kepler --tolerance 1e-12
+  scvi-codegen run kepler --advise 1e-9
+  scvi-codegen run kepler --monitor frequency --span 1000
+"""
+
+
+@click.command(help=ABOUT)
 @partial(model_arguments, required=False)
 @click.option(
     "-o",
@@ -80,46 +123,7 @@ def run(
     max_iterations: int | None,
     **choices: Any,
 ) -> None:
-    """Integrate MODEL and print what was conserved and where it ended.
-
-    A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
-    asked for.
-
-    With --tolerance each step has the length that its error allows. With --advise one step for all is chosen by short
-    pilot runs, for the error wanted at the end; advice and evidence are printed, and a run that belies them ends with
-    exit status 1.
-
-    With --monitor steps are of one length in a time tau that runs the slower the faster the motion is; the map stays
-    symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
-    and all times are of t.
-
-    A system with inputs, functions of time that are data, takes their values from the section [inputs] of its file or
-    from --input: a table with columns t and value. Steps end where a piece of an input does.
-
-    With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
-
-    \b
-      [grid]
-      q1 = { from = 0.5, to = 1.5, count = 11 }
-      q2_dot = [0.9, 1.0, 1.1]
-      mu = 2.0
-
-    A table is a CSV file with the names in its first line. Names are those of coordinates, velocities (q1_dot) or
-    momenta (p_q1), and parameters; MODEL gives the others. An .npz file has arrays q and p of shape (states,
-    trajectories, coordinates); a .csv file has a line a state.
-
-    Into a folder (-o long.run) the states are written as they are computed, with all that the run needs to go on. It
-    may be killed at any time; --resume continues it bit for bit, with --steps or --span further than it was meant to
-    go. The memory in use does not grow. 'scvi-codegen export' makes one file of it.
-
-    \b
-    Examples:
-      scvi-codegen run outer-solar-system --plot orbits.png
-      scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
-      scvi-codegen run kepler --tolerance 1e-12
-      scvi-codegen run kepler --advise 1e-9
-      scvi-codegen run kepler --monitor frequency --span 1000
-    """
+    """What ``ABOUT`` says."""
     recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
     if resume is not None:
         check_resumed(click.get_current_context())
