@@ -7,7 +7,14 @@ from itertools import chain
 from scvi_codegen.reproduce import claims, correction, theorems
 from scvi_codegen.reproduce.kepler import figures_13_to_20, figures_23_to_30, overview
 from scvi_codegen.reproduce.laboratory.experiment import Experiment
-from scvi_codegen.reproduce.oscillators import duffing, oscillator, oscillator_orders, pendulum, two_point_pendulum
+from scvi_codegen.reproduce.oscillators import (
+    duffing,
+    long_step,
+    oscillator,
+    oscillator_orders,
+    pendulum,
+    two_point_pendulum,
+)
 from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
 
 __all__ = ["EXPERIMENTS"]
@@ -22,8 +29,8 @@ ORDER = """
     correction claims
 """
 MODULES = (
-    *(overview, oscillator, oscillator_orders, pendulum, duffing, figures_13_to_20, figures_23_to_30, correction),
-    *(tableaux, properties, outlines, costs, iterations, two_point_pendulum, theorems, claims),
+    *(overview, oscillator, long_step, oscillator_orders, pendulum, duffing, figures_13_to_20, figures_23_to_30),
+    *(correction, tableaux, properties, outlines, costs, iterations, two_point_pendulum, theorems, claims),
 )
 
 
