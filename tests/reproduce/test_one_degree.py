@@ -15,7 +15,7 @@ import scvi_codegen as sc
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.reproduce.kepler import overview
 from scvi_codegen.reproduce.laboratory import geometric
-from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result, Verdict
+from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result, Verdict, judged
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of
 from scvi_codegen.reproduce.oscillators import duffing, long_step, one_degree, oscillator, oscillator_orders, pendulum
 from scvi_codegen.reproduce.writing import draw
@@ -210,7 +210,7 @@ def test_drift_is_told_from_oscillation():
     [((True, True), Verdict.HOLDS), ((True, False), Verdict.PARTLY), ((False, False), Verdict.FAILS)],
 )
 def test_verdicts_follow_conditions(conditions, verdict):
-    assert one_degree.judged(*conditions) is verdict
+    assert judged(*conditions) is verdict
 
 
 def test_area_changes_as_the_energy_of_an_oscillator():

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ALONG", "WINDOW", "Line", "factors", "fitted_line", "is_straight", "typical", "within"]
+__all__ = ["ALONG", "STRAIGHT", "WINDOW", "Line", "factors", "fitted_line", "is_straight", "typical", "within"]
 
 Array = NDArray[np.float64]
 Line: TypeAlias = tuple[float, float]

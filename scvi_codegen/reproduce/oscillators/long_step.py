@@ -20,11 +20,12 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     Verdict,
     holds,
+    judged,
 )
 from scvi_codegen.reproduce.laboratory.geometric import ALONG, WINDOW, Line, factors, fitted_line, typical, within
 from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS, READINGS, SCHEMES, Reading
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
-from scvi_codegen.reproduce.oscillators.one_degree import judged, largest
+from scvi_codegen.reproduce.oscillators.one_degree import largest
 from scvi_codegen.reproduce.oscillators.oscillator import OSCILLATOR, POSITION, SYSTEM, VELOCITY
 
 if TYPE_CHECKING:

@@ -21,13 +21,13 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     Verdict,
     holds,
+    judged,
 )
 from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
     curves_table,
     drifts,
     energy_error,
-    judged,
     largest,
     svi_with_points,
 )

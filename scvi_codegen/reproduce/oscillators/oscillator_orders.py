@@ -22,10 +22,10 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     Verdict,
     holds,
+    judged,
 )
 from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS, SCHEMES, Reading
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
-from scvi_codegen.reproduce.oscillators.one_degree import judged
 from scvi_codegen.reproduce.oscillators.oscillator import OSCILLATOR, POSITION, SYSTEM, VELOCITY
 from scvi_codegen.tables.precision import Number, mp
 
