@@ -20,7 +20,7 @@ from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, pro
 __all__ = ["EXPERIMENTS"]
 
 ORDER = """
-    theorem-2.1 table-1 table-2 table-3 table-4 figure-1
+    section-2.1 theorem-2.1 table-1 table-2 table-3 table-4 figure-1
     figure-2 table-5 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
     figure-9 figure-10 table-6 figure-11 figure-12 table-7
     figure-13 figure-14 figure-15 figure-16 figure-17 figure-18 figure-19 figure-20 table-8 table-9
