@@ -131,9 +131,9 @@ ORDERS = [
 ]
 
 
-@pytest.mark.parametrize(("what", "setting", "scheme", "powers"), ORDERS)
-def test_figures_7_and_8_have_the_orders(what, setting, scheme, powers):
-    fits = [oscillator_orders.fitted_power(what, setting.method(scheme, n)) for n in (2, 4, 6)]
+@pytest.mark.parametrize(("what", "variant", "scheme", "powers"), ORDERS)
+def test_figures_7_and_8_have_the_orders(what, variant, scheme, powers):
+    fits = [oscillator_orders.fitted_power(what, variant.method(scheme, n)) for n in (2, 4, 6)]
     assert [fit.power for fit in fits] == pytest.approx(powers, abs=0.01)
 
 

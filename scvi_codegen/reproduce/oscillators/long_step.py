@@ -50,7 +50,7 @@ class Errors(NamedTuple):
     energy: float
 
 
-class Curve(NamedTuple):
+class ErrorsOverN(NamedTuple):
     """Errors of a scheme over N."""
 
     n: Array
@@ -62,7 +62,7 @@ class Curve(NamedTuple):
         return fitted_line(self.n, getattr(self, what))
 
 
-Curves: TypeAlias = Mapping[tuple[Reading, str], Curve]
+Curves: TypeAlias = Mapping[tuple[Reading, str], ErrorsOverN]
 
 
 @lru_cache
@@ -72,10 +72,10 @@ def _errors(method: Method) -> Errors:
     return Errors(float(abs(q[0] - np.sin(STEP))), float(abs(stepper.energy(q, p) - 0.5)))
 
 
-def _curve(reading: Reading, scheme: str, degrees: Sequence[int]) -> Curve:
+def _curve(reading: Reading, scheme: str, degrees: Sequence[int]) -> ErrorsOverN:
     counts = [degree + reading.beyond_degree for degree in degrees]
     errors = np.array([_errors(reading.method(scheme, n)) for n in counts])
-    return Curve(np.array(counts, dtype=float), *errors.T)
+    return ErrorsOverN(np.array(counts, dtype=float), *errors.T)
 
 
 def convergence(_: Mapping[str, Result], degrees: Mapping[str, Sequence[int]] = DEGREES) -> Result:

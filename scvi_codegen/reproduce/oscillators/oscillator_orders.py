@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["BEYOND", "DEGREES", "EXPERIMENTS", "POINTS", "Setting", "fitted_power", "refinement"]
+__all__ = ["BEYOND", "DEGREES", "EXPERIMENTS", "POINTS", "Variant", "fitted_power", "refinement"]
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ LEGEND = (2, 4, 6)
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class Variant:
     """A meaning of N, and how many Gauss points SVI has beyond N."""
 
     reading: Reading
@@ -62,7 +62,7 @@ class Setting:
         return self.reading.method(scheme, n, more=self.more)
 
 
-POINTS, DEGREES, BEYOND = Setting(BY_POINTS), Setting(BY_DEGREE), Setting(BY_DEGREE, more=1)
+POINTS, DEGREES, BEYOND = Variant(BY_POINTS), Variant(BY_DEGREE), Variant(BY_DEGREE, more=1)
 SHOWN = {"q": (POINTS, DEGREES), "energy": (POINTS, DEGREES, BEYOND)}
 """Verdicts are on the first."""
 STEPS = tuple(10.0 ** (0.3 * k - 3.0) for k in range(14))
@@ -128,25 +128,28 @@ def fitted_power(what: str, method: Method) -> Fit | None:
     return Fit(float(np.exp(intercept)), float(power))
 
 
-def _fits(what: str, setting: Setting) -> dict[tuple[str, int], Fit | None]:
+def _fits(what: str, variant: Variant) -> dict[tuple[str, int], Fit | None]:
     """By scheme and N."""
-    return {(scheme, n): fitted_power(what, setting.method(scheme, n)) for scheme in SCHEMES for n in LEGEND}
+    return {(scheme, n): fitted_power(what, variant.method(scheme, n)) for scheme in SCHEMES for n in LEGEND}
 
 
-class Curve(NamedTuple):
+class ErrorsOverH(NamedTuple):
     """Errors over h, of the method and, where it was run, of the compiled code."""
 
     exact: Array
     compiled: Array | None
 
 
-def _curves(what: str, setting: Setting, steps: tuple[float, ...]) -> dict[tuple[str, int], Curve]:
-    """By scheme and N."""
-    methods = {(scheme, n): setting.method(scheme, n) for scheme in SCHEMES for n in LEGEND}
+Curves: TypeAlias = Mapping[tuple[str, int], ErrorsOverH]
+"""By scheme and N."""
+
+
+def _curves(what: str, variant: Variant, steps: tuple[float, ...]) -> Curves:
+    methods = {(scheme, n): variant.method(scheme, n) for scheme in SCHEMES for n in LEGEND}
     return {
-        key: Curve(
+        key: ErrorsOverH(
             _exact_errors(method, steps)[what],
-            _compiled_errors(method, steps)[what] if setting is POINTS else None,
+            _compiled_errors(method, steps)[what] if variant is POINTS else None,
         )
         for key, method in methods.items()
     }
@@ -154,7 +157,7 @@ def _curves(what: str, setting: Setting, steps: tuple[float, ...]) -> dict[tuple
 
 def refinement(name: str, what: str, _: Mapping[str, Result], steps: tuple[float, ...] = STEPS) -> Result:
     """A figure, at some steps."""
-    curves = {setting: _curves(what, setting, steps) for setting in SHOWN[what]}
+    curves = {variant: _curves(what, variant, steps) for variant in SHOWN[what]}
     return Result(
         name=name,
         title=TITLES[name],
@@ -162,7 +165,7 @@ def refinement(name: str, what: str, _: Mapping[str, Result], steps: tuple[float
         checks=(_powers(what), _constants(what), _ahead(what, curves[POINTS], steps)),
         tables=(
             TableBlock(
-                columns=("setting", "scheme", "N", "fitted power of h", "constant", "printed constant"),
+                columns=("variant", "scheme", "N", "fitted power of h", "constant", "printed constant"),
                 rows=tuple(_rows(what)),
                 formats={"fitted power of h": ".2f", "constant": ".1e", "printed constant": ".1e"},
             ),
@@ -173,17 +176,17 @@ def refinement(name: str, what: str, _: Mapping[str, Result], steps: tuple[float
 
 
 def _rows(what: str) -> Iterator[tuple[Cell, ...]]:
-    for setting in SHOWN[what]:
-        for (scheme, n), fit in _fits(what, setting).items():
+    for variant in SHOWN[what]:
+        for (scheme, n), fit in _fits(what, variant).items():
             numbers = (fit.power, fit.constant, PRINTED[what].get(round(fit.power))) if fit else (None, None, None)
-            yield setting.title, scheme, n, *numbers
+            yield variant.title, scheme, n, *numbers
 
 
-def _errors_table(curves: Mapping[Setting, Mapping[tuple[str, int], Curve]], steps: tuple[float, ...]) -> TableBlock:
+def _errors_table(curves: Mapping[Variant, Curves], steps: tuple[float, ...]) -> TableBlock:
     columns = {}
-    for setting, of_setting in curves.items():
-        for (scheme, n), curve in of_setting.items():
-            label = f"{scheme}, N = {n}, {setting.title}"
+    for variant, of_variant in curves.items():
+        for (scheme, n), curve in of_variant.items():
+            label = f"{scheme}, N = {n}, {variant.title}"
             columns[label] = curve.exact
             if curve.compiled is not None:
                 columns[f"{label}, compiled"] = curve.compiled
@@ -193,7 +196,7 @@ def _errors_table(curves: Mapping[Setting, Mapping[tuple[str, int], Curve]], ste
 
 def _powers(what: str) -> Comparison:
     """Whether the powers of the legend are those of the curves."""
-    found = {setting: {round(fit.power) for fit in _fits(what, setting).values() if fit} for setting in SHOWN[what]}
+    found = {variant: {round(fit.power) for fit in _fits(what, variant).values() if fit} for variant in SHOWN[what]}
     printed, ours = set(PRINTED[what]), found[POINTS]
     outcome = "These are the printed ones"
     if missing := sorted(printed - ours):
@@ -201,27 +204,27 @@ def _powers(what: str) -> Comparison:
         outcome = f"{_powers_of_h(missing)} is not among them, where there is {others}"
     return Comparison(
         claim=f"The errors of N = 2, 4, 6 follow the lines {_powers_of_h(PRINTED[what])} of the legend.",
-        measured=f"{'; '.join(_listed(what, setting) for setting in SHOWN[what])}. With N points: {outcome}.",
+        measured=f"{'; '.join(_listed(what, variant) for variant in SHOWN[what])}. With N points: {outcome}.",
         verdict=judged(*(power in ours for power in PRINTED[what])),
     )
 
 
-def _listed(what: str, setting: Setting) -> str:
-    fits = _fits(what, setting)
+def _listed(what: str, variant: Variant) -> str:
+    fits = _fits(what, variant)
     parts = []
     for scheme in SCHEMES:
         powers = [f"{fit.power:.1f}" for n in LEGEND if (fit := fits[scheme, n])]
         parts.append(f"{scheme} {', '.join(powers) or 'no error at all'}")
-    return f"{setting.title}: fitted powers {' and '.join(parts)}"
+    return f"{variant.title}: fitted powers {' and '.join(parts)}"
 
 
 def _powers_of_h(powers: Iterable[int]) -> str:
     return ", ".join(f"h^{power}" for power in powers)
 
 
-def _factors(what: str, setting: Setting) -> list[float]:
+def _factors(what: str, variant: Variant) -> list[float]:
     """By how much the constant of each fitted line is off that of the printed line of its power."""
-    fits = [fit for fit in _fits(what, setting).values() if fit]
+    fits = [fit for fit in _fits(what, variant).values() if fit]
     printed = [(fit.constant, PRINTED[what].get(round(fit.power))) for fit in fits]
     return [max(ours / theirs, theirs / ours) for ours, theirs in printed if theirs]
 
@@ -230,9 +233,9 @@ def _constants(what: str) -> Comparison:
     """How far lines of the same power are apart: it tells what N counts."""
     ours = _factors(what, POINTS)
     beside = [
-        f"{min(f):.1f} to {max(f):.0f} ({setting.title})"
-        for setting in SHOWN[what][1:]
-        if (f := _factors(what, setting))
+        f"{min(f):.1f} to {max(f):.0f} ({variant.title})"
+        for variant in SHOWN[what][1:]
+        if (f := _factors(what, variant))
     ]
     return Comparison(
         claim="The lines run along the errors.",
@@ -243,7 +246,7 @@ def _constants(what: str) -> Comparison:
     )
 
 
-def _ahead(what: str, curves: Mapping[tuple[str, int], Curve], steps: tuple[float, ...]) -> Comparison:
+def _ahead(what: str, curves: Curves, steps: tuple[float, ...]) -> Comparison:
     """SVI against SC at every N and step, as the methods are, without round-off."""
     pairs = [(curves["SVI", n].exact, curves["SC", n].exact) for n in LEGEND]
     wins = sum(int(np.count_nonzero(svi < sc)) for svi, sc in pairs)
@@ -260,15 +263,15 @@ def _ahead(what: str, curves: Mapping[tuple[str, int], Curve], steps: tuple[floa
 
 def _draw(
     what: str,
-    curves: Mapping[Setting, Mapping[tuple[str, int], Curve]],
+    curves: Mapping[Variant, Curves],
     steps: tuple[float, ...],
     figure: Figure,
 ) -> None:
-    for axes, (setting, of_setting) in zip(panels(figure, 1, len(curves)), curves.items(), strict=True):
+    for axes, (variant, of_variant) in zip(panels(figure, 1, len(curves)), curves.items(), strict=True):
         draw_powers(axes, (1e-3, 0.5), [(constant, power) for power, constant in PRINTED[what].items()])
-        for (scheme, n), curve in of_setting.items():
+        for (scheme, n), curve in of_variant.items():
             _draw_curve(axes, steps, curve, f"{scheme}, N = {n}")
-        axes.set(xscale="log", yscale="log", xlabel="h", ylim=(1e-20, 1e2), title=setting.title.replace("; ", "\n"))
+        axes.set(xscale="log", yscale="log", xlabel="h", ylim=(1e-20, 1e2), title=variant.title.replace("; ", "\n"))
         axes.plot([], [], ":", color=COLORS["exact"], linewidth=0.8, label="legend of the paper")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.axes[0].set_ylabel(f"error of {what} after one step")
@@ -277,7 +280,7 @@ def _draw(
 LOOKS = dict(zip(map(str, LEGEND), (("o", "-"), ("s", "--"), ("D", "-.")), strict=True))
 
 
-def _draw_curve(axes: Axes, steps: tuple[float, ...], curve: Curve, label: str) -> None:
+def _draw_curve(axes: Axes, steps: tuple[float, ...], curve: ErrorsOverH, label: str) -> None:
     color, (mark, line) = COLORS[label.partition(",")[0]], LOOKS[label[-1]]
     axes.plot([], [], mark + line, color=color, markersize=3, linewidth=1.0, label=label)
     if curve.exact.max() > NO_ERROR:
