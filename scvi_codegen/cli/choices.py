@@ -14,7 +14,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.methods import METHODS
+from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import catalogue_model, load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
@@ -27,6 +27,8 @@ METHOD_CHOICES = (
     *("method", "degree", "stages", "order", "nodes", "quadrature", "space", "form", "variational", "abscissae"),
 )
 """Options that say something of the method."""
+OFFERED_SIZES = range(1, 17)
+"""Numbers that a shell offers after ``svi:``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +130,10 @@ def _option(*names: str, **settings: Any) -> Callable[[Command], Command]:
 
 
 def complete_method(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of methods, for a shell."""
-    return [CompletionItem(name) for name in METHODS if name.startswith(incomplete)]
+    """Names of methods, for a shell; after a colon with their degree, number of stages or order."""
+    name, colon, _ = incomplete.partition(":")
+    offered = [f"{name}:{number}" for number in OFFERED_SIZES] if colon and size_of(name) else METHODS
+    return [CompletionItem(one) for one in offered if one.startswith(incomplete)]
 
 
 def complete_model(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -143,11 +147,21 @@ METHOD_OPTIONS = (
         "--method",
         metavar="NAME",
         shell_complete=complete_method,
-        help="Method: svi, svi:6, scvi, sc, gauss, ... (see 'scvi-codegen methods').",
+        help="Method, with its degree or number of stages: svi:6, gauss:3, .. (see 'scvi-codegen methods').",
     ),
-    _option("--degree", type=int, metavar="N", help="Degree of the trial curve (svi, scvi, sc)."),
-    _option("--stages", type=int, metavar="N", help="Number of stages (gauss, radau-iia, lobatto-iiia, ...)."),
-    _option("--order", type=int, metavar="N", help="Order of a composition of Stoermer-Verlet: 2, 8 or 10."),
+    _option(
+        "--degree",
+        type=int,
+        metavar="N",
+        help="Degree of the trial curve (svi, scvi, sc), as in svi:N.",
+    ),
+    _option("--stages", type=int, metavar="N", help="Number of stages (gauss, radau-iia, ..), as in gauss:N."),
+    _option(
+        "--order",
+        type=int,
+        metavar="N",
+        help="Order of a composition of Stoermer-Verlet: 2, 8 or 10.",
+    ),
     _option("--quadrature", metavar="NAME:N", help="Quadrature, as in gauss-legendre:8 or clenshaw-curtis:9."),
     _option("--nodes", metavar="NAME", help="Nodes: chebyshev-lobatto, legendre-lobatto or equispaced."),
     _option(
@@ -222,17 +236,35 @@ def model_arguments(command: Command, *, required: bool = True) -> Command:
     )(command)
 
 
+def _check_method(choices: Choices) -> None:
+    """Refuse options that the method given beside them does not take, or whose number its name gives otherwise."""
+    if choices.method is None:
+        return
+    said = specification_of(choices.method)
+    taken = ARGUMENTS[said["method"]]
+    for option in METHOD_CHOICES[1:]:
+        value = getattr(choices, option)
+        if value is not None and option not in taken:
+            takes = ", ".join(f"--{one}" for one in taken if one in METHOD_CHOICES) or "no options"
+            raise click.UsageError(f"--method {choices.method} takes no --{option}; it takes {takes}")
+        if value is not None and said.get(option, value) != value:
+            raise click.UsageError(
+                f"--method {choices.method} and --{option} {value} contradict each other: leave one of them out"
+            )
+
+
 def read_model(name: str, choices: Choices) -> Model:
     """The model of a file or of the catalogue, with the choices of the command line laid over it.
 
     Raises:
-        click.UsageError: if choices exclude each other.
+        click.UsageError: if choices exclude or contradict each other, or are none of the chosen method.
         ScviCodegenError: as reading and building the model do.
     """
     if choices.p is not None and choices.velocity is not None:
         raise click.UsageError("--p and --velocity exclude each other")
     if choices.span is not None and choices.steps is not None:
         raise click.UsageError("--span and --steps exclude each other")
+    _check_method(choices)
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
         return load_model(path, choices.sections())

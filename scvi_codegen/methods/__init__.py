@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from inspect import Parameter, signature
 from typing import Any
 
@@ -50,6 +50,7 @@ __all__ = [
     "default_method",
     "fitted",
     "method_from_specification",
+    "size_of",
     "sized",
     "specification_of",
 ]
@@ -113,25 +114,41 @@ def specification_of(name: str) -> dict[str, Any]:
     """What a name says of a method: ``{"method": "svi", "degree": 6}`` of ``"svi:6"``.
 
     Raises:
-        MethodError: for a number that is none or that the method does not take.
+        MethodError: for an unknown name, a number that is none or that the method does not take.
     """
     method, colon, number = name.partition(":")
-    size = _size_of(method)
-    if colon and not (size and number.isascii() and number.isdigit()):
-        raise MethodError(f"there is no method {name!r}: write svi, svi:6, gauss:3, stoermer-verlet, ..")
-    return {"method": method} | ({size: int(number)} if size and colon else {})
+    _check_name(method)
+    size = size_of(method)
+    if not colon:
+        return {"method": method}
+    if size is None:
+        raise MethodError(f"{name!r} is no method: no number follows {method}; it takes {_listed(ARGUMENTS[method])}")
+    if not (number.isascii() and number.isdigit()):
+        example = f"{method}:{DEFAULT_SIZE}"
+        raise MethodError(f"{name!r} is no method: a number, its {size}, follows the colon, as in {example}")
+    return {"method": method, size: int(number)}
 
 
 def sized(specification: Specification) -> Specification:
     """With the default degree, number of stages or order where a method needs one that is not given."""
     name = str(specification.get("method"))
-    size = _size_of(name)
+    size = size_of(name)
     needed = size is not None and size in REQUIRED[name]
     return {size: DEFAULT_SIZE, **specification} if needed and size else specification
 
 
-def _size_of(name: str) -> str | None:
+def size_of(name: str) -> str | None:
+    """What the number after a method's name is: ``"degree"`` of ``"svi"``, ``None`` of ``"explicit-euler"``."""
     return next((argument for argument in SIZES if argument in ARGUMENTS.get(name, ())), None)
+
+
+def _check_name(name: object) -> None:
+    if name not in METHODS:
+        raise MethodError(f"there is no method {name!r}{closest(str(name), METHODS)} Known: {', '.join(METHODS)}")
+
+
+def _listed(arguments: Sequence[str]) -> str:
+    return ", ".join(arguments) or "no arguments"
 
 
 def method_from_specification(specification: Specification) -> Method:
@@ -141,13 +158,12 @@ def method_from_specification(specification: Specification) -> Method:
         MethodError: on an unknown method, an argument it does not take, or one it needs.
     """
     arguments: dict[str, Any] = dict(specification)
-    name = arguments.pop("method", None)
-    if name not in METHODS:
-        raise MethodError(f"there is no method {name!r}{closest(str(name), METHODS)} Known: {', '.join(METHODS)}")
+    name: Any = arguments.pop("method", None)
+    _check_name(name)
     accepted = ARGUMENTS[name]
     for argument in arguments:
         if argument not in accepted:
-            raise MethodError(f"{name} takes no {argument!r}; it takes {', '.join(accepted) or 'no arguments'}")
+            raise MethodError(f"{name} takes no {argument!r}; it takes {_listed(accepted)}")
     for argument in {"degree", "stages", "order"} & set(arguments):
         checked_count(arguments[argument], argument, least=1, error=MethodError)
     if not isinstance(arguments.get("abscissae", ""), str | list | tuple):

@@ -220,7 +220,7 @@ def _spelt_out(section: Section) -> Section:
     spelt = _in_section("[method]", lambda: specification_of(name))
     for key, value in spelt.items():
         if key != "method" and section.get(key, value) != value:
-            raise ModelFileError(f"[method] {name} says {key} {value}, {key} = {section[key]!r} another")
+            raise ModelFileError(f"[method] method = {name!r} and {key} = {section[key]!r} contradict each other")
     return {**section, **spelt}
 
 

@@ -7,13 +7,20 @@ from itertools import chain
 from scvi_codegen.reproduce import claims, correction, theorems
 from scvi_codegen.reproduce.kepler import figures_13_to_20, figures_23_to_30, overview
 from scvi_codegen.reproduce.laboratory.experiment import Experiment
-from scvi_codegen.reproduce.oscillators import duffing, oscillator, oscillator_orders, pendulum, two_point_pendulum
+from scvi_codegen.reproduce.oscillators import (
+    duffing,
+    long_step,
+    oscillator,
+    oscillator_orders,
+    pendulum,
+    two_point_pendulum,
+)
 from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
 
 __all__ = ["EXPERIMENTS"]
 
 ORDER = """
-    theorem-2.1 table-1 table-2 table-3 table-4 figure-1
+    section-2.1 theorem-2.1 table-1 table-2 table-3 table-4 figure-1
     figure-2 table-5 figure-3 figure-4 figure-5 figure-6 figure-7 figure-8
     figure-9 figure-10 table-6 figure-11 figure-12 table-7
     figure-13 figure-14 figure-15 figure-16 figure-17 figure-18 figure-19 figure-20 table-8 table-9
@@ -22,8 +29,8 @@ ORDER = """
     correction claims
 """
 MODULES = (
-    *(overview, oscillator, oscillator_orders, pendulum, duffing, figures_13_to_20, figures_23_to_30, correction),
-    *(tableaux, properties, outlines, costs, iterations, two_point_pendulum, theorems, claims),
+    *(overview, oscillator, long_step, oscillator_orders, pendulum, duffing, figures_13_to_20, figures_23_to_30),
+    *(correction, tableaux, properties, outlines, costs, iterations, two_point_pendulum, theorems, claims),
 )
 
 

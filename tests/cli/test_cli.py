@@ -118,6 +118,8 @@ class TestHelp:
         [
             (["run", "out"], {"outer-solar-system"}),
             (["run", "kepler", "--method", "sv"], {"svi"}),
+            (["generate", "kepler", "--method", "svi:1"], {"svi:1", *(f"svi:{degree}" for degree in range(10, 17))}),
+            (["run", "kepler", "--method", "explicit-euler:"], set()),
             (["verify", "kepler", "--method", "radau"], {"radau-ia", "radau-iia"}),
             (["derive", "planar"], {"planar-pendulum"}),
             (["systems", "hen"], {"henon-heiles"}),
@@ -204,8 +206,13 @@ class TestChoices:
             ("kepler --p 0,1 --velocity 0,1", "--p and --velocity exclude each other"),
             ("kepler --span 1 --steps 1", "--span and --steps exclude each other"),
             ("kepler --method gaus", "did you mean 'gauss'?"),
-            ("kepler --method svi:6 --degree 4", "[method] svi:6 says degree 6, degree = 4 another"),
-            ("kepler --method svi:x", "there is no method 'svi:x'"),
+            ("kepler --method svi:6 --degree 4", "--method svi:6 and --degree 4 contradict each other"),
+            ("kepler --method gauss:3 --stages 2", "--method gauss:3 and --stages 2 contradict each other: leave one"),
+            ("kepler --method gauss:3 --degree 4", "--method gauss:3 takes no --degree; it takes --stages, --form"),
+            ("kepler --method svi:x", "'svi:x' is no method: a number, its degree, follows the colon, as in svi:8"),
+            ("kepler --method gauss:", "a number, its stages, follows the colon, as in gauss:8"),
+            ("kepler --method collocation:2", "no number follows collocation; it takes abscissae, form"),
+            ("kepler --method gaus:2", "did you mean 'gauss'?"),
             ("kepler --stages 3", "unknown key 'stages' in [method] for svi. Known: method, degree, quadrature"),
             ("kepler --quadrature gauss-legendre", "lacks its number of points"),
             ("kepler --degree x", "'x' is not a valid integer"),
@@ -430,7 +437,7 @@ class TestListings:
     def test_systems_lists_the_catalogue(self):
         text = output_of("systems")
         for name in PROBLEMS:
-            assert re.search(rf"^{name} ", text, re.MULTILINE)
+            assert re.search(rf"^{name}(\[:(degree|stages|order)\])? ", text, re.MULTILINE)
         assert "mu=1" in text
 
     def test_systems_prints_a_model_file(self):
@@ -440,8 +447,8 @@ class TestListings:
     def test_methods_lists_names_arguments_and_properties(self):
         text = output_of("methods")
         for name in METHODS:
-            assert re.search(rf"^{name} ", text, re.MULTILINE)
-        assert re.search(r"^svi +degree, quadrature, nodes, space +\S+ +8 +yes +yes$", text, re.MULTILINE)
+            assert re.search(rf"^{name}(\[:(degree|stages|order)\])? ", text, re.MULTILINE)
+        assert re.search(r"^svi\[:degree\] +degree, quadrature, nodes, space +\S+ +8 +yes +yes$", text, re.MULTILINE)
         assert re.search(r"^ +scvi-printed-\S+ +none claimed +no +no$", text, re.MULTILINE)
 
     def test_tableaux_in_radicals_and_in_decimals(self):

@@ -14,7 +14,7 @@ from scvi_codegen.reproduce.runner import Failure, run_experiments
 PAPER = {
     *(f"figure-{n}" for n in range(1, 31)),
     *(f"table-{n}" for n in range(1, 11)),
-    *("theorem-2.1", "theorem-4.1", "theorem-4.2", "theorem-4.3", "section-4.3", "claims", "correction"),
+    *("section-2.1", "theorem-2.1", "theorem-4.1", "theorem-4.2", "theorem-4.3", "section-4.3", "claims", "correction"),
 }
 
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import pickle
 
+import numpy as np
 import pytest
 import sympy
 
-from scvi_codegen.methods import SpectralCollocation
+from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.rendering import outline as c_outline
 from scvi_codegen.reproduce import claims
-from scvi_codegen.reproduce.laboratory import full_newton
+from scvi_codegen.reproduce.kepler import motion
+from scvi_codegen.reproduce.laboratory import full_newton, picard, readings, running
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Result, Verdict
 from scvi_codegen.reproduce.oscillators import two_point_pendulum as two_point
-from scvi_codegen.reproduce.paper_tables import costs, iterations, outlines, properties, tableaux
+from scvi_codegen.reproduce.paper_tables import costs, iteration_counts, iterations, outlines, properties, tableaux
 from scvi_codegen.reproduce.writing import statement
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.precision import mp
@@ -93,25 +95,61 @@ def test_a_verdict_on_costs_can_fail():
 
 
 def test_the_printed_iterations_are_those_of_the_paper():
-    table = iterations.printed_counts(8)
+    table = iteration_counts.printed_counts(8)
     assert (table[0.5, 2, "SVI"].largest, table[0.5, 2, "SVI"].total) == (10, 1520)
     assert (table[0.5, 5, "SC"].total, table[0.5, 5, "SVI"].total) == (1271, 1168)
     assert not table[0.5, 2, "SC"].converged
     assert sum(count.converged for count in table.values()) == 33
-    assert sum(count.converged for count in iterations.printed_counts(9).values()) == 24
+    assert sum(count.converged for count in iteration_counts.printed_counts(9).values()) == 24
 
 
 def test_full_newton_needs_four_iterations_a_step():
-    used = full_newton.newton_counts(iterations.KEPLER, iterations.SVI(5), *iterations._start(0.2), h=0.5, steps=200)
+    used = full_newton.newton_counts(motion.SYSTEM, SVI(5), *motion.perihelion(0.2), h=0.5, steps=200)
     assert (max(used), sum(used)) == (4, 800)
 
 
 def test_iterations_of_the_compiled_solvers():
-    fixed, newton = (iterations._count(0.2, 0.5, 5, "SVI", solver) for solver in iterations.SOLVERS)
-    assert fixed.total == pytest.approx(1216, rel=0.05)
-    assert newton.total == pytest.approx(675, rel=0.05)
-    failed = iterations._count(0.2, 1.0, 2, "SC", "fixed-point")
+    fixed, newton = (iteration_counts.compiled_count(0.2, 0.5, 5, "SVI", solver) for solver in iterations.SOLVERS)
+    assert fixed.total == pytest.approx(1354, rel=0.05)
+    assert newton.total == pytest.approx(735, rel=0.05)
+    failed = iteration_counts.compiled_count(0.2, 1.0, 3, "SC", "fixed-point")
     assert (failed.converged, failed.failure) == (False, "step 0: not converged")
+
+
+@pytest.mark.parametrize(("number", "cells", "by_points", "by_degree"), [(8, 50, 47, 46), (9, 40, 37, 35)])
+@pytest.mark.parametrize("tolerance", [1e-12, *(pytest.param(t, marks=pytest.mark.full) for t in (1e-14, 1e-9))])
+def test_picard_iteration_fails_where_the_tables_have_dashes(number, cells, by_points, by_degree, tolerance):
+    """Whatever the tolerance; and where steps are large and the points more than two, but for 2 of 56 cells."""
+    printed = iteration_counts.printed_counts(number)
+    found = [iteration_counts.picard_counts(number, reading, tolerance) for reading in readings.READINGS]
+    assert [iteration_counts.agreement(counts, printed).alike for counts in found] == [by_points, by_degree]
+    assert iteration_counts.agreement(found[0], printed).cells == cells
+    large = [key for key in printed if key[0] >= 1.0 and key[1] > 2]
+    assert sum(found[0][key].converged != printed[key].converged for key in large) == 1
+
+
+@pytest.mark.parametrize("degree", [1, 4, 9, 19])
+def test_picard_iteration_ends_in_the_compiled_step(degree):
+    """The exact force of Kepler's problem; independent of the project's solvers but for the tables."""
+    (q, v), rule = map(np.array, motion.perihelion(0.2)), f"gauss-legendre:{degree + 1}"
+    pairs = (
+        (picard.spectral_collocation(degree), SpectralCollocation(degree)),
+        (picard.galerkin(degree, degree + 1), SVI(degree, rule)),
+    )
+    for equations, method in pairs:
+        ends = picard.picard_step(
+            equations, iteration_counts.attraction, q, v, h=0.3, tolerance=1e-14, max_iterations=99
+        )
+        step = running.stepper_of(motion.SYSTEM, method).step(q, v, 0.3)
+        assert np.abs(np.array(ends[:2]) - step).max() < 1e-13
+
+
+def test_picard_iteration_that_does_not_converge_says_so():
+    q, v = map(np.array, motion.perihelion(0.2))
+    with pytest.raises(picard.NotSolvedError):
+        picard.picard_step(
+            picard.galerkin(1, 2), iteration_counts.attraction, q, v, h=5.0, tolerance=1e-14, max_iterations=1000
+        )
 
 
 def test_outlines_find_every_step_and_miss_what_is_not_there():

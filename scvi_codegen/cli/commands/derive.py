@@ -31,7 +31,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
 
     \b
     Examples:
-      scvi-codegen derive planar-pendulum --method svi --degree 1 --quadrature gauss-lobatto:2 --radicals
+      scvi-codegen derive planar-pendulum --method svi:1 --quadrature gauss-lobatto:2 --radicals
       scvi-codegen derive kepler --html kepler.html
     """
     if html is not None:

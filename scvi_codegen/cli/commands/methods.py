@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import click
 
 from scvi_codegen.cli.wording import table
-from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification
+from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification, size_of
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.nodes import Expressions
 from scvi_codegen.tables.precision import mp
@@ -30,7 +30,10 @@ LONGEST_EXACT = 32
 @click.command()
 @click.option("--tableau", metavar="NAME:S", help="Print a Butcher tableau instead, as in gauss:3.")
 def methods(tableau: str | None) -> None:
-    """List the methods with their arguments, and order, symplecticity and symmetry of an example of each."""
+    """List the methods with their arguments, and order, symplecticity and symmetry of an example of each.
+
+    A degree, number of stages or order may follow the name: --method svi:6 is --method svi --degree 6.
+    """
     click.echo(methods_table() if tableau is None else tableau_text(tableau))
 
 
@@ -39,7 +42,15 @@ def methods_table() -> str:
     rows = [("name", "arguments", "example", "order", "symplectic", "symmetric")]
     for name in METHODS:
         method = _example(name)
-        rows.append((name, ", ".join(ARGUMENTS[name]) or "none", method.name, *_properties(method)))
+        size = size_of(name)
+        rows.append(
+            (
+                f"{name}[:{size}]" if size else name,
+                ", ".join(ARGUMENTS[name]) or "none",
+                method.name,
+                *_properties(method),
+            )
+        )
         if "variational" in ARGUMENTS[name]:
             printed = method_from_specification({"method": name, **EXAMPLES[name], "variational": False})
             rows.append(("", "", printed.name, *_properties(printed)))

@@ -35,7 +35,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
 
     \b
     Examples:
-      scvi-codegen verify kepler --method scvi --degree 3
+      scvi-codegen verify kepler --method scvi:3
       scvi-codegen verify mine.toml
       scvi-codegen generate mine.toml -o mine_svi
       scvi-codegen verify mine_svi

@@ -24,7 +24,7 @@ from scvi_codegen.methods import (
 from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["curve_section", "tables_section"]
+__all__ = ["curve_section", "kronecker_form", "tables_section"]
 
 CAPTIONS = {
     "l": "l_j(tau_n): cardinal functions at the quadrature points",
@@ -124,7 +124,7 @@ def _(method: SpectralCollocation) -> Iterator[Content]:
         yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s; node 0 carries no equation.")
     else:
         yield _stages(method.form)
-    yield from _kronecker(method)
+    yield from kronecker_form(method)
 
 
 @_curve.register
@@ -166,7 +166,7 @@ def _nodal(degree: int) -> Iterator[Content]:
     yield Formula(sympy.Sum(Symbol("Q__j") * cardinal, (j, 0, s)), Function("q")(tau))
 
 
-def _kronecker(method: SpectralCollocation) -> Iterator[Content]:
+def kronecker_form(method: SpectralCollocation) -> Iterator[Paragraph | Formula]:
     """(18), (21) with letters for matrices; with all entries in ``StepEquations.matrix_form``."""
     s, m = method.degree, Symbol("m", integer=True, positive=True)
     A, a0 = MatrixSymbol("A", s, s), MatrixSymbol("a_0", s, 1)

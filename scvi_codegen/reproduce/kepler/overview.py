@@ -24,9 +24,10 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Result,
     TableBlock,
     holds,
+    judged,
 )
 from scvi_codegen.reproduce.laboratory.running import stepper_of, trajectory
-from scvi_codegen.reproduce.oscillators.one_degree import drift, judged, largest
+from scvi_codegen.reproduce.oscillators.one_degree import drift, largest
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto

@@ -36,6 +36,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Verdict,
     holds,
 )
+from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,17 +51,9 @@ STEPS = tuple(float(h) for h in np.geomspace(1e-3, 3.0, 36))
 Reading: TypeAlias = tuple[str, float, Callable[[int], int]]
 
 
-def _degree_of_points(n: int) -> int:
-    return n - 1
-
-
-def _degree_itself(n: int) -> int:
-    return n
-
-
 READINGS: tuple[Reading, ...] = (
-    ("circle, N points (degree N - 1)", CIRCLE, _degree_of_points),
-    ("e = 0.5, N the degree", ELLIPSE, _degree_itself),
+    ("circle, N points (degree N - 1)", CIRCLE, BY_POINTS.degree),
+    ("e = 0.5, N the degree", ELLIPSE, BY_DEGREE.degree),
 )
 PAPER_POWERS: Mapping[str, tuple[Line, ...]] = {
     "q1": ((1.5, 2), (1e-2, 4), (1e-5, 6), (1e-4, 8), (1e-8, 12)),

@@ -30,6 +30,7 @@ __all__ = [
     "Verdict",
     "common_verdict",
     "holds",
+    "judged",
 ]
 
 
@@ -46,6 +47,13 @@ class Verdict(Enum):
 def holds(condition: bool) -> Verdict:
     """``HOLDS`` or ``FAILS``."""
     return Verdict.HOLDS if condition else Verdict.FAILS
+
+
+def judged(*conditions: bool) -> Verdict:
+    """``HOLDS`` if all conditions do, ``FAILS`` if none does, else ``PARTLY``."""
+    if all(conditions):
+        return Verdict.HOLDS
+    return Verdict.PARTLY if any(conditions) else Verdict.FAILS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,6 +21,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     Result,
     TableBlock,
     holds,
+    judged,
 )
 from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
@@ -30,7 +31,6 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     drifts,
     energy_error,
     energy_table,
-    judged,
     largest,
     offset_from_curve,
 )

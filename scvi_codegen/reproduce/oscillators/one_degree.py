@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import MethodWarning
 from scvi_codegen.methods import SVI
 from scvi_codegen.reproduce.laboratory.drawing import largest_in_bins
-from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock, Verdict
+from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -24,7 +24,6 @@ __all__ = [
     "drifts",
     "energy_error",
     "energy_table",
-    "judged",
     "largest",
     "offset_from_curve",
     "svi_with_points",
@@ -41,13 +40,6 @@ def svi_with_points(degree: int, points: int) -> SVI:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MethodWarning)
         return SVI(degree, f"gauss-legendre:{points}")
-
-
-def judged(*conditions: bool) -> Verdict:
-    """``HOLDS`` if all conditions do, ``FAILS`` if none does, else ``PARTLY``."""
-    if all(conditions):
-        return Verdict.HOLDS
-    return Verdict.PARTLY if any(conditions) else Verdict.FAILS
 
 
 def energy_error(run: Trajectory) -> Array:

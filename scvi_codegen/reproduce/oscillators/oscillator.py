@@ -1,4 +1,4 @@
-"""Figures 3-6: the harmonic oscillator over many steps, and over one long step with growing degree."""
+"""Figures 3-5: the harmonic oscillator over many steps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.methods import SVI, SpectralCollocation
+from scvi_codegen.methods import SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import harmonic_oscillator
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
@@ -21,13 +21,13 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     TableBlock,
     Verdict,
     holds,
+    judged,
 )
-from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of, trajectory
+from scvi_codegen.reproduce.laboratory.running import trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
     curves_table,
     drifts,
     energy_error,
-    judged,
     largest,
     svi_with_points,
 )
@@ -47,7 +47,6 @@ TITLES = {
     "figure-3": "Harmonic oscillator: phase trajectories of SVI and SC, every fifth step",
     "figure-4": "Harmonic oscillator: position error of SVI and SC",
     "figure-5": "Harmonic oscillator: energy error of SVI and SC",
-    "figure-6": "Harmonic oscillator: error over one step h = 20 with growing degree",
 }
 
 DEGREE = 8
@@ -61,13 +60,6 @@ METHODS: dict[str, Method] = {
 SVI_LABEL = f"SVI, {DEGREE} Gauss points"
 VISIBLE = 2e-3
 """Of a picture's width: a line is not thinner."""
-
-LONG_STEP = 20.0
-DEGREES = {"SVI, s Gauss points": range(10, 31, 3), "SVI, s+1 Gauss points": range(10, 31, 3), "SC": range(10, 37, 3)}
-FITTED = (1e-13, 1e-1)
-"""Errors between which convergence is fitted: below is round-off, above the solution is not resolved."""
-PRINTED_BASES = {"SVI, s Gauss points": (1e14, 0.09), "SVI, s+1 Gauss points": (1e14, 0.09), "SC": (1e10, 0.21)}
-"""The lines of the paper's legend, C K^N, the steeper for SVI."""
 
 SYSTEM = "m = k = 1, q(0) = 0, p(0) = 1; the exact solution is q = sin t, p = cos t."
 NINE_POINTS = "9 Chebyshev points: degree 8."
@@ -232,133 +224,6 @@ def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
     axes.legend(loc="center right")
 
 
-@lru_cache
-def _refined(scheme: str) -> tuple[Array, Array]:
-    """Errors of q and of the energy after one step of h = 20, by degree."""
-    errors = []
-    for degree in DEGREES[scheme]:
-        stepper = stepper_of(OSCILLATOR, _of_degree(scheme, degree), "newton")
-        q, p = stepper.step(POSITION, VELOCITY, h=LONG_STEP, options=ROUNDOFF)
-        errors.append((abs(q[0] - np.sin(LONG_STEP)), abs(stepper.energy(q, p) - 0.5)))
-    of_q, of_energy = np.array(errors).T
-    return of_q, of_energy
-
-
-def _of_degree(scheme: str, degree: int) -> Method:
-    if scheme == "SC":
-        return SpectralCollocation(degree)
-    return SVI(degree, f"gauss-legendre:{degree + ('s+1' in scheme)}")
-
-
-def _fitted_base(degrees: Array, errors: Array) -> tuple[float, float] | None:
-    """(C, K) of the line C K^N through the errors that lie in ``FITTED``; ``None`` if there are too few."""
-    used = (errors > FITTED[0]) & (errors < FITTED[1])
-    if np.count_nonzero(used) < 3:
-        return None
-    slope, intercept = np.polyfit(degrees[used], np.log(errors[used]), 1)
-    return float(np.exp(intercept)), float(np.exp(slope))
-
-
-def _convergence(_: Mapping[str, Result]) -> Result:
-    errors = {scheme: _refined(scheme) for scheme in DEGREES}
-    degrees = {scheme: np.array(DEGREES[scheme], dtype=float) for scheme in DEGREES}
-    fits = {scheme: [_fitted_base(degrees[scheme], error) for error in errors[scheme]] for scheme in DEGREES}
-    rows = tuple(
-        (scheme, degree, float(of_q), float(of_energy))
-        for scheme in DEGREES
-        for degree, of_q, of_energy in zip(DEGREES[scheme], *errors[scheme], strict=True)
-    )
-    fitted = tuple(
-        (scheme, what, *(fit or (None, None)), *PRINTED_BASES[scheme])
-        for scheme in DEGREES
-        for what, fit in zip(("q", "energy"), fits[scheme], strict=True)
-    )
-    formats = {"error of q": ".2e", "error of the energy": ".2e", "C": ".1e", "printed C": ".0e"}
-    return Result(
-        name="figure-6",
-        title=TITLES["figure-6"],
-        setting=(
-            SYSTEM,
-            "One step, h = 20, errors at its end; N on the axis is the degree.",
-            "The caption gives no quadrature; SVI has as many Gauss points as the degree, s, and s + 1.",
-            "Newton's iteration to relative round-off: SC does not reach an absolute 1e-14 on a step this long.",
-            f"Lines C K^N are fitted to errors from {FITTED[0]:g} to {FITTED[1]:g}.",
-        ),
-        checks=(_geometric(fits), _bases(fits), _ahead(errors)),
-        tables=(
-            TableBlock(columns=("scheme", "N", "error of q", "error of the energy"), rows=rows, formats=formats),
-            TableBlock(
-                name="fits",
-                columns=("scheme", "error of", "C", "K", "printed C", "printed K"),
-                rows=fitted,
-                formats=formats,
-            ),
-        ),
-        picture=Picture(draw=partial(_draw_convergence, degrees, errors)),
-    )
-
-
-Fits = Mapping[str, list[tuple[float, float] | None]]
-
-
-def _geometric(fits: Fits) -> Comparison:
-    found = {
-        f"{what} of {scheme}": fit[1]
-        for scheme in fits
-        for what, fit in zip(("q", "energy"), fits[scheme], strict=True)
-        if fit
-    }
-    return Comparison(
-        claim="SVI and SC converge geometrically in the degree.",
-        measured=f"Fitted bases K: {', '.join(f'{key}: {base:.2f}' for key, base in found.items())}; the energy of SVI "
-        f"with s Gauss points has no error but round-off (at most {largest(_refined('SVI, s Gauss points')[1]):.0e}).",
-        verdict=judged(*(base < 0.5 for base in found.values())),
-        bears_on=("geometric",),
-    )
-
-
-def _bases(fits: Fits) -> Comparison:
-    pairs = {scheme: (fit[0][1], PRINTED_BASES[scheme][1]) for scheme, fit in fits.items() if fit[0]}
-    return Comparison(
-        claim="The errors follow 1e14 (0.09)^N (SVI) and 1e10 (0.21)^N (SC), the lines of the legend.",
-        measured="Fitted and printed K of q: "
-        + ", ".join(f"{scheme}: {base:.3f}, {printed:g}" for scheme, (base, printed) in pairs.items())
-        + "; bases that differ by less than 30 % count as the same. The constants are in the table.",
-        verdict=judged(*(abs(base / printed - 1.0) < 0.3 for base, printed in pairs.values())),
-    )
-
-
-def _ahead(errors: Mapping[str, tuple[Array, Array]]) -> Comparison:
-    """SVI against SC at the degrees that both have, where SC resolves the step and is above round-off."""
-    svi, sc = errors["SVI, s+1 Gauss points"], errors["SC"]
-    wins, cases = 0, 0
-    for ours, theirs in zip(svi, sc, strict=True):
-        compared = (theirs[: len(ours)] > FITTED[0]) & (theirs[: len(ours)] < FITTED[1])
-        wins += int(np.count_nonzero(compared & (ours < theirs[: len(ours)])))
-        cases += int(np.count_nonzero(compared))
-    return Comparison(
-        claim="SVI is more accurate than SC in configuration and energy at every N.",
-        measured=f"SVI with s + 1 Gauss points is more accurate in {wins} of {cases} errors of SC that lie between "
-        f"{FITTED[0]:g} and {FITTED[1]:g}.",
-        verdict=Verdict.HOLDS if wins == cases else Verdict.PARTLY if wins else Verdict.FAILS,
-        bears_on=("accuracy",),
-    )
-
-
-def _draw_convergence(degrees: Mapping[str, Array], errors: Mapping[str, tuple[Array, Array]], figure: Figure) -> None:
-    markers = dict(zip(errors, ("o-", "s--", "^-"), strict=True))
-    for axes, which, what in zip(panels(figure, 1, 2), (0, 1), ("q", "energy"), strict=True):
-        for scheme, pair in errors.items():
-            color = COLORS[scheme[:3].rstrip(",")]
-            shown = np.where(pair[which] > 0.0, pair[which], np.nan)
-            axes.semilogy(degrees[scheme], shown, markers[scheme], color=color, markersize=4, label=scheme)
-        for power, base, style in ((14, 0.09, ":"), (10, 0.21, "-.")):
-            line, label = 10.0**power * base ** degrees["SC"], f"paper: $10^{{{power}}}\\ {base:g}^N$"
-            axes.semilogy(degrees["SC"], line, style, color=COLORS["exact"], linewidth=1.0, label=label)
-        axes.set(xlabel="degree N", ylabel=f"error of {what}", ylim=(1e-17, 1e4))
-        axes.legend()
-
-
 def _listed(sizes: Mapping[str, float]) -> str:
     return ", ".join(f"{scheme}: {size:.1e}" for scheme, size in sizes.items())
 
@@ -367,6 +232,5 @@ RUNS = {
     "figure-3": _phase_trajectories,
     "figure-4": _position_errors,
     "figure-5": _energy_errors,
-    "figure-6": _convergence,
 }
 EXPERIMENTS = tuple(Experiment(name=name, title=TITLES[name], run=run) for name, run in RUNS.items())

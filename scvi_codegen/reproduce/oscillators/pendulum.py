@@ -14,7 +14,7 @@ from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.reproduce.laboratory.drawing import draw_error, draw_orbit, panels, thinned
-from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, holds
+from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, holds, judged
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import (
     area_change,
@@ -24,7 +24,6 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     drifts,
     energy_error,
     energy_table,
-    judged,
     largest,
 )
 from scvi_codegen.runtime.trajectory import Trajectory
