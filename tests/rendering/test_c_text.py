@@ -39,6 +39,8 @@ from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
 from scvi_codegen.rendering.source import Interface, Source
 
+pytestmark = pytest.mark.long
+
 C99 = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror".split()  # noqa: SIM905  (reads as one types it)
 CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as above)
 
