@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -9,18 +10,46 @@ from typing import Any
 import pytest
 from browsing import chromium
 from samples import Sample, compile_quickly, sample_named, stepper_for
-from tiers import mark_the_rest_full
+from tiers import DEFAULT, long_ones_first, mark_the_rest_full
 
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
+from scvi_codegen.native.building import FLAGS_VARIABLE
 from scvi_codegen.runtime.stepper import Stepper
 
+UNOPTIMISED = "-O0"
+
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What C text means, which most tests ask, does not depend on optimisation, of which compiling is mostly made."""
+    if config.option.markexpr == DEFAULT:
+        os.environ.setdefault(FLAGS_VARIABLE, UNOPTIMISED)
 
 
 @pytest.hookimpl(tryfirst=True)  # before those of the full tier are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     mark_the_rest_full(items)
+    long_ones_first(items)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """A file is run by one process: what its tests share is made once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False  # the order of `long_ones_first`
+    return LoadFileScheduling(config, log)
+
+
+@pytest.fixture(scope="module")
+def as_users_compile() -> Iterator[None]:
+    """With the flags that a stepper is given, for what depends on them: bits, round-off, long runs, documentation."""
+    with pytest.MonkeyPatch.context() as patch:
+        if os.environ.get(FLAGS_VARIABLE) == UNOPTIMISED:  # and not those of `test_builds.py`
+            patch.delenv(FLAGS_VARIABLE)
+        yield
 
 
 @pytest.fixture(scope="session")

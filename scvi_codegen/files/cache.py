@@ -3,7 +3,9 @@
 Anything in it can be made again, and is made again when it is missing or not what its checksum says. A checksum finds
 accidents; what protects from others is that nobody else may write here: a folder or an entry that every user of the
 machine may write is not used. When the entries are larger than ``$SCVI_CODEGEN_CACHE_SIZE`` (1G by default; 0: no
-limit), those used least recently are removed. Processes may do all this at once: entries come and go by renaming.
+limit), those used least recently are removed. To count thousands of entries takes as long as to compile one: a process
+counts them at its first, and again when it has written a share of what was free. Processes may do all this at once:
+entries come and go by renaming.
 """
 
 from __future__ import annotations
@@ -49,6 +51,10 @@ INTEGRATORS, TEXTS, REFERENCES = "_scvi_*", "texts/*.json", "references/*.npz"
 UNFINISHED = (".building-*", ".removed-*", "texts/.*", "references/.*")
 STALE_SECONDS = 3600
 """After which something unfinished is taken to be of a process that was killed; no compilation takes so long."""
+UNCOUNTED_SHARE = 1 / 16
+"""Of what is free: so much a process writes before it counts again."""
+_uncounted: dict[tuple[Path, int], float] = {}
+"""Bytes that this process may yet write before it counts, by folder and limit."""
 
 
 def cache_folder() -> Path:
@@ -159,11 +165,20 @@ def touch(entry: Path) -> None:
 
 
 def make_room(folder: Path, newest: Path) -> None:
-    """Remove the entries used least recently until all fit the limit, but never the ``newest``."""
-    _remove_unfinished(folder)
+    """Remove the entries used least recently until all fit the limit, but never the ``newest``, which was written now.
+
+    They are counted where this one may be too much: where it does not fit what was left uncounted.
+    """
     limit = size_limit()
-    if not limit:
-        return
+    left = _uncounted.get((folder, limit), 0.0) - _size(newest)
+    if left <= 0.0:
+        _remove_unfinished(folder)
+        left = (limit - _fit(folder, newest, limit)) * UNCOUNTED_SHARE if limit else float("inf")
+    _uncounted[folder, limit] = left
+
+
+def _fit(folder: Path, newest: Path, limit: int) -> int:
+    """Remove entries until all fit; the bytes of those that are left."""
     found = [(_last_use(path), _size(path), path) for path in _entries(folder) if path != newest]
     total = _size(newest) + sum(size for _, size, _ in found)
     for _, size, path in sorted(found):
@@ -171,6 +186,7 @@ def make_room(folder: Path, newest: Path) -> None:
             break
         discard(path)
         total -= size
+    return total
 
 
 def discard(entry: Path) -> None:
@@ -204,14 +220,15 @@ def _last_use(path: Path) -> float:
         return 0.0
 
 
-def _size(path: Path) -> int:
+def _size(path: Path | os.DirEntry[str]) -> int:
     """Bytes of a file, or of all in a folder that others may be removing."""
-    files = [path] if path.is_file() else [Path(place, name) for place, _, names in os.walk(path) for name in names]
-    total = 0
-    for file in files:
-        with suppress(OSError):
-            total += file.stat().st_size
-    return total
+    try:
+        if not path.is_dir():
+            return path.stat().st_size
+        with os.scandir(path) as inside:
+            return sum(map(_size, inside))
+    except OSError:
+        return 0
 
 
 def _readable(size: float) -> str:

@@ -76,6 +76,19 @@ class TestSize:
             assert answer(number) == number
             assert held(folder) == {number}
 
+    def test_entries_are_counted_once_while_there_is_room(self, folder, monkeypatch):
+        """And not for each that is written: there may be thousands."""
+        counted = []
+        fit = cache._fit
+        monkeypatch.setattr(cache, "_fit", lambda *given: counted.append(1) or fit(*given))
+        for number in range(3):
+            answer(number)
+        assert counted == [1]
+        monkeypatch.setenv(cache.SIZE_VARIABLE, str(5 * sc.cache_info().size))
+        for number in range(3, 5):  # a share of what is free has no room for one
+            answer(number)
+        assert counted == [1, 1, 1]
+
     def test_texts_and_reference_solutions_count(self, folder, monkeypatch):
         spring()
         (folder / "references").mkdir()
@@ -201,11 +214,10 @@ class TestClearing:
         assert not folder.exists()
 
     def test_what_killed_processes_left_is_removed_after_an_hour(self, folder):
-        answer(1)
         for name, age in ((".building-old", 7200), (".building-new", 60), (".removed-old", 7200)):
             (folder / name / "inside").mkdir(parents=True)
             os.utime(folder / name, (time.time() - age,) * 2)
-        answer(2)
+        answer(1)
         assert {path.name for path in folder.glob(".*")} == {".building-new"}
 
     def test_on_the_command_line(self, folder):

@@ -9,6 +9,8 @@ from scvi_codegen.ir import parts as cutting
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, Operation
 from scvi_codegen.native.building import PORTABLE_FLAGS
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 
 @pytest.fixture
 def cut_after(monkeypatch):

@@ -22,6 +22,8 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.native.building import TUNED_FLAGS
 
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
+
 SEPARABLE = ("planar-pendulum", "kepler")
 COUPLED = ("double-pendulum", "cart-pole")
 SYSTEMS = (

@@ -13,6 +13,8 @@ import pytest
 
 from scvi_codegen.native import building
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 ROOT = Path(__file__).parents[2]
 SANITIZERS = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer"
 

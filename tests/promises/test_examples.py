@@ -19,6 +19,8 @@ from scipy.optimize import brentq
 from scvi_codegen.cli import main
 from scvi_codegen.models.model_file import load_model
 
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
     "balanced_cart_pole",

@@ -9,6 +9,8 @@ import pytest
 from nbody_reference import integrate
 from outer_planets import GRAVITY, MASSES, POSITIONS, VELOCITIES
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 MODEL = Path(__file__).parents[2] / "examples" / "outer_solar_system.toml"
 SPAN = 200_000.0
 

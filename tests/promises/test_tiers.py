@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections import Counter
 from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from tiers import cover, first_of_each
+from tiers import DEFAULT, cover, first_of_each, long_ones_first
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])
@@ -24,3 +27,14 @@ def test_the_first_of_each_kind_is_in_the_default_tier() -> None:
     found = first_of_each(["a1", "a2", "b1", "a3", "b2"], key=lambda word: word[0])
     assert [one.values[0] for one in found if not one.marks] == ["a1", "b1"]
     assert [one.values[0] for one in found] == ["a1", "a2", "b1", "a3", "b2"]
+
+
+def test_files_marked_long_are_begun_first_and_others_keep_their_order():
+    items = [SimpleNamespace(name=name, get_closest_marker={"long": name.isupper() or None}.get) for name in "abCdE"]
+    long_ones_first(items)
+    assert "".join(item.name for item in items) == "CEabd"
+
+
+def test_the_default_tier_is_what_pytest_runs():
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
+    assert f"-m '{DEFAULT}'" in project["tool"]["pytest"]["ini_options"]["addopts"]

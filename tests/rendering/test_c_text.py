@@ -39,6 +39,8 @@ from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
 from scvi_codegen.rendering.source import Interface, Source
 
+pytestmark = pytest.mark.long
+
 C99 = "-std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror".split()  # noqa: SIM905  (reads as one types it)
 CXX = "-std=c++11 -Wall -Wextra -Wpedantic -Werror".split()  # noqa: SIM905  (as above)
 
@@ -67,6 +69,7 @@ METHODS = {
 }
 
 
+SHARES = 4
 TUNED = (SVI(3), Gauss(5), SpectralCollocation(4), SCVI(5, variational=False))
 
 
@@ -133,22 +136,32 @@ def tool(name: str) -> str:
     return name
 
 
+def share_of(method: str, share: int) -> list[Source]:
+    """Every fourth of the texts of a method: over the shares all of them."""
+    return [source for source, _ in generated(method).values()][share::SHARES]
+
+
+@pytest.mark.covering
+@pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
-def test_compiles_without_a_warning_to_pure_code(method, tmp_path):
+def test_compiles_without_a_warning_to_pure_code(method, share, tmp_path):
     """The objects export nothing but names with the prefix, and hold no data that could be written."""
-    files = write([source for source, _ in generated(method).values()], tmp_path)
+    files = write(share_of(method, share), tmp_path)
     run([tool("gcc"), *C99, "-O1", "-c", *files], tmp_path)
     if sys.platform == "linux":
         for file in files:
             check_symbols(Path(file).stem, tmp_path)
 
 
+@pytest.mark.covering
+@pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
-def test_clang_has_no_warning_either(method, tmp_path):
-    files = write([source for source, _ in generated(method).values()], tmp_path)
+def test_clang_has_no_warning_either(method, share, tmp_path):
+    files = write(share_of(method, share), tmp_path)
     run([tool("clang"), *C99, "-c", *files], tmp_path)
 
 
+@pytest.mark.covering(2)
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
@@ -211,13 +224,13 @@ def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_pa
     run([tool(compiler), *C99, "-c", *files], tmp_path)
 
 
+@pytest.mark.covering(2)
+@pytest.mark.parametrize("name", ["double-pendulum", "driven-duffing", "driven Hamiltonian"])
+@pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_tuned_builds_compile_without_a_warning(compiler, tmp_path):
+def test_tuned_builds_compile_without_a_warning(compiler, method, name, tmp_path):
     """With the vector instructions of this processor, and with glibc's vector functions where those are."""
-    names = ("double-pendulum", "driven-duffing")
-    sources = [generate_source(systems()[name], method)[0] for method in TUNED for name in names]
-    sources += [generate_source(driven_hamiltonian(), method)[0] for method in TUNED[:2]]
-    files = write(sources, tmp_path)
+    files = write([generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
         run([tool(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
 
@@ -302,7 +315,9 @@ def test_names_that_mean_something_in_c_do_no_harm(method, tmp_path):
     hostile = accepted(C_NAMES)
     plain = [f"name{k}" for k in range(len(hostile))]
     assert len(hostile) > 50
-    steppers = [compile_stepper(named_system(names), method, prefix="named") for names in (hostile, plain)]
+    steppers = [
+        compile_stepper(named_system(names), method, prefix="named", flags=QUICK_FLAGS) for names in (hostile, plain)
+    ]
     m = steppers[0].dimension
     results = [stepper.step(np.linspace(-0.5, 0.5, m), np.linspace(0.3, -0.2, m), 0.1) for stepper in steppers]
     np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-13)
@@ -424,25 +439,35 @@ def sanitizer(command: Sequence[str], folder: Path) -> None:
 BRIEFLY = [name for name in METHODS if name.startswith(("svi-3", "scvi", "sc-3", "gauss", "stoermer"))]
 
 
-@pytest.mark.parametrize("command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"])
-def test_method_families_pass_the_sanitizers(command, tmp_path):
-    sanitizer(command, tmp_path)
-    check_sanitized([generated(method)["pumped-cart-pole"] for method in BRIEFLY], command, tmp_path)
+SANITIZERS = pytest.mark.parametrize(
+    "command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"]
+)
 
 
-@pytest.mark.parametrize("command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"])
-def test_bands_and_kept_factors_pass_the_sanitizers(command, tmp_path):
+@pytest.mark.covering
+@SANITIZERS
+@pytest.mark.parametrize("method", BRIEFLY)
+def test_method_families_pass_the_sanitizers(command, method, tmp_path):
     sanitizer(command, tmp_path)
-    choices = [(5, SVI(8)), (12, SVI(3, "gauss-lobatto:4")), (12, SCVI(2)), (12, Gauss(3)), (9, SpectralCollocation(3))]
-    pairs = [generate_source(fput_chain(n), method, solver="newton") for n, method in choices]
-    assert all(interface.unknowns >= WORTH_REMEMBERING for _, interface in pairs)
-    files = write([source for source, _ in pairs], tmp_path)
-    run([tool(command[0]), *C99, "-c", *files], tmp_path)
-    check_sanitized(pairs, command, tmp_path)
+    check_sanitized([generated(method)["pumped-cart-pole"]], command, tmp_path)
+
+
+@pytest.mark.covering
+@SANITIZERS
+@pytest.mark.parametrize(
+    ("masses", "method"),
+    [(5, SVI(8)), (12, SVI(3, "gauss-lobatto:4")), (12, SCVI(2)), (12, Gauss(3)), (9, SpectralCollocation(3))],
+)
+def test_bands_and_kept_factors_pass_the_sanitizers(command, masses, method, tmp_path):
+    sanitizer(command, tmp_path)
+    source, interface = generate_source(fput_chain(masses), method, solver="newton")
+    assert interface.unknowns >= WORTH_REMEMBERING
+    run([tool(command[0]), *C99, "-c", *write([source], tmp_path)], tmp_path)
+    check_sanitized([(source, interface)], command, tmp_path)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("command", [ADDRESS, MEMORY], ids=["address and undefined behaviour", "uninitialised memory"])
+@SANITIZERS
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_passes_the_sanitizers_for_every_system(command, method, tmp_path):
     sanitizer(command, tmp_path)

@@ -11,6 +11,8 @@ import pytest
 
 import scvi_codegen as sc
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 CHECK = """
 #include "power.c"
 

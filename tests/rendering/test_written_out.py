@@ -14,6 +14,8 @@ from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.rendering import written_out
 from scvi_codegen.runtime.stepper import Stepper
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 GENERATED = Path(__file__).parents[2] / "generated" / "two_point_pendulum.c"
 TWO_POINTS = SCVI(1, "gauss-legendre:2")
 HAMILTONIAN = HamiltonianSystem.from_text(

@@ -21,6 +21,8 @@ from scvi_codegen.reproduce.oscillators import duffing, long_step, one_degree, o
 from scvi_codegen.reproduce.writing import draw
 from scvi_codegen.tables.precision import mp
 
+pytestmark = pytest.mark.long
+
 MODULES = (overview, oscillator, long_step, oscillator_orders, pendulum, duffing)
 EXPERIMENTS: dict[str, Experiment] = {e.name: e for module in MODULES for e in module.EXPERIMENTS}
 NOT_AS_PRINTED = {"figure-1", "figure-3", "figure-4", "figure-7", "figure-8"}

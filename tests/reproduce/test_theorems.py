@@ -32,6 +32,8 @@ from scvi_codegen.reproduce.theorems.convergence import (
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.tableau import collocation_tableau, radau_ia
 
+pytestmark = pytest.mark.long
+
 KEPLER = order_theorem.STEPS["kepler"]
 DEGREES = (2, 4, 6)
 

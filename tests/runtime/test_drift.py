@@ -8,6 +8,8 @@ import pytest
 import scvi_codegen as sc
 from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 STEPS = 2_000_000
 
 

@@ -30,6 +30,8 @@ from scvi_codegen.runtime.ensemble import Ensemble, integrate_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.stepper import Stepper
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 KINDS = {
     "separable": "kepler",
     "coupled": "double-pendulum",

@@ -18,6 +18,8 @@ from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.results.recording import record_run, resume_run
 from scvi_codegen.runtime.stepper import Stepper
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 LONG = 0.2
 """A step of the double pendulum on which sweeps fail now and then, and Newton's iteration does not."""
 

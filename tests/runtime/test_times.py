@@ -15,6 +15,8 @@ from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.times import times_after
 
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
 GRIDS = [(0.0, 0.1), (1e6, 0.1), (-3.7, 1e-3), (0.3, -0.7), (1e-3, 2.0**-20), (1e16, 3.0), (5.0, 1e-17)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -19,7 +20,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.runtime.stepper import Stepper
 
 
@@ -158,8 +159,12 @@ QUICK_FLAGS = ("-O1", *(flag for flag in TUNED_FLAGS if flag != "-O3"))
 """What users get, but for the optimisation of which most of the compilation time is made."""
 
 
-@cache
 def stepper_for(name: str, method: Method, *, solver: str = "auto", flags: tuple[str, ...] = QUICK_FLAGS) -> Stepper:
+    return _compiled_once(name, method, solver, flags, os.environ.get(FLAGS_VARIABLE, ""))
+
+
+@cache
+def _compiled_once(name: str, method: Method, solver: str, flags: tuple[str, ...], wanted: str) -> Stepper:
     return compile_stepper(sample_named(name).system, method, solver=solver, flags=flags)
 
 

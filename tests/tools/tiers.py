@@ -2,7 +2,8 @@
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
-``first_of_each`` does the like for one argument, by what its values have in common.
+``first_of_each`` does the like for one argument, by what its values have in common. ``pytest.mark.long`` on a file
+begins it before others, so that no process waits for another at the end.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ import pytest
 
 from scvi_codegen.methods.method import Method
 
-__all__ = ["cover", "family", "first_of_each", "mark_the_rest_full"]
+__all__ = ["DEFAULT", "cover", "family", "first_of_each", "long_ones_first", "mark_the_rest_full"]
+
+DEFAULT = "not full"
+"""The expression of the default tier, as in pyproject.toml."""
 
 Combination = tuple[tuple[str, int], ...]
 """Which value of each argument."""
@@ -50,6 +54,10 @@ def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
         for item, combination in zip(found, combinations, strict=True):
             if combination not in kept:
                 item.add_marker(pytest.mark.full)
+
+
+def long_ones_first(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
 
 
 def family(method: Method) -> tuple[object, ...]:

@@ -33,6 +33,8 @@ from scvi_codegen.verification import subject
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, Outcome, checked
 from scvi_codegen.verification.stepping import step_checks
 
+pytestmark = pytest.mark.long
+
 QUICK = (
     "numbers printed with 8 digits",
     "a slope five per cent off",
