@@ -152,7 +152,7 @@ class _Wish(NamedTuple):
     tolerance: float | None
 
 
-class _Plan(NamedTuple):
+class _Chosen(NamedTuple):
     """The steps to take, and what a run of them belies of what was promised, in words."""
 
     h: float | None
@@ -186,20 +186,20 @@ def _plan(
     wish: _Wish,
     motion: tuple[ArrayLike, ArrayLike, float],
     along: dict[str, Any],
-) -> _Plan:
+) -> _Chosen:
     """Steps for a wish, of a motion from (q, p) over a span."""
     if wish.h is not None:
-        return _Plan(wish.h, wish.rtol)
+        return _Chosen(wish.h, wish.rtol)
     if stepper.interface.energy_parameter:
         error = wish.rtol or 0.0
         tau = longest_step(stepper, *motion, error, **along)
-        return _Plan(tau, None, lambda run: too_wrong(run.step_error, run.step_error_t, error) or "")
+        return _Chosen(tau, None, lambda run: too_wrong(run.step_error, run.step_error_t, error) or "")
     advised = wish.tolerance if wish.tolerance is not None or _chooses(stepper) else ADVISED
     if wish.rtol is not None or uncompiled is None or advised is None:
-        return _Plan(None, wish.rtol)
+        return _Chosen(None, wish.rtol)
     (system, method), (q, p, span) = uncompiled, motion
     h = advise(system, method, q, p, span, advised, **along).h
-    return _Plan(h, None, lambda run: broken_promise(system, run, advised))
+    return _Chosen(h, None, lambda run: broken_promise(system, run, advised))
 
 
 INSTEAD = {
@@ -225,7 +225,7 @@ def _chooses(stepper: Stepper) -> bool:
     return True
 
 
-def _steps(stepper: Stepper, start: float, end: float, plan: _Plan) -> dict[str, Any]:
+def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[str, Any]:
     """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
     if plan.rtol is not None or plan.h is None:
         return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}

@@ -120,7 +120,7 @@ def test_without_data_the_inputs_are_nought(model, tmp_path):
     folder = generate_package(replace(model, inputs={}), tmp_path / "still")
     states, _ = states_printed(folder)
     run = compile_stepper(model.system, model.method).integrate(
-        model.q, states[0, 2:3], h=0.03, steps=round(2.3 / 0.03), parameters={"c": 0.2}
+        model.q, states[0, 2:3], h=0.03, steps=round(2.3 / 0.03), parameters={"c": 0.2, "u_0": 0.0, "w_0": 0.0}
     )
     assert (np.isin(states[:, 0], run.t)).all()
 

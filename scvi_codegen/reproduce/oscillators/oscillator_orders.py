@@ -86,7 +86,7 @@ SETTING = (
 )
 
 
-class Fit(NamedTuple):
+class PowerLaw(NamedTuple):
     """The line constant h^power."""
 
     constant: float
@@ -119,16 +119,16 @@ def _collected(errors: Sequence[Mapping[str, float]]) -> dict[str, Array]:
     return {what: np.array([float(error[what]) for error in errors]) for what in ("q", "energy")}
 
 
-def fitted_power(what: str, method: Method) -> Fit | None:
+def fitted_power(what: str, method: Method) -> PowerLaw | None:
     """The line through the errors of small steps; ``None`` where the method makes none."""
     errors = _exact_errors(method, FITTED)[what]
     if errors.max() < NO_ERROR:
         return None
     power, intercept = np.polyfit(np.log(FITTED), np.log(errors), 1)
-    return Fit(float(np.exp(intercept)), float(power))
+    return PowerLaw(float(np.exp(intercept)), float(power))
 
 
-def _fits(what: str, variant: Variant) -> dict[tuple[str, int], Fit | None]:
+def _fits(what: str, variant: Variant) -> dict[tuple[str, int], PowerLaw | None]:
     """By scheme and N."""
     return {(scheme, n): fitted_power(what, variant.method(scheme, n)) for scheme in SCHEMES for n in LEGEND}
 
