@@ -36,7 +36,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """A file is run by one process: what its tests share is made once."""
+    """Of the whole default tier a file is run by one process: what its tests share is made once."""
+    if config.option.markexpr != DEFAULT or config.args_source is not config.ArgsSource.TESTPATHS:
+        return None
     from xdist.scheduler import LoadFileScheduling
 
     config.option.loadscopereorder = False  # the order of `long_ones_first`

@@ -213,6 +213,7 @@ def test_headers_serve_c_plus_plus(tmp_path):
     run([str(tmp_path / "main")], tmp_path)
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_path):
@@ -224,7 +225,7 @@ def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_pa
     run([tool(compiler), *C99, "-c", *files], tmp_path)
 
 
-@pytest.mark.covering(2)
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["double-pendulum", "driven-duffing", "driven Hamiltonian"])
 @pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
