@@ -16,7 +16,7 @@ from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.kinds import SWITCH, of, takes
-from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
@@ -79,6 +79,7 @@ def solve_motion(
     tolerance: float | None = None,
     rtol: float | None = None,
     monitor: str | Expr | None = None,
+    controller: str | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
     events: EventLike | Sequence[EventLike] | None = None,
@@ -106,6 +107,8 @@ def solve_motion(
         monitor: g of :func:`reparametrise`: by equal steps of tau, dt = g dtau, symplectic and of variable length in t.
             ``h`` is then of tau; without it :func:`longest_step` finds one for ``rtol``. A run with steps that do not
             keep it is no success.
+        controller: ``"reversible"``: the monitor is that of :func:`compile_stepper`, for systems that depend on time or
+            on which forces act, too; ``"symplectic"``, by default, that of :func:`reparametrise`.
         t_eval: (n,) times at which states are wanted; by default the ends of the steps.
         dense_output: whether ``sol`` is wanted, for which all steps are kept.
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
@@ -121,12 +124,10 @@ def solve_motion(
         raise StateError("args are the parameters in order: give args or parameters, not both")
     parameters = parameters if args is None else args
     start, end = _span(t_span)
-    q: ArrayLike
-    given: ArrayLike | None
-    q, given = (y0, None) if velocity is not None else _halves(y0)
+    q, given = _halves(y0) if velocity is None else (y0, None)
     asked = None if t_eval is None else times_of_run(t_eval, start, end)
     wish = _Wish(h, rtol, tolerance)
-    stepper, uncompiled = _stepper(system, method, monitor, wish)
+    stepper, uncompiled = _stepper(system, method, (monitor, controller), wish)
     p = stepper.momenta_given(q, given, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, wish, (q, p, end - start), along)
@@ -161,19 +162,22 @@ class _Chosen(NamedTuple):
 
 
 def _stepper(
-    system: MechanicalSystem | Stepper, method: Method | str | None, monitor: str | Expr | None, wish: _Wish
+    system: MechanicalSystem | Stepper,
+    method: Method | str | None,
+    pace: tuple[str | Expr | None, str | None],
+    wish: _Wish,
 ) -> tuple[Stepper, tuple[MechanicalSystem, Method] | None]:
-    """The stepper, and of what it was compiled if it was not given."""
-    if wish.tolerance is not None and (wish.h is not None or wish.rtol is not None or monitor is not None):
+    """The stepper, and of what it was compiled if it was not given; ``pace`` is a monitor and its controller."""
+    if wish.tolerance is not None and (wish.h is not None or wish.rtol is not None or pace != (None, None)):
         raise StateError(
             "a tolerance of the end chooses steps of one length, h gives it, rtol lets each choose its own: give one, "
             "and of h and rtol with a monitor"
         )
     if not isinstance(system, Stepper):
-        system = system if monitor is None else reparametrise(system, monitor)
+        system, monitor = with_monitor(system, *pace)
         chosen = default_method(system) if method is None else as_method(method, system)
-        return compile_stepper(system, chosen), (system, chosen)
-    if method is not None or monitor is not None or wish.tolerance is not None:
+        return compile_stepper(system, chosen, monitor=monitor), (system, chosen)
+    if method is not None or pace != (None, None) or wish.tolerance is not None:
         raise StateError(
             "a compiled stepper has its method and monitor, and its step is h, or its own: leave out tolerance"
         )
@@ -190,7 +194,7 @@ def _plan(
     """Steps for a wish, of a motion from (q, p) over a span."""
     if wish.h is not None:
         return _Chosen(wish.h, wish.rtol)
-    if stepper.interface.energy_parameter:
+    if _paced(stepper):
         error = wish.rtol or 0.0
         tau = longest_step(stepper, *motion, error, **along)
         return _Chosen(tau, None, lambda run: too_wrong(run.step_error, run.step_error_t, error) or "")
@@ -216,6 +220,11 @@ def _refuse(given: Mapping[str, float | None]) -> None:
             raise StateError(f"solve_motion has no {name}={value!r}: {INSTEAD[name]}")
 
 
+def _paced(stepper: Stepper) -> bool:
+    """Whether its steps are of tau."""
+    return bool(stepper.interface.energy_parameter or stepper.interface.monitor)
+
+
 def _chooses(stepper: Stepper) -> bool:
     """Whether its steps can choose their length."""
     try:
@@ -229,8 +238,9 @@ def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[st
     """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
     if plan.rtol is not None or plan.h is None:
         return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
-    if stepper.interface.energy_parameter:
-        return {"h": math.copysign(checked_step(plan.h), end - start), "t_end": end}
+    if _paced(stepper):
+        sign = 1.0 if stepper.interface.monitor else end - start
+        return {"h": math.copysign(checked_step(plan.h), sign), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}
 
@@ -269,7 +279,7 @@ def _span(t_span: Sequence[float]) -> tuple[float, float]:
     return start, end
 
 
-def _halves(y0: ArrayLike) -> tuple[Array, Array]:
+def _halves(y0: ArrayLike) -> tuple[ArrayLike, ArrayLike | None]:
     try:
         y = np.array(y0, dtype=float)
     except (TypeError, ValueError) as error:

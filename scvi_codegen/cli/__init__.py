@@ -39,6 +39,7 @@ ABOUT = {
     "bench": "Measure this project against other integrators.",
     "cache": "Show or clear the cache of compiled integrators.",
     "derive": "Print the equations of one step of MODEL.",
+    "doctor": "Say what this machine has and lacks, and what to install.",
     "export": "Make one file of a run in a folder.",
     "generate": "Write MODEL as C and as a Python package.",
     "methods": "List the methods and their properties.",

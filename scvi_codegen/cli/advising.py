@@ -9,7 +9,6 @@ import click
 
 from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.wording import duration
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -39,17 +38,16 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
     """The model with step and number of steps for an error at the end; prints why, and warnings to stderr.
 
     Raises:
-        StateError: in transformed time, if the tolerance is not positive, every pilot run fails, or very many steps are
+        StateError: with a monitor, if the tolerance is not positive, every pilot run fails, or very many steps are
             needed.
     """
-    if model.system.clock is not None:
+    if model.paced:
         raise StateError("steps of tau are chosen by the error of a step: give --tolerance in place of --advise")
-    stepper = compile_stepper(model.system, model.method, solver=solver)
     advice = advise(
         model.system,
         model.method,
         model.q,
-        model.momenta(stepper),
+        model.momenta(model.stepper(solver=solver)),
         model.covered,
         tolerance,
         t=model.t,

@@ -14,6 +14,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.reparametrisation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import catalogue_model, load_model
@@ -55,6 +56,7 @@ class Choices:
     steps: int | None
     every: int | None
     monitor: str | None = None
+    controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
 
     def sections(self) -> dict[str, dict[str, Any]]:
@@ -63,7 +65,7 @@ class Choices:
             "system": {"monitor": self.monitor},
             "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
             "method": {name: getattr(self, name) for name in METHOD_CHOICES},
-            "run": {"step": self.step, "span": self.span, "steps": self.steps, "every": self.every},
+            "run": {name: getattr(self, name) for name in ("step", "span", "steps", "every", "controller")},
             "parameters": dict(self.parameter),
             "inputs": dict(self.inputs or ()),
         }
@@ -211,6 +213,11 @@ STATE_OPTIONS = (
         "--monitor",
         metavar="G",
         help="Steps of one length in tau, dt = G dtau: frequency, distance, potential, arclength or a formula.",
+    ),
+    _option(
+        "--controller",
+        type=click.Choice(CONTROLLERS),
+        help="With --monitor: symplectic (so unless said), for motions that conserve energy; or reversible, for all.",
     ),
 )
 

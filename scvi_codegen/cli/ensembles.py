@@ -14,7 +14,6 @@ from scvi_codegen.cli.conservation import momentum_report
 from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -62,7 +61,7 @@ def integrate_states(
     """
     model, began = states.model, time.perf_counter()
     check_memory(model, len(states))
-    stepper = compile_stepper(model.system, model.method, solver=solver)
+    stepper = model.stepper(solver=solver)
     work = _work(model, stepper, states, options)
     started, shown, interrupted = time.perf_counter(), 0, False
     length = work.length

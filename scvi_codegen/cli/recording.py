@@ -17,7 +17,6 @@ import numpy as np
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.running import conserved, final_state
 from scvi_codegen.cli.wording import counted, duration
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
 from scvi_codegen.models.model import Model
@@ -138,7 +137,7 @@ class Recording:
             text = dump_model(model)
         if model.system.clock is not None and model.ends_at_time:
             raise click.UsageError("in transformed time a folder holds a number of steps: give --step and --steps")
-        run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
+        run = model.start(model.stepper(solver=solver), options=options)
         return self._watched(
             record_run,
             run,
@@ -197,7 +196,8 @@ def standing(recorded: RecordedRun) -> str:
     manifest = recorded.manifest
     done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
     if manifest.goal:
-        way = f"{done} of their own lengths from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
+        how = f"of {manifest.goal.tau:g} in tau" if manifest.goal.tau else "of their own lengths"
+        way = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
         way += "" if recorded.finished else f" (of {manifest.goal.t_end:g})"
     else:
         far = "all" if recorded.finished else f"of {manifest.steps}"

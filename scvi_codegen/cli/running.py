@@ -14,7 +14,6 @@ from scvi_codegen.cli.conservation import energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration, in_known_digits
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
@@ -84,7 +83,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     """
     check_memory(model)
     began = time.perf_counter()
-    run = model.start(compile_stepper(model.system, model.method, solver=solver), options=options)
+    run = model.start(model.stepper(solver=solver), options=options)
     if model.system.clock is not None and model.ends_at_time:
         return _by_clock(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
@@ -94,13 +93,15 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             pieces.append(work.stretch(steps))
             if work.failure is not None or work.stopped:
                 break
+    trajectory = DrivenTrajectory(tuple(pieces)) if model.system.inputs else pieces[0]
     return RunOutcome(
-        trajectory=DrivenTrajectory(tuple(pieces)) if model.system.inputs else pieces[0],
+        trajectory=trajectory,
         run=run,
         preparation=preparation,
         seconds=work.seconds,
         failure=work.failure,
         interrupted=work.stopped,
+        broken=_broken(model, trajectory),
     )
 
 
@@ -162,9 +163,6 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
             trajectory = observed.advance(None, look, lambda: bool(caught))
         except StepFailedError as error:
             failure, trajectory = error, Trajectory.before(error)
-    broken = None
-    if model.tolerance is not None:
-        broken = too_wrong(trajectory.step_error, trajectory.step_error_t, model.tolerance)
     return RunOutcome(
         trajectory=trajectory,
         run=run,
@@ -172,8 +170,15 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
         seconds=time.perf_counter() - began,
         failure=failure,
         interrupted=bool(caught) and not observed.ended,
-        broken=broken,
+        broken=_broken(model, trajectory),
     )
+
+
+def _broken(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
+    """What is to be said where the step of tau was chosen by the first steps, and others belie it."""
+    if model.tolerance is None or not model.paced:
+        return None
+    return too_wrong(trajectory.step_error, trajectory.step_error_t, model.tolerance)
 
 
 def _length(model: Model) -> int:
@@ -188,7 +193,7 @@ def _reached(model: Model, run: Run) -> int:
 
 def _by_time(model: Model) -> bool:
     """Whether the number of steps is not known before."""
-    return model.h is None or bool(model.system.inputs)
+    return model.ends_at_time or bool(model.system.inputs)
 
 
 def summary(model: Model, outcome: RunOutcome) -> str:
@@ -222,6 +227,8 @@ def of_length(h: float | None, run: Run) -> str:
     """How long the steps of a run are."""
     if run.stepper.interface.energy_parameter:
         return f"of {run.h:g} in tau"
+    if run.goal and run.goal.tau:
+        return f"of {run.goal.tau:g} in tau by the reversible controller"
     return f"of their own lengths ({run.rejected} rejected)" if run.goal or h is None else f"of {h:g}"
 
 

@@ -12,6 +12,8 @@ state. Time is the integral of g along the curve, summed by the method's own qua
 Sources: S. Reich, SIAM J. Numer. Anal. 36 (1999); E. Hairer, Appl. Numer. Math. 25 (1997); V. Duruisseaux, J. Schmitt,
 M. Leok, SIAM J. Sci. Comput. 43 (2021), where the singular p_t direction of K = g (H + p_t) rules a Lagrangian out;
 with p_t = -E constant it does not.
+
+A monitor may leave the system as it is, too, and choose the steps of its runs: see :func:`with_monitor`.
 """
 
 from __future__ import annotations
@@ -30,10 +32,14 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.monitors import monitor_function
 from scvi_codegen.mechanics.system import SYSTEM, Clock, MechanicalSystem
 
-__all__ = ["reparametrise"]
+__all__ = ["CONTROLLERS", "reparametrise", "with_monitor"]
+
+CONTROLLERS = ("symplectic", "reversible")
+"""What a monitor may do: transform the time of a system, or control the steps of its runs."""
 
 ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
 """Of the parameter that is the energy: the first that is free."""
+REVERSIBLE = 'the reversible controller: compile_stepper(..., monitor=...), controller = "reversible" in [run]'
 
 
 @takes(system=SYSTEM)
@@ -63,12 +69,12 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
     if system.depends_on_time:
         raise SystemDefinitionError(
             f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or "
-            "compile_stepper(..., monitor=...), the reversible controller"
+            f"{REVERSIBLE}"
         )
     if system.forces:
         raise SystemDefinitionError(
             f"forces act on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
-            "controlled steps (t_end=...), or compile_stepper(..., monitor=...), the reversible controller"
+            f"controlled steps (t_end=...), or {REVERSIBLE}"
         )
     if system.constraints:
         raise SystemDefinitionError(
@@ -93,6 +99,37 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
     assert isinstance(named, LagrangianSystem)
     slowed = named.lagrangian.xreplace({v: v / rate for v in named.velocities})
     return replace(named, lagrangian=_distributed(rate, slowed + level))
+
+
+def with_monitor(
+    system: MechanicalSystem, monitor: str | Expr | None, controller: str | None = None
+) -> tuple[MechanicalSystem, str | Expr | None]:
+    """A system whose pace a monitor sets, and the monitor where its stepper is to be compiled with it.
+
+    Args:
+        system: what moves.
+        monitor: g of dt = g dtau, or ``None`` for steps without one.
+        controller: ``"symplectic"`` (also ``None``): the system in transformed time, :func:`reparametrise`;
+            ``"reversible"``: as it is, for ``compile_stepper(..., monitor=...)``. Source of the names: E. Hairer,
+            Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2 and VIII.3.
+
+    Raises:
+        SystemDefinitionError: for a controller without a monitor, or that there is not, and as :func:`reparametrise`.
+    """
+    if controller is not None and controller not in CONTROLLERS:
+        raise SystemDefinitionError(f"a controller is {' or '.join(CONTROLLERS)}, not {controller!r}")
+    if monitor is None:
+        if controller is not None:
+            raise SystemDefinitionError(f'the {controller} controller wants a monitor: "frequency", or a formula')
+        return system, None
+    if controller != "reversible":
+        return reparametrise(system, monitor), None
+    if system.clock is not None:
+        raise SystemDefinitionError(
+            f"the time of '{system.name}' is transformed already: its steps have one controller"
+        )
+    monitor_function(system, monitor, in_time=True)  # refused here, not when the first step is wanted
+    return system, monitor
 
 
 def _distributed(factor: Expr, total: Expr) -> Expr:

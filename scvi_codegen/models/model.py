@@ -43,11 +43,13 @@ class Model:
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
         h: step size, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given. In transformed time
-            steps are of tau.
+            steps are of tau, as with a monitor.
         tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off. In
-            transformed time :func:`longest_step` chooses one length of tau for it.
+            transformed time, and with a monitor, :func:`longest_step` chooses one length of tau for it.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps of h, or ``None`` if ``span`` is given.
+        monitor: of the reversible controller, as text, see :func:`~scvi_codegen.compile_stepper`; its runs have a span.
+            A system in transformed time has its own.
         every: distance between kept states in steps.
         t: initial time.
         inputs: of a system that has any, by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as
@@ -67,6 +69,7 @@ class Model:
     tolerance: float | None = None
     span: float | None = None
     steps: int | None = None
+    monitor: str | None = None
     every: int = 1
     t: float = 0.0
     inputs: Mapping[str, InputTable] = field(default_factory=dict, hash=False)
@@ -114,17 +117,23 @@ class Model:
         """
         if self.steps is not None:
             return self.steps
-        if self.h is not None and self.ends_at_time:
+        step = self.step
+        if self.ends_at_time:
             raise ModelFileError(
                 "how many steps of tau a span takes is not known before: give steps (--steps) for this"
             )
         assert self.span is not None  # by construction
-        return max(1, round(self.span / abs(self.step)))
+        return max(1, round(self.span / abs(step)))
 
     @property
     def ends_at_time(self) -> bool:
         """Whether it is a time that ends the run, after a number of steps that is not known before."""
-        return self.h is None or (self.system.clock is not None and self.span is not None)
+        return self.h is None or (self.paced and self.span is not None)
+
+    @property
+    def paced(self) -> bool:
+        """Whether a monitor sets the pace, so that a step, if one is given, is of tau."""
+        return self.monitor is not None or self.system.clock is not None
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -137,6 +146,8 @@ class Model:
         """The step h, for what works with steps of one length; ModelFileError where there is none."""
         if self.h is None:
             raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
+        if self.monitor is not None:
+            raise ModelFileError("the reversible controller chooses how long steps are: leave it out for this")
         return self.h
 
     @property
@@ -146,6 +157,12 @@ class Model:
             assert self.span is not None  # by construction
             return self.span
         return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
+
+    def stepper(self, *, solver: str = "auto") -> Stepper:
+        """Compiled for the runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
+        from scvi_codegen.compiler import compile_stepper  # here: reading a model does not wait for it
+
+        return compile_stepper(self.system, self.method, solver=solver, monitor=self.monitor)
 
     def momenta(self, stepper: Stepper) -> Array:
         """(m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
@@ -202,25 +219,33 @@ class Model:
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
         """The run of this model from its initial state, to be advanced by :attr:`step_count` steps or to its end."""
         p, h = self.momenta(stepper), self.h
-        if h is None and self.system.clock is not None:
+        if h is None and self.paced:
             from scvi_codegen.runtime.longest_step import longest_step  # here: reading a model does not wait for NumPy
 
             assert self.tolerance is not None  # by construction
+            if self.system.inputs:
+                raise ModelFileError("with inputs no pilot run finds a step of tau: give one (--step, [run] step)")
             h = longest_step(
                 stepper, self.q, p, self.covered, self.tolerance, t=self.t, parameters=self.parameters, options=options
             )
+        to_end = h is None or self.monitor is not None
         return stepper.start(
             self.q,
             p,
-            h=h,
+            h=abs(h) if h is not None and to_end else h,
             t=self.t,
-            t_end=self.t + self.covered if h is None else None,
+            t_end=self.t + self.covered if to_end else None,
             tolerance=self.tolerance or None if h is None else None,
             parameters=self.parameters_at_start(stepper),
             options=options,
         )
 
     def _check_length(self) -> None:
+        if self.monitor is not None and (self.system.clock is not None or self.span is None):
+            raise ModelFileError(
+                f"the reversible controller of the monitor {self.monitor} takes steps that lead to a time (give span, "
+                "not steps), of a system whose time is not transformed"
+            )
         if self.h is None:
             self._check_tolerance()
             return

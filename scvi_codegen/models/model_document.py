@@ -32,8 +32,8 @@ def document_of(model: Model) -> dict[str, Any]:
         document["forces"] = acting
     if system.constraints:
         document["system"]["constraints"] = [system.text_of(g) for g in system.constraints]
-    if clock:
-        document["system"]["monitor"] = clock.monitor
+    if monitor := clock.monitor if clock else model.monitor:
+        document["system"]["monitor"] = monitor
     if system.inputs:
         document["system"]["inputs"] = list(system.inputs)
     if model.inputs:
@@ -55,7 +55,8 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification.items()}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
     step = {"tolerance": model.tolerance} if model.h is None else {"step": model.h}
-    run = {**step, **length, "every": model.every}
+    controller = {"controller": "reversible"} if model.monitor else {}
+    run = {**step, **controller, **length, "every": model.every}
     return {"initial": {"t": model.t, **initial}, "method": method, "run": run}
 
 

@@ -40,6 +40,7 @@
     span = 100.0                                        # length of time, or steps = 200
                                                         # or tolerance = 1e-9 (0, and without both: round-off): steps
                                                         # choose their length; then a negative span goes back
+    # controller = "reversible"                         # of a monitor: time as it is, steps whose density it carries
     every = 1                                           # distance between kept states; left out: 1
 
 A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
@@ -67,7 +68,7 @@ from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, fitted, method_from_specification, sized, specification_of
 from scvi_codegen.models.model import DEFAULT_METHOD, Model, check_length, real
@@ -85,7 +86,7 @@ Document = Mapping[str, Section]
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "constraints")
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
-RUN_KEYS = ("step", "tolerance", "span", "steps", "every")
+RUN_KEYS = ("step", "tolerance", "controller", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance"}, {"span", "steps"})
@@ -175,14 +176,11 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     if entry is None:
         _check_complete(document)
         _check_used(document, given.get("parameters", {}))
-    system = _read_system(document, entry)
-    if "monitor" in document["system"]:
-        monitor = _text(document["system"], "monitor", "[system]")
-        system = _in_section("[system]", lambda: reparametrise(system, monitor))
+    system, monitor = _read_monitor(_read_system(document, entry), document)
     state = _read_state(document["initial"], system)
     method = _read_method(fitted(document["method"], system))
     inputs = _read_inputs(document.get("inputs", {}), folder)
-    return Model(system=system, method=method, inputs=inputs, **state, **_read_run(document["run"]))
+    return Model(system=system, method=method, monitor=monitor, inputs=inputs, **state, **_read_run(document["run"]))
 
 
 def _chosen_method(document: Document, given: Document) -> Section:
@@ -300,6 +298,11 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     return _in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 
+def _read_monitor(system: MechanicalSystem, document: Document) -> tuple[MechanicalSystem, Any]:
+    monitor, controller = document["system"].get("monitor"), document["run"].get("controller")
+    return _in_section("[system] monitor", lambda: with_monitor(system, monitor, controller))
+
+
 def _names(section: Section, key: str) -> list[str]:
     names = _required(section, key, "[system]")
     if not isinstance(names, list) or not all(isinstance(item, str) for item in names):
@@ -349,19 +352,17 @@ def _read_run(section: Section) -> dict[str, Any]:
     _check_one(section, "run", "step", "tolerance")
     _check_one(section, "run", "span", "steps")
     fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
-    numbers = {field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section}
+    found: dict[str, Any] = {
+        field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
+    }
     if not {"step", "tolerance"} & section.keys():
         if "steps" in section:
             raise ModelFileError("[run] has steps and no step, which says how long they are")
-        numbers["tolerance"] = 0.0
-    every = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
-    if "steps" not in section:
-        return {**numbers, "every": every}
-    return {
-        **numbers,
-        "steps": checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError),
-        "every": every,
-    }
+        found["tolerance"] = 0.0
+    if "steps" in section:
+        found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
+    found["every"] = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
+    return found
 
 
 def _check_one(section: Section, name: str, one: str, other: str) -> None:

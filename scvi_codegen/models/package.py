@@ -194,6 +194,11 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
     from scvi_codegen.rendering.text import ExampleRun
 
     clock = model.system.clock
+    if model.monitor is not None:
+        raise ModelFileError(
+            "generated folders have no reversible controller: take the symplectic one (--controller), or steps that "
+            "choose their length by their error (--tolerance) without a monitor"
+        )
     if model.h is None and clock:
         raise ModelFileError(
             "give a step of tau (--step, [run] step): without compiling none can be found for a tolerance"

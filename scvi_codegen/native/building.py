@@ -49,6 +49,7 @@ from scvi_codegen.rendering.source import Source
 
 __all__ = [
     "CACHE_VARIABLE",
+    "FLAGS_VARIABLE",
     "PORTABLE_FLAGS",
     "TUNED_FLAGS",
     "Library",
@@ -137,10 +138,13 @@ def fingerprint(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> str:
     return _key(source, find_compiler(), flags)
 
 
-@cache
 def compiler_title() -> str:
     """The first line that the compiler says of its version."""
-    command = find_compiler()
+    return _title_of(find_compiler())
+
+
+@cache
+def _title_of(command: tuple[str, ...]) -> str:
     result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
     return (result.stdout.splitlines() or [" ".join(command)])[0]
 

@@ -7,6 +7,9 @@ not tell is seen in the run itself: its ``step_error`` is the largest of all its
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -43,11 +46,14 @@ def longest_step(
     """The longest step of tau, to a fifth, at which no step of a pilot run has an estimated error beyond the tolerance.
 
     Args:
-        stepper: of a system in transformed time.
+        stepper: of a system in transformed time, or with a monitor.
         q, p: (m,) initial state.
         span: of time, negative to go back; pilot runs do not go further.
         tolerance: relative error of the end of a step, 0 for round-off.
         t, parameters, options: as of :meth:`Stepper.integrate`.
+
+    Returns:
+        The step, with the sign of the span in transformed time, positive for a monitor.
 
     Raises:
         StateError: for numbers out of range, and where no step is short enough.
@@ -56,39 +62,56 @@ def longest_step(
     length, wanted = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0 or not 0.0 <= wanted < 1.0:
         raise StateError(f"a span of {length:g} with a tolerance of {wanted:g}: the one is not 0, the other in [0, 1)")
-    run = stepper.start(q, p, h=math.copysign(1.0, length), t=t, parameters=parameters, options=options)
-    rate = float(stepper.rates(q, p, run.parameters)[0])
+    monitored, end = bool(stepper.interface.monitor), t + length
+    start = partial(stepper.start, q, p, t=t, t_end=end if monitored else None, options=options)
+    known = start(h=length if not monitored else 1.0, parameters=parameters).parameters
+    rate = float(stepper.rates(q, p, known)[0])
 
-    def serves(h: float) -> bool:
-        pilot = stepper.start(q, p, h=h, t=t, parameters=run.parameters, options=options)
-        return _largest_error(pilot, t + length) <= (wanted or ROUND_OFF)
+    def pilot(h: float) -> _Pilot:
+        return _pilot(start(h=h, parameters=known), end)
 
-    h = length / rate
+    return _longest(pilot, (abs(length) if monitored else length) / rate, wanted or ROUND_OFF)
+
+
+class _Pilot(NamedTuple):
+    """The largest error of the first steps, and how many were taken."""
+
+    error: float
+    steps: int
+
+
+def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> float:
+    """By doubling a first step while it is short, halving it while it is long, then between that and its double."""
+    found = pilot(h)
     for _ in range(MOST_HALVINGS):
-        if serves(h):
-            break
-        h /= 2.0
+        if found.error <= allowed and found.steps <= 1:
+            return h
+        if found.error <= allowed:
+            longer = pilot(2.0 * h)
+            if longer.error > allowed:
+                break
+            h, found = 2.0 * h, longer
+        else:
+            h, found = h / 2.0, pilot(h / 2.0)
     else:
-        raise StateError(
-            f"no step of tau keeps an error of {wanted or ROUND_OFF:.1e}: is the monitor fit for this motion?"
-        )
-    longer = (h * 2.0 ** (k / RUNGS) for k in range(RUNGS - 1, 0, -1))
-    return next((longest for longest in longer if serves(longest)), h)
+        raise StateError(f"no step of tau keeps an error of {allowed:.1e}: is the monitor fit for this motion?")
+    between = (h * 2.0 ** (k / RUNGS) for k in range(RUNGS - 1, 0, -1))
+    return next((longest for longest in between if pilot(longest).error <= allowed), h)
 
 
-def _largest_error(run: Run, end: float) -> float:
-    """Of the first steps; infinite if one of them fails."""
-    done = 0
-    while done < PILOT_STEPS and (end - run.t) * run.h > 0.0:
+def _pilot(run: Run, end: float) -> _Pilot:
+    """The first steps; the error is infinite if one of them fails."""
+    error, done = 0.0, 0
+    while done < PILOT_STEPS and not run.arrived and (run.goal or (end - run.t) * run.h > 0.0):
         size = max(1, done)
         try:
             error = run.record(size, every=size).step_error
         except StepFailedError:
-            return math.inf
+            return _Pilot(math.inf, done + 1)
         if math.isnan(error):
             raise MethodError(f"{run.stepper.interface.title}: steps have no estimate of their error, give a step h")
-        done += size
-    return error
+        done = run.steps
+    return _Pilot(error, done)
 
 
 def too_wrong(step_error: float, t: float, tolerance: float) -> str | None:

@@ -274,7 +274,7 @@ class Stepper(ConstrainedStates):
             velocity=velocity,
             h=h,
             t=t,
-            t_end=end if h is None else None,
+            t_end=end if h is None or self.interface.monitor else None,
             tolerance=tolerance,
             parameters=values(t),
             options=options,

@@ -129,6 +129,8 @@ static int project_position(real t, real *u, const real *parameters, const saddl
       memcpy(u, nearest, sizeof nearest);
       return size <= SETTLED * largest_of(nearest) ? OK : NOT_CONVERGED;
     }
+    if (size <= REAL_EPSILON * largest_of(nearest))
+      return OK;
     left = now;
     memcpy(nearest, u, sizeof nearest);
   }

@@ -32,6 +32,7 @@ SCRIPTS = (
     "custom_sympy_system",
     "import_generated_stepper",
     "inspect_derivation",
+    "joints",
     "kepler_conservation",
     "logarithmic_hamiltonian",
     "poincare_section",
@@ -193,6 +194,19 @@ def test_hanging_chain_comes_to_rest_as_a_catenary(tmp_path):
     assert tension == pytest.approx(9.81 * a / 1.2, rel=1e-3)
     carried, weight = re.search(r"carry (\S+) of the weight (\S+)", output).groups()
     assert float(carried) == pytest.approx(float(weight), abs=1e-5)
+
+
+def test_joints_carry_what_they_say(tmp_path):
+    output = output_of("joints", tmp_path)
+    forces = re.findall(r"(\d+\.\d+), (?:by its turning|with a constant acceleration) (\S+)", output)
+    assert len(forces) == 2
+    for found, expected in forces:
+        assert float(found) == pytest.approx(float(expected), abs=2e-9)
+    kept = [float(number) for number in re.findall(r"joints kept to (\S+),", output)]
+    assert len(kept) == 6
+    assert max(kept) < 1e-14
+    hangers = [float(number) for number in re.search(r"hangers pull with (\S+) and (\S+)", output).groups()]
+    assert sum(hangers) == pytest.approx((9 * 0.2 + 3.0) * 9.81, abs=1e-3)
 
 
 def test_a_cart_balances_its_pole(tmp_path):

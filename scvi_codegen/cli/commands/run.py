@@ -36,7 +36,8 @@ exit status 1.
 
 With --monitor steps are of one length in a time tau that runs the slower the faster the motion is; the map stays
 symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
-and all times are of t.
+and all times are of t. Where the system depends on time or forces act, --controller reversible takes steps of tau
+that are the same backward.
 
 A system with inputs, functions of time that are data, takes their values from the section [inputs] of its file or
 from --input: a table with columns t and value. Steps end where a piece of an input does.
@@ -64,6 +65,7 @@ Examples:
   scvi-codegen run kepler --tolerance 1e-12
   scvi-codegen run kepler --advise 1e-9
   scvi-codegen run kepler --monitor frequency --span 1000
+  scvi-codegen run kepler --monitor frequency --controller reversible --step 0.2
 """
 
 
@@ -230,8 +232,8 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
 
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
-    if model.system.clock is not None:
-        raise click.UsageError("in transformed time every trajectory has its own times: --ensemble does not go with it")
+    if model.paced:
+        raise click.UsageError("with a monitor every trajectory has its own times: --ensemble does not go with it")
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
     click.echo(ensemble_summary(model, outcome))
     kept = "the states computed were not written to a file (-o)"

@@ -10,7 +10,6 @@ import click
 from scvi_codegen import verification
 from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable
-from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
@@ -62,7 +61,7 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
     folder = Path(name)
     if not folder.is_dir():
         model = read_model(name, choices)
-        return _certificate(model, compile_stepper(model.system, model.method, solver=solver), solver)
+        return _certificate(model, model.stepper(solver=solver), solver)
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():

@@ -1,0 +1,215 @@
+"""What a machine has and lacks: what ``scvi-codegen doctor`` finds."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+from scvi_codegen.errors import BuildError
+from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed
+from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS, compiler_title, find_compiler
+from scvi_codegen.native.processes import running
+
+__all__ = ["FAILS", "LACKS", "OK", "Finding", "examine"]
+
+OK, LACKS, FAILS = "ok", "lacks", "fails"
+PACKAGE = "scvi-codegen"
+REQUIREMENT = re.compile(
+    r"(?P<name>[\w.-]+)(\[(?P<own>\w+)\])?\s*(>=\s*(?P<least>[\w.]+))?.*?(extra == ['\"](?P<extra>\w+)['\"])?$"
+)
+"""A line of a package's metadata: a library, perhaps with an extra of its own, and the extra that wants it."""
+TRIAL_SECONDS = 120
+VECTOR_CALL = b"_ZGV"
+"""Begins the names of vector functions, by the vector ABI of x86-64."""
+KEPT = 1e-6
+"""Of the energy of the trial, which is kept much better."""
+
+TRIAL = f"""
+import os, sys
+sys.excepthook = lambda kind, error, place: print(error, file=sys.stderr)
+os.environ["{CACHE_VARIABLE}"] = os.getcwd()
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+import scvi_codegen as sc
+stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:4")
+energy = stepper.integrate([0.5], [0.0], h=0.1, steps=1000).energy()
+print(abs(energy / energy[0] - 1).max())
+"""
+"""In a process of its own, because instructions that the processor does not have end it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        name: of the thing.
+        status: ``"ok"``; ``"lacks"`` for what the rest does without; ``"fails"`` for what everything needs.
+        found: what there is.
+        remedy: what to do where something is not as it should be, else ``""``.
+    """
+
+    name: str
+    status: str
+    found: str
+    remedy: str = ""
+
+
+def examine() -> Iterator[Finding]:
+    """All findings, one by one: the slow one, a stepper compiled and run, takes some seconds."""
+    yield Finding(name="python", status=OK, found=f"{platform.python_version()}, {platform.platform()}")
+    yield Finding(name="cores", status=OK, found=_cores())
+    yield _packages("", "libraries")
+    yield from _compilation()
+    yield _cache()
+    for extra in dict.fromkeys(wanted["extra"] for wanted in _described(PACKAGE)):
+        if extra:
+            yield _packages(extra, f"extra {extra}")
+
+
+def _cores() -> str:
+    count = os.cpu_count() or 1
+    with suppress(AttributeError):  # not on every system
+        allowed = len(os.sched_getaffinity(0))
+        return str(count) if allowed == count else f"{allowed} of {count} for this process"
+    return str(count)
+
+
+def _requirements(package: str, extra: str) -> Iterator[dict[str, str]]:
+    """What an installed package says that an extra of it wants ("": what it always does), and these want in turn."""
+    for wanted in _described(package):
+        if wanted["extra"] == extra:
+            yield wanted
+            if wanted["own"]:
+                yield from _requirements(wanted["name"], wanted["own"])
+
+
+def _described(package: str) -> list[dict[str, str]]:
+    """Names, least versions and extras; none of a package that is not installed."""
+    try:
+        lines = requires(package) or []
+    except PackageNotFoundError:
+        return []
+    return [match.groupdict("") for match in map(REQUIREMENT.match, lines) if match]
+
+
+def _packages(extra: str, name: str) -> Finding:
+    """The libraries of an extra, or those without which nothing works."""
+    present, absent = [], []
+    for wanted in _requirements(PACKAGE, extra):
+        try:
+            found = version(wanted["name"])
+        except PackageNotFoundError:
+            absent.append(wanted["name"])
+            continue
+        present.append(f"{wanted['name']} {found}")
+        if _numbers(found) < _numbers(wanted["least"]):
+            absent.append(f"{wanted['name']} >= {wanted['least']}")
+    if not absent:
+        return Finding(name=name, status=OK, found=", ".join(present))
+    return Finding(
+        name=name,
+        status=LACKS if extra else FAILS,
+        found=", ".join(present) or "none of them",
+        remedy=f"for {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'",
+    )
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    """Of a version, as far as it is numbers."""
+    return tuple(int(part) for part in re.findall(r"\d+", text)[:3])
+
+
+def _compilation() -> Iterator[Finding]:
+    """The compiler, its flags, a stepper by them, and whether that has the vector library."""
+    try:
+        command = find_compiler()
+        title = compiler_title()
+    except (BuildError, OSError, subprocess.TimeoutExpired) as error:
+        yield Finding(name="compiler", status=FAILS, found="none", remedy=str(error))
+        return
+    yield Finding(name="compiler", status=OK, found=f"{' '.join(command)}: {title}")
+    own = os.environ.get(FLAGS_VARIABLE, "")
+    yield Finding(
+        name="flags", status=OK, found=" ".join([*TUNED_FLAGS, *([own, f"({FLAGS_VARIABLE})"] if own else [])])
+    )
+    with tempfile.TemporaryDirectory(prefix="scvi-codegen-doctor-", ignore_cleanup_errors=True) as folder:
+        trial = _trial(Path(folder))
+        yield trial
+        if trial.status == OK:
+            yield _vectors(Path(folder))
+
+
+def _trial(folder: Path) -> Finding:
+    """A pendulum, derived, compiled and run in a folder."""
+    began = time.perf_counter()
+    with running([sys.executable, "-c", TRIAL], folder) as process:
+        try:
+            said, errors = process.communicate(timeout=TRIAL_SECONDS)
+        except subprocess.TimeoutExpired:
+            return _untried(f"not ready after {TRIAL_SECONDS} s")
+    if process.returncode:
+        return _untried(errors.strip() or _ending(process.returncode))
+    error = float(said)
+    if not error < KEPT:
+        return _untried(f"its energy is off by {error:.0e}: the compiler, or its flags, break the arithmetic")
+    took = f"compiled and run in {time.perf_counter() - began:.1f} s"
+    return Finding(name="trial", status=OK, found=f"a pendulum, {took}, keeps its energy to {error:.0e}")
+
+
+def _untried(why: str) -> Finding:
+    last = why.splitlines()[-12:]
+    return Finding(
+        name="trial",
+        status=FAILS,
+        found="a pendulum could not be compiled and run",
+        remedy="\n".join([*last, f"take another compiler (CC=gcc, CC=clang), or look at {FLAGS_VARIABLE}"]),
+    )
+
+
+def _ending(status: int) -> str:
+    """Of a process that said nothing; a shell in between makes 128 + its number of a signal."""
+    number = -status if status < 0 else status - 128
+    with suppress(ValueError):
+        return f"what was compiled ended by {signal.Signals(number).name}"
+    return f"it ended with status {status}"
+
+
+def _vectors(folder: Path) -> Finding:
+    """Whether the library that was built calls glibc's vector functions."""
+    if any(VECTOR_CALL in library.read_bytes() for library in folder.glob("_scvi_*/*.so")):
+        return Finding(name="vectors", status=OK, found="libmvec: sines and exponentials of several points at once")
+    return Finding(
+        name="vectors",
+        status=LACKS,
+        found="no libmvec: sines and exponentials are computed one by one",
+        remedy="only glibc 2.22 or later on x86-64 has it, and -march=native must be among the flags "
+        "(Debian, Ubuntu: apt install libc6-dev)",
+    )
+
+
+def _cache() -> Finding:
+    """The folder where compiled integrators are kept."""
+    folder = cache_folder()
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    try:
+        held = str(cache_info()).replace("\n", ": ")
+    except BuildError as error:
+        return Finding(name="cache", status=LACKS, found=str(folder), remedy=str(error))
+    if exposed(folder):
+        remedy = f"every user may write there, so it is not used: chmod o-w '{folder}'"
+        return Finding(name="cache", status=LACKS, found=held, remedy=remedy)
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        remedy = f"it cannot be written, so nothing is kept: name another folder in {CACHE_VARIABLE}"
+        return Finding(name="cache", status=LACKS, found=held, remedy=remedy)
+    return Finding(name="cache", status=OK, found=held)

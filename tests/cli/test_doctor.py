@@ -1,0 +1,146 @@
+"""``scvi-codegen doctor`` on machines that lack something, made for the occasion."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import json
+import platform
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from scvi_codegen.cli import checkup, main
+
+PROJECT = Path(__file__).parents[2] / "pyproject.toml"
+
+
+def doctor(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(main, ["doctor", *words], prog_name="scvi-codegen")
+    return result.exit_code, result.output
+
+
+def findings(status: int = 0) -> dict[str, dict[str, Any]]:
+    result = CliRunner().invoke(main, ["doctor", "--json"], prog_name="scvi-codegen")
+    assert result.exit_code == status, result.output
+    said = json.loads(result.stdout)
+    assert said["ok"] == (status == 0)
+    return {found["name"]: found for found in said["findings"]}
+
+
+@pytest.fixture
+def without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is of no account."""
+    monkeypatch.setattr(checkup, "_trial", lambda folder: checkup.Finding(name="trial", status="lacks", found=""))
+
+
+def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:
+    """Nothing on the PATH, and no compiler from a wheel."""
+    find = importlib.util.find_spec
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(empty))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: name != "ziglang" and find(name, *more))
+
+
+def test_a_stepper_is_compiled_and_run_in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
+    status, said = doctor()
+    assert status == 0
+    error = re.search(r"^ok +trial +a pendulum, .*keeps its energy to (\S+)$", said, re.MULTILINE)
+    assert error is not None
+    assert float(error[1]) < 1e-10
+    assert re.search(r"^ok +compiler ", said, re.MULTILINE)
+    assert re.search(r"^ok +cache .*0 compiled integrators", said, re.MULTILINE)
+    assert not (tmp_path / "cache").exists()
+
+
+def test_without_a_compiler_it_says_what_to_install(tmp_path, monkeypatch):
+    no_compiler(monkeypatch, tmp_path)
+    status, said = doctor()
+    assert status == 1
+    assert re.search(r"^fails compiler +none$", said, re.MULTILINE)
+    assert "apt install gcc" in said
+    assert "trial" not in said
+    assert "integrators cannot be compiled and run here: compiler" in said
+    assert findings(1)["compiler"]["status"] == "fails"
+
+
+def test_a_compiler_that_is_named_and_not_there(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-cc")
+    assert "named by the environment variable CC ('no-such-cc')" in findings(1)["compiler"]["remedy"]
+
+
+def test_a_compiler_that_refuses_is_quoted(monkeypatch):
+    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-no-such-flag")
+    found = findings(1)
+    assert found["compiler"]["status"] == "ok"
+    assert found["trial"]["status"] == "fails"
+    assert "no-such-flag" in found["trial"]["remedy"]
+    assert "Traceback" not in found["trial"]["remedy"]
+    assert "-no-such-flag" in found["flags"]["found"]
+
+
+def test_instructions_that_the_processor_does_not_have_end_the_trial_alone(tmp_path, monkeypatch):
+    header = tmp_path / "trap.h"
+    header.write_text("__attribute__((constructor)) static void trap(void) { __builtin_trap(); }\n")
+    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", f"-O0 -include {header}")
+    assert re.search("what was compiled ended by SIG(ILL|TRAP)", findings(1)["trial"]["remedy"])
+
+
+def test_arithmetic_that_is_broken_is_found_out(tmp_path, monkeypatch):
+    header = tmp_path / "coarse.h"
+    header.write_text("#include <math.h>\n#define sin(x) (0.9 * sin(x))\n")
+    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", f"-O0 -USCVI_LIBMVEC -include {header}")
+    assert "break the arithmetic" in findings(1)["trial"]["remedy"]
+
+
+def test_a_stepper_without_vector_functions_is_told_from_one_with_them(monkeypatch):
+    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1")
+    tuned = findings()["vectors"]["status"]
+    monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1 -USCVI_LIBMVEC")
+    assert findings()["vectors"]["status"] == "lacks"
+    on_glibc = platform.libc_ver()[0] == "glibc" and platform.machine() == "x86_64"
+    assert tuned == ("ok" if on_glibc else "lacks")
+
+
+@pytest.mark.usefixtures("without_trial")
+def test_a_cache_that_is_not_used_is_named(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "file" / "cache"))
+    assert "cannot be written" in findings()["cache"]["remedy"]
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(shared))
+    assert f"chmod o-w '{shared}'" in findings()["cache"]["remedy"]
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE_SIZE", "much")
+    assert "it must be a size" in findings()["cache"]["remedy"]
+
+
+@pytest.mark.usefixtures("without_trial")
+def test_extras_are_those_of_the_project_with_what_they_lack(monkeypatch):
+    extras = tomllib.loads(PROJECT.read_text())["project"]["optional-dependencies"]
+    before = findings()
+    assert {name.removeprefix("extra ") for name in before if name.startswith("extra ")} == set(extras)
+    assert f"numpy {importlib.metadata.version('numpy')}" in before["libraries"]["found"]
+
+    versions = {"matplotlib": "3.1", "distributed": None}
+
+    def version(name: str) -> str:
+        found = versions.get(name, "9999.0")
+        if found is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return found
+
+    monkeypatch.setattr(checkup, "version", version)
+    found = findings()
+    assert found["extra plot"]["status"] == "lacks"
+    assert found["extra plot"]["remedy"] == "for matplotlib >= 3.8: pip install 'scvi-codegen[plot]'"
+    assert found["extra distributed"]["remedy"] == "for distributed: pip install 'scvi-codegen[distributed]'"
+    assert found["extra data"]["status"] == "ok"
+    versions["sympy"] = None
+    assert "for sympy: pip install 'scvi-codegen'" in findings(1)["libraries"]["remedy"]

@@ -1,0 +1,154 @@
+"""The mechanisms of ``examples/joints.py`` beside closed forms, reduced coordinates and the statics of trusses."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from scvi_codegen import SVI, LagrangianSystem, compile_stepper
+
+JOINTS: Any = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "examples" / "joints.py")))
+G = JOINTS.GRAVITY
+SPAN = 2.0
+
+
+def ran(mechanism: Any, steps: int = 200) -> Any:
+    run = mechanism.run(SPAN, steps)
+    assert np.abs(run.constraint_values()[0]).max() < 2e-15 * max(1.0, np.abs(run.q).max())
+    return run
+
+
+def reduced(lagrangian: str, start: list[float], velocity: list[float], t: np.ndarray, **parameters: float) -> Any:
+    """(n, m) positions of the same motion in coordinates that need no constraint, by steps of their own lengths."""
+    names = [f"u{k}" for k in range(len(start))]
+    system = LagrangianSystem.from_text(
+        name="reduced", coordinates=names, lagrangian=lagrangian, parameters={"g": G, **parameters}
+    )
+    run = compile_stepper(system, SVI(8)).integrate(start, velocity=velocity, t_end=float(t[-1]))
+    return run.at(t)[0]
+
+
+def test_a_dumbbell_flies_as_its_centre_and_turns_evenly():
+    run = ran(JOINTS.dumbbell())
+    (one, other), t, turning = run.q.reshape(-1, 2, 2).transpose(1, 0, 2), run.t, 2.0 / 0.8
+    centre = np.column_stack([0.6 + 2.0 * t, 4.5 * t - G * t**2 / 2])
+    assert_allclose(0.25 * one + 0.75 * other, centre, atol=1e-12)
+    assert_allclose(other - one, 0.8 * np.column_stack([np.cos(turning * t), np.sin(turning * t)]), atol=1e-9)
+    assert_allclose(-2 * 0.8 * run.multipliers()[:, 0], 0.75 * turning**2 * 0.8, atol=1e-9)
+
+
+@pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
+def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(bend):
+    hook = JOINTS.bent_pendulum()
+    a, b = 0.6, 0.4
+    places = [np.sin(np.pi - bend), -np.cos(np.pi - bend)]
+    q = [0.0, -a, b * places[0], b * places[1] - a]
+    system = hook.system.with_parameters(bend=bend)
+    run = ran(JOINTS.Mechanism(system, q, [2.0 * a, 0.0, -2.0 * q[3], 2.0 * q[2]]))
+    far = a**2 + b**2 - 2 * a * b * np.cos(bend)
+    f = reduced(
+        "(a**2 + far)*u0_dot**2/2 + g*(2*a*cos(u0) - b*cos(u0 - bend))",
+        [0.0],
+        [2.0],
+        run.t,
+        a=a,
+        b=b,
+        far=far,
+        bend=bend,
+    )[:, 0]
+    bent = f + np.pi - bend
+    middle = a * np.column_stack([np.sin(f), -np.cos(f)])
+    assert_allclose(run.q[:, :2], middle, atol=1e-9)
+    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(bent), -np.cos(bent)]), atol=1e-9)
+
+
+def test_a_point_slides_on_its_line():
+    run = ran(JOINTS.pendulum_on_a_slide())
+    s, f = reduced(
+        "2*u0_dot**2/2 + ((u0_dot*cos(w) + l*u1_dot*cos(u1))**2 + (u0_dot*sin(w) + l*u1_dot*sin(u1))**2)/2"
+        " - 3*g*u0*sin(w) + g*l*cos(u1)",
+        [0.0, np.pi / 2],
+        [0.0, 0.0],
+        run.t,
+        l=0.5,
+        w=-0.4,
+    ).T
+    line = s[:, np.newaxis] * [np.cos(-0.4), np.sin(-0.4)]
+    assert_allclose(run.q[:, :2], line, atol=1e-8)
+    assert_allclose(run.q[:, 2:], line + 0.5 * np.column_stack([np.sin(f), -np.cos(f)]), atol=1e-8)
+
+
+def test_welded_bodies_tumble_as_one():
+    run = ran(JOINTS.welded_plates())
+    (x1, y1, a1, x2, y2, a2), t = run.q.T, run.t
+    assert_allclose(a1, 3.0 * t, atol=1e-10)
+    assert_allclose(a2, 0.5 + 3.0 * t, atol=1e-10)
+    assert_allclose((x1 + 2 * x2) / 3, 1.4 / 3 + t, atol=1e-11)
+    assert_allclose((y1 + 2 * y2) / 3, (4.0 + 2 * 6.1) / 3 * t - G * t**2 / 2, atol=1e-11)
+    centripetal = 2.0 / 3.0 * 0.7 * 3.0**2
+    assert_allclose(np.hypot(*run.multipliers()[:, :2].T), centripetal, atol=1e-8)
+    assert_allclose(run.multipliers()[:, 2], 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("meshing", [False, True], ids=["belt", "gears"])
+def test_a_belt_and_gears_carry_the_torque(meshing):
+    sign, winch = (-1.0 if meshing else 1.0), JOINTS.winch()
+    system = winch.system.with_parameters(r2=sign * 0.4, torque=sign * 3.0)
+    run = ran(JOINTS.Mechanism(system, winch.q, winch.velocity))
+    lifting = (3.0 * 4.0 - 5.0 * G * 0.15) / (0.3 + 5.0 * 0.15**2 + 0.02 * 4.0**2)
+    assert_allclose(run.q[:, 1], lifting * run.t**2 / 2, atol=1e-11)
+    assert_allclose(run.q[:, 0], sign * 4.0 * run.q[:, 1], atol=1e-11)
+    rim, rope = run.multipliers().T
+    assert_allclose(rim * 0.1, 0.02 * sign * 4.0 * lifting - sign * 3.0, atol=1e-10)
+    assert_allclose(-rope, 5.0 * (G + 0.15 * lifting), atol=1e-10)
+
+
+def by_joints() -> np.ndarray:
+    """(17,) pulls from the balance of both components of force at all nine joints: the method of joints at once."""
+    places, members, last = JOINTS.PLACES, JOINTS.MEMBERS, JOINTS.BOTTOM[-1]
+    balance = np.zeros((len(places), 2, len(members) + 2))
+    for column, (a, b) in enumerate(members):
+        along = (places[b] - places[a]) / np.hypot(*(places[b] - places[a]))
+        balance[a, :, column], balance[b, :, column] = along, -along
+    balance[0, 1, -2] = balance[last, 1, -1] = 1.0
+    weights = np.array([0.2 + (3.0 if k == 1 else 0.0) for k in JOINTS.LOADS]) * G
+    loads = np.column_stack([np.zeros(len(places)), weights])
+    pulls, residual, rank, _ = np.linalg.lstsq(balance.reshape(-1, balance.shape[2]), loads.ravel(), rcond=None)
+    assert rank == len(pulls)
+    assert residual[0] < 1e-20
+    return pulls
+
+
+def test_the_members_of_the_bridge_carry_what_the_method_of_joints_says():
+    run = JOINTS.bridge().run(0.1, 1, "svi:1")
+    pulls = JOINTS.pulls(run)
+    assert np.abs(run.q - run.q[0]).max() < 1e-13
+    assert_allclose(pulls, [by_joints()] * 2, atol=1e-10)
+    left = (9 * 0.2 / 2 + 3.0 * 0.75) * G
+    assert_allclose(pulls[0, -2:], [left, (9 * 0.2 + 3.0) * G - left], atol=1e-10)
+    moment = left - 0.2 * G - 0.2 * G * 0.5
+    top = JOINTS.MEMBERS.index((5, 6))
+    assert_allclose(pulls[0, top], -moment / JOINTS.HEIGHT, atol=1e-10)
+
+
+def test_the_bridge_swings_as_a_pendulum():
+    """On rods of one length it does not turn; all its joints go along the same circle."""
+    mechanism = JOINTS.bridge(0.3)
+    run = ran(mechanism, 100)
+    f = reduced("r**2*u0_dot**2/2 + g*r*cos(u0)", [0.3], [0.0], run.t, r=JOINTS.HANGER)[:, 0]
+    moved = JOINTS.HANGER * np.column_stack([np.sin(f), 1.0 - np.cos(f)])
+    assert_allclose(run.q.reshape(len(run), -1, 2) - JOINTS.PLACES, moved[:, np.newaxis].repeat(9, axis=1), atol=1e-9)
+
+
+def test_a_state_with_coordinates_at_0_is_met():
+    """There an update far below the rounding of the others still changes g, a little less each time."""
+    hook = JOINTS.bent_pendulum()
+    q, p = compile_stepper(hook.system, "svi:2").project(hook.q, [0.0] * 4)
+    assert_allclose(q, hook.q, atol=1e-16)
+    assert not p.any()

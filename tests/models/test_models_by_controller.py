@@ -1,0 +1,192 @@
+"""Models whose steps the reversible controller chooses: files, the command line, ``solve_motion`` and inputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.errors import ModelFileError, StateError, SystemDefinitionError
+from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
+from scvi_codegen.models.package import generate_package
+from scvi_codegen.runtime.longest_step import RUNGS, longest_step
+
+SHAKEN = """
+[system]
+name = "shaken comet"
+coordinates = ["x", "y"]
+lagrangian = "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + x*cos(t)/100"
+monitor = "(x**2 + y**2)**(3/4)"
+
+[forces]
+x = "-x_dot/1000"
+
+[initial]
+q = [0.2, 0.0]
+p = [0.0, 3.0]
+
+[method]
+method = "svi:6"
+
+[run]
+step = 0.1
+controller = "reversible"
+span = 12.0
+"""
+
+
+@pytest.fixture
+def shaken(tmp_path: Path) -> Path:
+    path = tmp_path / "shaken.toml"
+    path.write_text(SHAKEN)
+    return path
+
+
+def invoke(*words: str, status: int = 0) -> str:
+    result = CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
+    assert result.exit_code == status, result.output
+    return result.output
+
+
+def plain(model: sc.Model) -> sc.Stepper:
+    return sc.compile_stepper(model.system, model.method)
+
+
+def test_files_hold_the_controller_and_its_monitor(shaken: Path, tmp_path: Path) -> None:
+    model = sc.load_model(shaken)
+    assert model.system.clock is None
+    assert (model.monitor, model.h, model.covered) == ("(x**2 + y**2)**(3/4)", 0.1, 12.0)
+    sc.save_model(model, tmp_path / "again.toml")
+    assert sc.load_model(tmp_path / "again.toml") == model
+    assert 'controller = "reversible"' in (tmp_path / "again.toml").read_text()
+    assert sc.load_model(shaken, {"run": {"tolerance": 1e-9}}).h is None
+
+
+def test_the_controller_of_a_monitor_can_be_exchanged() -> None:
+    both = {"system": {"monitor": "frequency"}, "run": {"controller": "reversible", "step": 0.2, "span": 5.0}}
+    reversible = catalogue_model("kepler", both)
+    symplectic = parse_model(dump_model(reversible), {"run": {"controller": "symplectic"}})
+    assert symplectic == catalogue_model("kepler", {**both, "run": {"step": 0.2, "span": 5.0}})
+    assert parse_model(dump_model(symplectic), {"run": {"controller": "reversible"}}) == reversible
+
+
+def test_the_command_line_takes_the_steps_of_the_library(shaken: Path, tmp_path: Path) -> None:
+    model, orbit = sc.load_model(shaken), tmp_path / "orbit.npz"
+    said = invoke("run", str(shaken), "-o", str(orbit))
+    assert "of 0.1 in tau by the reversible controller from t = 0 to t = 12;" in said
+    stepper = sc.compile_stepper(model.system, model.method, monitor=model.monitor)
+    run = stepper.integrate(model.q, model.p, h=0.1, t_end=12.0)
+    with np.load(orbit) as file:
+        assert np.array_equal(file["t"], run.t)
+        assert np.array_equal(file["q"], run.q)
+    exact = plain(model).integrate(model.q, model.p, t_end=12.0)
+    assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-10
+    back = tmp_path / "back.npz"
+    invoke("run", str(shaken), "--step", "-0.1", "--span", "2", "-o", str(back))
+    with np.load(back) as file:
+        expected = stepper.integrate(model.q, model.p, h=0.1, t_end=-2.0)
+        assert np.array_equal(file["q"], expected.q)
+
+
+def test_the_command_line_finds_the_step_of_tau(shaken: Path) -> None:
+    said = invoke("run", str(shaken), "--tolerance", "1e-8")
+    error = float(said.partition("relative error about ")[2].partition(",")[0])
+    assert 1e-12 < error < 1e-7
+    words = ("--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)", "--controller", "reversible", "--tolerance", "1e-10")
+    far = ("--q", "1.9999,0", "--velocity", "0,0.00707", "--span", "6")
+    assert "the monitor does not fit the whole motion" in invoke("run", "kepler", *far, *words, status=1)
+
+
+def test_a_folder_is_gone_on_with(shaken: Path, tmp_path: Path) -> None:
+    folder = str(tmp_path / "shaken.run")
+    assert "of 0.1 in tau from t = 0 to t = 12;" in invoke("run", str(shaken), "-o", folder)
+    assert "to t = 20;" in invoke("run", "--resume", folder, "--span", "20")
+    model = sc.load_model(shaken)
+    exact = plain(model).integrate(model.q, model.p, t_end=20.0)
+    assert np.abs(sc.load_run(folder)[-1:].q - exact.q[-1]).max() < 1e-9
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("tolerance", [0.0, 1e-8])
+def test_the_longest_step_keeps_the_tolerance_and_a_longer_one_does_not(unit: float, tolerance: float) -> None:
+    kepler, start = sc.problem("kepler").system, ([1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5])
+    stepper = sc.compile_stepper(kepler, sc.SVI(8), monitor=f"{unit}*(q1**2 + q2**2)**(3/4)")
+    h = longest_step(stepper, *start, 20.0, tolerance)
+    errors = [stepper.integrate(*start, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / RUNGS))]
+    assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
+    assert longest_step(stepper, *start, -20.0, tolerance) == h
+
+
+def test_one_call_integrates_by_the_controller(shaken: Path) -> None:
+    model = sc.load_model(shaken)
+    state: Any = [*model.q, *(model.p or ())]
+    exact = plain(model).integrate(model.q, model.p, t_end=12.0)
+    found = sc.solve_motion(model.system, (0.0, 12.0), state, monitor=model.monitor, controller="reversible")
+    assert found.success
+    assert np.abs(found.y[:2, -1] - exact.q[-1]).max() < 1e-11
+    compiled = sc.solve_motion(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
+    earlier = plain(model).integrate(model.q, model.p, t_eval=[-1.5, -3.0], t_end=-3.0)
+    assert np.abs(compiled.y[:2, 1:].T - earlier.q).max() < 1e-9
+    for wrong in ({"controller": "reversible"}, {"monitor": "frequency", "controller": "pi"}):
+        with pytest.raises(SystemDefinitionError, match="controller"):
+            sc.solve_motion(model.system, (0.0, 1.0), state, **wrong)
+    with pytest.raises(StateError, match="has its method and monitor"):
+        sc.solve_motion(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
+
+
+def test_inputs_are_met_at_their_breakpoints() -> None:
+    system = sc.LagrangianSystem.from_text(
+        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**4/4 + x*u", inputs=["u"]
+    )
+    pushes = {"u": ((0.0, 1.0, 2.5, 6.0), (0.3, -1.0, 0.5, 0.5), "constant")}
+    exact = sc.compile_stepper(system, sc.SVI(8)).drive([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
+    common: dict[str, Any] = {"system": system, "q": (1.0,), "p": (0.0,), "monitor": "1/(1 + x**2)", "inputs": pushes}
+    errors = []
+    for tau in (0.4, 0.2):
+        model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
+        driven = model.stepper().drive(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
+        run = model.start(model.stepper())
+        for steps in model.stretches(run):
+            run.record(steps)
+        assert np.array_equal(run.q, driven.q[-1])
+        errors.append(abs(driven.q[-1] - exact)[0])
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.8)
+    searching = sc.Model(method=sc.SVI(2), tolerance=1e-9, span=6.0, **common)
+    with pytest.raises(ModelFileError, match="no pilot run finds a step of tau"):
+        searching.start(searching.stepper())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("run kepler --controller reversible", "the reversible controller wants a monitor"),
+        ("run kepler --controller pid", "'symplectic', 'reversible'"),
+        ("run kepler --monitor z --controller reversible", "no monitor 'z'"),
+        ("run FILE --steps 10", "give span, not steps"),
+        ("run FILE --advise 1e-9", "give --tolerance in place of --advise"),
+        ("run FILE --ensemble grid.toml", "--ensemble does not go with it"),
+        ("run FILE --controller symplectic", "depends on time"),
+        ("verify FILE", "the reversible controller chooses how long steps are"),
+        ("generate FILE -o by_controller", "generated folders have no reversible controller"),
+    ],
+)
+def test_what_does_not_go_with_it_is_said(shaken: Path, words: str, said: str) -> None:
+    assert said in " ".join(invoke(*words.replace("FILE", str(shaken)).split(), status=2).split())
+
+
+def test_a_model_says_what_it_is_not(shaken: Path, tmp_path: Path) -> None:
+    model = sc.load_model(shaken)
+    with pytest.raises(ModelFileError, match="reversible controller"):
+        _ = model.step_count
+    with pytest.raises(ModelFileError, match="no reversible controller"):
+        generate_package(model, tmp_path / "none")
+    stretched = sc.reparametrise(sc.problem("kepler").system, "frequency")
+    with pytest.raises(ModelFileError, match="not transformed"):
+        sc.Model(system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, monitor="frequency")
+    with pytest.raises(ModelFileError, match="controller is symplectic or reversible"):
+        parse_model(SHAKEN.replace('"reversible"', '"pid"'))
