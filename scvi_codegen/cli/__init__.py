@@ -31,6 +31,8 @@ Examples:
   scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
   scvi-codegen verify mine_svi                         measure whether it keeps what it promises
 
+With --json a command prints one JSON document, with --quiet nothing but errors, warnings and files asked for.
+
 Exit status: 0; 2 if the command line or a model is at fault; 1 if a step failed, a promise is broken, there is
 no C compiler or a file cannot be written; 130 after Ctrl-C.
 """

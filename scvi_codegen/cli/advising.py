@@ -8,6 +8,7 @@ from dataclasses import replace
 import click
 
 from scvi_codegen.advice.advice import Advice, Evidence, advise
+from scvi_codegen.cli.frame import tell
 from scvi_codegen.cli.wording import duration
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
@@ -54,7 +55,8 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
         solver=solver,
         options=options,
     )
-    click.echo(_text(advice))
+    numbers = {"h": advice.h, "steps": advice.steps, "message": advice.message, "warnings": list(advice.warnings)}
+    tell(_text(advice), advice=numbers)
     for warning in advice.warnings:
         click.echo(f"Warning: {warning}", err=True)
     if advice.steps > MOST_STEPS:

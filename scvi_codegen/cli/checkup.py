@@ -21,7 +21,7 @@ from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, e
 from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS, compiler_title, find_compiler
 from scvi_codegen.native.processes import running
 
-__all__ = ["FAILS", "LACKS", "OK", "Finding", "examine"]
+__all__ = ["FAILS", "LACKS", "OK", "Equipment", "examine"]
 
 OK, LACKS, FAILS = "ok", "lacks", "fails"
 PACKAGE = "scvi-codegen"
@@ -49,7 +49,7 @@ print(abs(energy / energy[0] - 1).max())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class Equipment:
     """One thing that was looked at.
 
     Attributes:
@@ -65,10 +65,10 @@ class Finding:
     remedy: str = ""
 
 
-def examine() -> Iterator[Finding]:
+def examine() -> Iterator[Equipment]:
     """All findings, one by one: the slow one, a stepper compiled and run, takes some seconds."""
-    yield Finding(name="python", status=OK, found=f"{platform.python_version()}, {platform.platform()}")
-    yield Finding(name="cores", status=OK, found=_cores())
+    yield Equipment(name="python", status=OK, found=f"{platform.python_version()}, {platform.platform()}")
+    yield Equipment(name="cores", status=OK, found=_cores())
     yield _packages("", "libraries")
     yield from _compilation()
     yield _cache()
@@ -103,7 +103,7 @@ def _described(package: str) -> list[dict[str, str]]:
     return [match.groupdict("") for match in map(REQUIREMENT.match, lines) if match]
 
 
-def _packages(extra: str, name: str) -> Finding:
+def _packages(extra: str, name: str) -> Equipment:
     """The libraries of an extra, or those without which nothing works."""
     present, absent = [], []
     for wanted in _requirements(PACKAGE, extra):
@@ -116,8 +116,8 @@ def _packages(extra: str, name: str) -> Finding:
         if _numbers(found) < _numbers(wanted["least"]):
             absent.append(f"{wanted['name']} >= {wanted['least']}")
     if not absent:
-        return Finding(name=name, status=OK, found=", ".join(present))
-    return Finding(
+        return Equipment(name=name, status=OK, found=", ".join(present))
+    return Equipment(
         name=name,
         status=LACKS if extra else FAILS,
         found=", ".join(present) or "none of them",
@@ -130,17 +130,17 @@ def _numbers(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", text)[:3])
 
 
-def _compilation() -> Iterator[Finding]:
+def _compilation() -> Iterator[Equipment]:
     """The compiler, its flags, a stepper by them, and whether that has the vector library."""
     try:
         command = find_compiler()
         title = compiler_title()
     except (BuildError, OSError, subprocess.TimeoutExpired) as error:
-        yield Finding(name="compiler", status=FAILS, found="none", remedy=str(error))
+        yield Equipment(name="compiler", status=FAILS, found="none", remedy=str(error))
         return
-    yield Finding(name="compiler", status=OK, found=f"{' '.join(command)}: {title}")
+    yield Equipment(name="compiler", status=OK, found=f"{' '.join(command)}: {title}")
     own = os.environ.get(FLAGS_VARIABLE, "")
-    yield Finding(
+    yield Equipment(
         name="flags", status=OK, found=" ".join([*TUNED_FLAGS, *([own, f"({FLAGS_VARIABLE})"] if own else [])])
     )
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-doctor-", ignore_cleanup_errors=True) as folder:
@@ -150,7 +150,7 @@ def _compilation() -> Iterator[Finding]:
             yield _vectors(Path(folder))
 
 
-def _trial(folder: Path) -> Finding:
+def _trial(folder: Path) -> Equipment:
     """A pendulum, derived, compiled and run in a folder."""
     began = time.perf_counter()
     with running([sys.executable, "-c", TRIAL], folder) as process:
@@ -164,12 +164,12 @@ def _trial(folder: Path) -> Finding:
     if not error < KEPT:
         return _untried(f"its energy is off by {error:.0e}: the compiler, or its flags, break the arithmetic")
     took = f"compiled and run in {time.perf_counter() - began:.1f} s"
-    return Finding(name="trial", status=OK, found=f"a pendulum, {took}, keeps its energy to {error:.0e}")
+    return Equipment(name="trial", status=OK, found=f"a pendulum, {took}, keeps its energy to {error:.0e}")
 
 
-def _untried(why: str) -> Finding:
+def _untried(why: str) -> Equipment:
     last = why.splitlines()[-12:]
-    return Finding(
+    return Equipment(
         name="trial",
         status=FAILS,
         found="a pendulum could not be compiled and run",
@@ -185,11 +185,11 @@ def _ending(status: int) -> str:
     return f"it ended with status {status}"
 
 
-def _vectors(folder: Path) -> Finding:
+def _vectors(folder: Path) -> Equipment:
     """Whether the library that was built calls glibc's vector functions."""
     if any(VECTOR_CALL in library.read_bytes() for library in folder.glob("_scvi_*/*.so")):
-        return Finding(name="vectors", status=OK, found="libmvec: sines and exponentials of several points at once")
-    return Finding(
+        return Equipment(name="vectors", status=OK, found="libmvec: sines and exponentials of several points at once")
+    return Equipment(
         name="vectors",
         status=LACKS,
         found="no libmvec: sines and exponentials are computed one by one",
@@ -198,18 +198,18 @@ def _vectors(folder: Path) -> Finding:
     )
 
 
-def _cache() -> Finding:
+def _cache() -> Equipment:
     """The folder where compiled integrators are kept."""
     folder = cache_folder()
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
         held = str(cache_info()).replace("\n", ": ")
     except BuildError as error:
-        return Finding(name="cache", status=LACKS, found=str(folder), remedy=str(error))
+        return Equipment(name="cache", status=LACKS, found=str(folder), remedy=str(error))
     if exposed(folder):
         remedy = f"every user may write there, so it is not used: chmod o-w '{folder}'"
-        return Finding(name="cache", status=LACKS, found=held, remedy=remedy)
+        return Equipment(name="cache", status=LACKS, found=held, remedy=remedy)
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         remedy = f"it cannot be written, so nothing is kept: name another folder in {CACHE_VARIABLE}"
-        return Finding(name="cache", status=LACKS, found=held, remedy=remedy)
-    return Finding(name="cache", status=OK, found=held)
+        return Equipment(name="cache", status=LACKS, found=held, remedy=remedy)
+    return Equipment(name="cache", status=OK, found=held)

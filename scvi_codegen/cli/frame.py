@@ -1,14 +1,20 @@
-"""What all commands share: the group that finds them, errors as one line and an exit status, files to be written."""
+"""What all commands share: the group that finds them, errors as one line and an exit status, files to be written.
+
+A command whose result is of use to a program has :func:`reporting` above it and tells by :func:`tell` what it finds, in
+words and in numbers: people read the words, ``--json`` prints the numbers, ``--quiet`` neither.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
@@ -16,7 +22,21 @@ from click.shell_completion import CompletionItem
 from scvi_codegen.errors import BuildError, MethodWarning, RecordingError, ScviCodegenError, StepFailedError
 from scvi_codegen.files.atomic import write_atomically
 
-__all__ = ["FAILURE", "INTERRUPTED", "USAGE", "CommandFailure", "Commands", "check_writable", "emit"]
+__all__ = [
+    "FAILURE",
+    "INTERRUPTED",
+    "USAGE",
+    "CommandFailure",
+    "Commands",
+    "check_writable",
+    "emit",
+    "reporting",
+    "tell",
+]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+REPORT, QUIET = f"{__name__}.report", f"{__name__}.quiet"
+"""Where a command keeps what ``--json`` is to print, and whether it is to be silent."""
 
 FAILURE, USAGE, INTERRUPTED = 1, 2, 130
 """Exit statuses: numerical failure or no compiler; faulty input; Ctrl-C."""
@@ -101,6 +121,68 @@ def _warnings_as_lines() -> Iterator[None]:
         warnings.simplefilter("always", MethodWarning)
         warnings.showwarning = show
         yield
+
+
+def reporting(command: Command) -> Command:
+    """Give a command the options ``--json`` and ``--quiet``, which :func:`tell` obeys."""
+    options = (
+        click.option(
+            *("--json", "as_json"),
+            is_flag=True,
+            expose_value=False,
+            callback=_begin_report,
+            help="Print one JSON document in place of text.",
+        ),
+        click.option(
+            *("--quiet", "quiet"),
+            is_flag=True,
+            expose_value=False,
+            callback=_be_quiet,
+            help="Print nothing but errors and warnings; the exit status tells.",
+        ),
+    )
+    for option in options:
+        command = option(command)
+    return command
+
+
+def _begin_report(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+    if not wanted:
+        return
+    report: dict[str, Any] = {}
+    context.meta[REPORT] = report
+
+    def print_report() -> None:
+        if report:
+            click.echo(json.dumps(_plain(report), indent=1))
+
+    context.call_on_close(print_report)
+
+
+def _be_quiet(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+    context.meta[QUIET] = wanted
+
+
+def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
+    """Say a text, or with ``--json`` have the numbers in the document printed at the end, also after an error."""
+    meta = click.get_current_context().meta
+    if REPORT in meta:
+        meta[REPORT] |= numbers
+    elif text and not meta.get(QUIET):
+        click.echo(text, nl=nl)
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it, which knows no NaN, infinity or number of NumPy's: ``None`` where there is no number."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
 
 
 def check_writable(path: Path, hint: str) -> None:

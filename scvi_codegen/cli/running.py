@@ -33,6 +33,7 @@ __all__ = [
     "conserved",
     "final_state",
     "integrate_model",
+    "known_at_end",
     "summary",
 ]
 
@@ -196,7 +197,7 @@ def _by_time(model: Model) -> bool:
     return model.ends_at_time or bool(model.system.inputs)
 
 
-def summary(model: Model, outcome: RunOutcome) -> str:
+def summary(model: Model, outcome: RunOutcome, known: Known | None) -> str:
     """The run in a few lines; little if not one step was made."""
     run, trajectory, method = outcome.run, outcome.trajectory, model.method
     order = "no order claimed" if method.order is None else f"order {method.order}"
@@ -212,10 +213,10 @@ def summary(model: Model, outcome: RunOutcome) -> str:
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory)
         lines += worst_step(trajectory)
-    return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], _known(model, outcome))])
+    return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
 
 
-def _known(model: Model, outcome: RunOutcome) -> Known | None:
+def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
     """What is known of the state at the end of a run that came to its end, where that was kept."""
     run, trajectory = outcome.run, outcome.trajectory
     if not run.steps or outcome.failure is not None or outcome.interrupted or trajectory.t[-1] != run.t:

@@ -35,7 +35,7 @@ def findings(status: int = 0) -> dict[str, dict[str, Any]]:
 @pytest.fixture
 def without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it is of no account."""
-    monkeypatch.setattr(checkup, "_trial", lambda folder: checkup.Finding(name="trial", status="lacks", found=""))
+    monkeypatch.setattr(checkup, "_trial", lambda folder: checkup.Equipment(name="trial", status="lacks", found=""))
 
 
 def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:

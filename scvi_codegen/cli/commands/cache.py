@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import click
 
+from scvi_codegen.cli.frame import reporting, tell
 from scvi_codegen.files.cache import cache_folder, cache_info, clear_cache
 
 __all__ = ["cache"]
@@ -11,6 +14,7 @@ __all__ = ["cache"]
 
 @click.command()
 @click.argument("action", type=click.Choice(["info", "clear", "path"]), default="info")
+@reporting
 def cache(action: str) -> None:
     """Show what is in the cache of compiled integrators (info), empty it (clear), or print where it is (path).
 
@@ -23,6 +27,9 @@ def cache(action: str) -> None:
     """
     if action == "clear":
         count = clear_cache()
-        click.echo(f"removed {count:,} bytes from {cache_folder()}")
+        tell(f"removed {count:,} bytes from {cache_folder()}", folder=cache_folder(), removed=count)
+    elif action == "path":
+        tell(str(cache_folder()), folder=cache_folder())
     else:
-        click.echo(cache_folder() if action == "path" else cache_info())
+        info = cache_info()
+        tell(str(info), **asdict(info))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 
 import click
 
-from scvi_codegen.cli.checkup import FAILS, Finding, examine
-from scvi_codegen.cli.frame import FAILURE, CommandFailure
+from scvi_codegen.cli.checkup import FAILS, Equipment, examine
+from scvi_codegen.cli.frame import FAILURE, CommandFailure, reporting, tell
 
 __all__ = ["doctor"]
 
@@ -16,8 +15,8 @@ STATUS_WIDTH, NAME_WIDTH = 5, 17
 
 
 @click.command()
-@click.option("--json", "as_json", is_flag=True, help="The same for programs: ok, and a list of findings.")
-def doctor(as_json: bool) -> None:
+@reporting
+def doctor() -> None:
     """Say what this machine has and lacks for compiled integrators, and what to install.
 
     A small integrator is compiled in a temporary folder and run. Exit status 1 if that fails; what is merely lacking
@@ -31,16 +30,14 @@ def doctor(as_json: bool) -> None:
     findings = []
     for finding in examine():
         findings.append(finding)
-        if not as_json:
-            click.echo(_lines(finding))
+        tell(_lines(finding))
     failing = [finding.name for finding in findings if finding.status == FAILS]
-    if as_json:
-        click.echo(json.dumps({"ok": not failing, "findings": [asdict(finding) for finding in findings]}, indent=1))
+    tell(ok=not failing, findings=[asdict(finding) for finding in findings])
     if failing:
         raise CommandFailure(f"integrators cannot be compiled and run here: {', '.join(failing)}", FAILURE)
 
 
-def _lines(finding: Finding) -> str:
+def _lines(finding: Equipment) -> str:
     """Status, name and what was found; below it what to do."""
     indent = " " * (STATUS_WIDTH + NAME_WIDTH + 2)
     first = f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.found}"

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from scvi_codegen.cli.frame import check_writable
+from scvi_codegen.cli.frame import check_writable, reporting, tell
+from scvi_codegen.cli.numbers import recorded_numbers
 from scvi_codegen.cli.recording import check_format, standing
 from scvi_codegen.results.recording import load_run
 
@@ -16,6 +17,7 @@ __all__ = ["export"]
 @click.command()
 @click.argument("folder", type=click.Path())
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory: .npz, .csv, .h5 (HDF5) or .zarr.")
+@reporting
 def export(folder: str, output: str | None) -> None:
     """Write the states of the run in FOLDER to one file, or say what is in it.
 
@@ -30,7 +32,7 @@ def export(folder: str, output: str | None) -> None:
         check_format(output, ensemble=False)
         check_writable(Path(output), "'-o'")
     recorded = load_run(folder)
-    click.echo(standing(recorded))
+    tell(standing(recorded), **recorded_numbers(recorded))
     if output is not None:
         recorded.save(output)
-        click.echo(f"wrote {output}")
+        tell(f"wrote {output}", written=[output])

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.cli.frame import reporting, tell
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.rendering.text import Embedded
 
@@ -26,6 +27,7 @@ __all__ = ["generate"]
     help="C for a microcontroller, in this precision, without a Python package.",
 )
 @click.option("--single-file", is_flag=True, help="One C file without support headers beside it, as for --embedded.")
+@reporting
 def generate(
     model_name: str,
     output: str,
@@ -47,6 +49,6 @@ def generate(
     """
     model = read_model(model_name, Choices(**choices))
     folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
-    click.echo(f"{model.system.name}: {model.method.title}")
+    tell(f"{model.system.name}: {model.method.title}", system=model.system.name, method=model.method.name)
     python = "" if embedded else f", or 'import {folder.resolve().name}'"
-    click.echo(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}")
+    tell(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}", written=[folder])

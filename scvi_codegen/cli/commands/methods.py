@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import click
 
+from scvi_codegen.cli.frame import reporting, tell
 from scvi_codegen.cli.wording import table
 from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification, size_of
 from scvi_codegen.tables.closed_forms import exact_tableau
@@ -29,31 +31,47 @@ LONGEST_EXACT = 32
 
 @click.command()
 @click.option("--tableau", metavar="NAME:S", help="Print a Butcher tableau instead, as in gauss:3.")
+@reporting
 def methods(tableau: str | None) -> None:
     """List the methods with their arguments, and order, symplecticity and symmetry of an example of each.
 
     A degree, number of stages or order may follow the name: --method svi:6 is --method svi --degree 6.
     """
-    click.echo(methods_table() if tableau is None else tableau_text(tableau))
+    if tableau is None:
+        entries = [entry for name in METHODS for entry in _entries_of(name)]
+        tell(methods_table(entries), methods=entries)
+    else:
+        found = tableau_by_name(tableau)
+        numbers: dict[str, Any] = {name: [_decimals(row) for row in getattr(found, name)] for name in "Abc"}
+        tell(tableau_text(tableau), name=found.name, order=found.order, **numbers)
 
 
-def methods_table() -> str:
+def _entries_of(name: str) -> Iterator[dict[str, Any]]:
+    """What is known of a method by an example of it, and by one of the form that the paper prints."""
+    variants: list[dict[str, Any]] = [{}, {"variational": False}] if "variational" in ARGUMENTS[name] else [{}]
+    for variant in variants:
+        method = method_from_specification({**_example(name).specification(), **variant})
+        yield {
+            "name": name,
+            "arguments": list(ARGUMENTS[name]),
+            "number": size_of(name),
+            "example": method.name,
+            "order": method.order,
+            "symplectic": method.symplectic,
+            "symmetric": method.symmetric,
+        }
+
+
+def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
     """A line for each method with its arguments, and the properties of an example."""
-    rows = [("name", "arguments", "example", "order", "symplectic", "symmetric")]
-    for name in METHODS:
-        method = _example(name)
-        size = size_of(name)
-        rows.append(
-            (
-                f"{name}[:{size}]" if size else name,
-                ", ".join(ARGUMENTS[name]) or "none",
-                method.name,
-                *_properties(method),
-            )
-        )
-        if "variational" in ARGUMENTS[name]:
-            printed = method_from_specification({"method": name, **EXAMPLES[name], "variational": False})
-            rows.append(("", "", printed.name, *_properties(printed)))
+    rows, last = [("name", "arguments", "example", "order", "symplectic", "symmetric")], ""
+    for entry in entries:
+        name = f"{entry['name']}[:{entry['number']}]" if entry["number"] else entry["name"]
+        first = (name, ", ".join(entry["arguments"]) or "none") if entry["name"] != last else ("", "")
+        order = "none claimed" if entry["order"] is None else str(entry["order"])
+        holds = ("yes" if entry[what] else "no" for what in ("symplectic", "symmetric"))
+        rows.append((*first, entry["example"], order, *holds))
+        last = entry["name"]
     return table(rows)
 
 
@@ -100,13 +118,13 @@ def _example(name: str) -> Method:
     return method_from_specification({"method": name, **arguments})
 
 
-def _properties(method: Method) -> tuple[str, str, str]:
-    order = "none claimed" if method.order is None else str(method.order)
-    return order, "yes" if method.symplectic else "no", "yes" if method.symmetric else "no"
-
-
 def _yes_or_not(holds: bool) -> str:
     return "" if holds else "not "
+
+
+def _decimals(row: Any) -> Any:
+    """A number, or a row of them, in 17 digits."""
+    return [float(_decimal(x)) for x in row] if hasattr(row, "__len__") else float(_decimal(row))
 
 
 def _decimal(value: object) -> str:

@@ -12,9 +12,10 @@ from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.cli.advising import advised_model, controlled_model
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
-from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
+from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
+from scvi_codegen.cli.numbers import ensemble_numbers, failure_text, recorded_numbers, run_numbers
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
-from scvi_codegen.cli.running import RunOutcome, integrate_model, summary
+from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -66,6 +67,7 @@ Examples:
   scvi-codegen run kepler --advise 1e-9
   scvi-codegen run kepler --monitor frequency --span 1000
   scvi-codegen run kepler --monitor frequency --controller reversible --step 0.2
+  scvi-codegen run kepler --json > kepler.json
 """
 
 
@@ -109,6 +111,7 @@ Examples:
     "--solver-tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
 )
 @click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
+@reporting
 def run(
     model_name: str | None,
     output: str | None,
@@ -206,36 +209,40 @@ def _run_one(
     promised: float | None,
 ) -> None:
     outcome = integrate_model(model, solver=solver, options=options)
-    click.echo(summary(model, outcome))
+    known = known_at_end(model, outcome)
+    tell(summary(model, outcome, known), **run_numbers(model, outcome, known))
     written = _write_outputs(outcome, output, plot)
+    tell(written=written)
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
     if outcome.broken is not None:
+        tell(broken=outcome.broken)
         raise CommandFailure(f"{outcome.broken}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
-        click.echo(f"wrote {path}")
+        tell(f"wrote {path}")
     broken = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised)
+    tell(broken=broken or None)
     if broken:
         raise CommandFailure(broken, FAILURE)
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
     """Say what came of a recorded run, and how to go on with it."""
-    click.echo(outcome.summary())
+    tell(outcome.summary(), **recorded_numbers(outcome.recorded), failure=failure_text(outcome))
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{outcome.kept()}", FAILURE)
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.kept()}", INTERRUPTED)
-    click.echo(f"wrote {outcome.recorded.folder}")
+    tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
 
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
     if model.paced:
         raise click.UsageError("with a monitor every trajectory has its own times: --ensemble does not go with it")
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
-    click.echo(ensemble_summary(model, outcome))
+    tell(ensemble_summary(model, outcome), **ensemble_numbers(model, outcome))
     kept = "the states computed were not written to a file (-o)"
     if output is not None:
         outcome.result.save(output)
@@ -247,7 +254,7 @@ def _run_ensemble(model: Model, path: str, output: str | None, solver: str, opti
     if not outcome.result.ok.any():
         raise CommandFailure(f"every trajectory failed\n{kept}", FAILURE)
     if output is not None:
-        click.echo(f"wrote {output}")
+        tell(f"wrote {output}", written=[output])
 
 
 def _write_outputs(outcome: RunOutcome, output: str | None, plot: str | None) -> list[str]:

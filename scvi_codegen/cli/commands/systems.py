@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import click
 
 from scvi_codegen.cli.choices import complete_model
+from scvi_codegen.cli.frame import reporting, tell
 from scvi_codegen.cli.wording import table
 from scvi_codegen.models.model import Model
+from scvi_codegen.models.model_document import document_of
 from scvi_codegen.models.model_file import dump_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
@@ -15,6 +20,7 @@ __all__ = ["systems"]
 
 @click.command()
 @click.argument("name", required=False, shell_complete=complete_model)
+@reporting
 def systems(name: str | None) -> None:
     """List the systems of the catalogue, or print the one called NAME as a model file.
 
@@ -23,18 +29,25 @@ def systems(name: str | None) -> None:
       scvi-codegen systems double-pendulum > mine.toml
     """
     if name is None:
-        click.echo(systems_table())
+        entries = [_entry(name) for name in PROBLEMS]
+        tell(systems_table(entries), systems=entries)
     else:
-        click.echo(dump_model(Model.from_problem(problem(name))), nl=False)
+        model = Model.from_problem(problem(name))
+        tell(dump_model(model), nl=False, **document_of(model))
 
 
-def systems_table() -> str:
+def _entry(name: str) -> dict[str, Any]:
+    """A problem: its name, what it is, coordinates, and parameters with their values."""
+    entry = problem(name)
+    values = zip(map(str, entry.system.parameters), entry.system.defaults, strict=True)
+    coordinates = [coordinate.name for coordinate in entry.system.coordinates]
+    return {"name": name, "description": entry.title, "coordinates": coordinates, "parameters": dict(values)}
+
+
+def systems_table(entries: Sequence[Mapping[str, Any]]) -> str:
     """A line for each problem: name, coordinates, what it is, parameters."""
     rows = [("name", "m", "description", "parameters")]
-    for name, build in PROBLEMS.items():
-        entry = build()
-        parameters = ", ".join(
-            f"{symbol}={value:g}" for symbol, value in zip(entry.system.parameters, entry.system.defaults, strict=True)
-        )
-        rows.append((name, str(entry.system.dimension), entry.title, parameters))
+    for entry in entries:
+        parameters = ", ".join(f"{name}={value:g}" for name, value in entry["parameters"].items())
+        rows.append((entry["name"], str(len(entry["coordinates"])), entry["description"], parameters))
     return table(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import click
 
 from scvi_codegen import verification
 from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
-from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable
+from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, reporting, tell
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
@@ -25,6 +26,7 @@ MODEL_FILE = "model.toml"
 @model_arguments
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="The certificate as JSON.")
 @SOLVER_OPTION
+@reporting
 def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> None:
     """Build the integrator of MODEL and measure what it promises; exit status 1 if a promise is broken.
 
@@ -43,7 +45,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     if path is not None:
         check_writable(path, "'-o'")
     certificate = _verified(model_name, Choices(**choices), solver=solver)
-    click.echo(certificate.to_text(), nl=False)
+    tell(certificate.to_text(), nl=False, **json.loads(certificate.to_json()))
     if path is not None:
         certificate.save(path)
         click.echo(f"wrote {path}", err=True)

@@ -1,0 +1,119 @@
+"""What ``--json`` says of runs: the numbers of which their summaries are made."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.advice.known_digits import Known
+from scvi_codegen.cli.ensembles import EnsembleOutcome
+from scvi_codegen.cli.recording import RecordedOutcome
+from scvi_codegen.cli.running import RunOutcome
+from scvi_codegen.errors import StateError
+from scvi_codegen.models.model import Model
+from scvi_codegen.results.recording import RecordedRun
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.trajectory import Trajectory
+
+__all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"]
+
+
+def run_numbers(model: Model, outcome: RunOutcome, known: Known | None) -> dict[str, Any]:
+    """Of one run in memory."""
+    run, trajectory = outcome.run, outcome.trajectory
+    t, q, p = outcome.end
+    return {
+        **_about(model),
+        "steps": run.steps,
+        "rejected": run.rejected,
+        "h": run.goal.tau or None if run.goal else run.h,
+        "states": len(trajectory),
+        "seconds": outcome.seconds,
+        "preparation_seconds": outcome.preparation,
+        **_conserved(trajectory),
+        "step_error": trajectory.step_error,
+        "step_error_t": trajectory.step_error_t,
+        "final": {"t": t, "q": _named(model, q), "p": _named(model, p)},
+        "final_error": None if known is None else {"q": _named(model, known.q), "p": _named(model, known.p)},
+        "chaotic": None if known is None else known.chaotic,
+        "failure": failure_text(outcome),
+    }
+
+
+def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:
+    """Why a run is not what was asked for."""
+    if outcome.interrupted:
+        return "interrupted"
+    return None if outcome.failure is None else str(outcome.failure)
+
+
+def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
+    """Of a run in a folder."""
+    interface = recorded.manifest.interface
+    return {
+        "system": interface.system,
+        "method": interface.method,
+        "folder": recorded.folder,
+        "steps": recorded.steps,
+        "states": len(recorded),
+        "final": {
+            "t": float(recorded.t[-1]),
+            "q": _by_name(interface.coordinates, recorded.q[-1]),
+            "p": _by_name(interface.coordinates, recorded.p[-1]),
+        },
+        "finished": recorded.finished,
+    }
+
+
+def ensemble_numbers(model: Model, outcome: EnsembleOutcome) -> dict[str, Any]:
+    """Of an ensemble."""
+    result = outcome.result
+    return {
+        **_about(model),
+        "trajectories": len(result),
+        "statuses": Counter(result.status.tolist()),
+        "steps": {"least": int(result.steps.min()), "most": int(result.steps.max())},
+        "states": len(result.t),
+        "seconds": outcome.seconds,
+        "preparation_seconds": outcome.preparation,
+        **_conserved(result),
+        "failure": "interrupted" if outcome.interrupted else None,
+    }
+
+
+def _about(model: Model) -> dict[str, Any]:
+    return {"system": model.system.name, "method": model.method.name, "order": model.method.order}
+
+
+def _named(model: Model, vector: np.ndarray[Any, Any]) -> dict[str, float]:
+    return _by_name([coordinate.name for coordinate in model.system.coordinates], vector)
+
+
+def _by_name(names: Sequence[str], vector: np.ndarray[Any, Any]) -> dict[str, float]:
+    return dict(zip(names, vector.tolist(), strict=True))
+
+
+def _conserved(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> dict[str, Any]:
+    """Largest changes: of energies, and of momentum maps relative to the sizes of their terms."""
+    found: dict[str, Any] = {"energy_change": None, "energy": None, "momentum_errors": None}
+    try:
+        with np.errstate(all="ignore"):
+            energy = np.asarray(result.energy())
+            found["energy"] = energy[0]
+            found["energy_change"] = _largest(energy - energy[0])
+            errors = np.asarray(result.momentum_errors())
+            names = result.stepper.interface.map_names
+            found["momentum_errors"] = {name: _largest(errors[..., k]) for k, name in enumerate(names)}
+    except StateError:
+        pass  # of a state without a velocity; the summary says so
+    return found
+
+
+def _largest(changes: np.ndarray[Any, Any]) -> float | None:
+    """In size; ``None`` where none is a number."""
+    sizes = np.abs(changes)[np.isfinite(changes)]
+    return float(sizes.max()) if sizes.size else None

@@ -1,0 +1,123 @@
+"""``--json`` and ``--quiet``: the numbers behind the text, or neither."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import scvi_codegen as sc
+from scvi_codegen.cli import frame, main
+from scvi_codegen.models.model_file import parse_model
+
+KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
+QUIET_COMMANDS = (
+    ("run", *KEPLER),
+    ("systems",),
+    ("systems", "kepler"),
+    ("methods",),
+    ("methods", "--tableau", "gauss:2"),
+    ("cache",),
+    ("generate", "kepler", "-o", "kepler_svi"),
+)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def invoke(*words: str, status: int = 0) -> Result:
+    result = CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
+    assert result.exit_code == status, result.output
+    return result
+
+
+def document(*words: str, status: int = 0) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(invoke(*words, "--json", status=status).stdout, parse_constant=refuse)
+    return found
+
+
+def refuse(constant: str) -> float:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+@pytest.mark.parametrize("words", QUIET_COMMANDS, ids=" ".join)
+def test_quiet_prints_nothing_and_json_one_document(words):
+    assert invoke(*words).stdout
+    assert invoke(*words, "--quiet").stdout == ""
+    assert document(*words)
+
+
+def test_the_numbers_of_a_run_are_those_of_the_library():
+    found = document("run", *KEPLER, "-o", "orbit.npz")
+    kepler = sc.problem("kepler")
+    stepper = sc.compile_stepper(kepler.system, "svi:4")
+    run = stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.1, steps=50)
+    assert (found["steps"], found["states"], found["h"], found["order"]) == (50, 51, 0.1, 8)
+    assert list(found["final"]["q"].values()) == run.q[-1].tolist()
+    assert list(found["final"]["p"]) == ["q1", "q2"]
+    assert found["final"]["t"] == pytest.approx(5.0, abs=1e-15)
+    assert found["energy_change"] == np.abs(run.energy() - run.energy()[0]).max()
+    assert found["momentum_errors"] == {"angular momentum": np.abs(run.momentum_errors()).max()}
+    assert found["step_error"] == pytest.approx(run.step_error)
+    exact = stepper.integrate(kepler.q, velocity=kepler.velocity, t_end=5.0).q[-1]
+    error = np.abs(run.q[-1] - exact)
+    assert np.all(np.array(list(found["final_error"]["q"].values())) > 0.3 * error)
+    assert (found["failure"], found["broken"], found["written"]) == (None, None, ["orbit.npz"])
+
+
+def test_a_run_that_fails_tells_how_far_it_came():
+    found = document("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
+    assert "step" in found["failure"]
+    assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
+    far = ("--q", "1.9999,0", "--velocity", "0,0.00707", "--span", "6", "--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)")
+    assert "monitor does not fit" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["broken"]
+    assert invoke("run", "keplr", "--json", status=2).stdout == ""
+
+
+def test_advice_folders_and_ensembles():
+    advised = document("run", "kepler", "--span", "10", "--advise", "1e-6")
+    assert advised["advice"]["h"] == advised["h"]
+    assert advised["advice"]["steps"] == advised["steps"]
+    recorded = document("run", *KEPLER, "-o", "orbit.run")
+    assert (recorded["steps"], recorded["finished"], recorded["folder"]) == (50, True, "orbit.run")
+    assert recorded["final"]["q"] == document("run", *KEPLER)["final"]["q"]
+    further = document("run", "--resume", "orbit.run", "--steps", "60")
+    assert further["steps"] == 60
+    assert document("export", "orbit.run", "-o", "orbit.csv")["written"] == ["orbit.csv"]
+    Path("grid.toml").write_text("[grid]\nq1 = [0.4, 0.5, 0.6]\n")
+    many = document("run", *KEPLER, "--ensemble", "grid.toml")
+    assert (many["trajectories"], many["statuses"], many["steps"]["most"]) == (3, {"ok": 3}, 50)
+    assert len(many["energy"]) == 3
+
+
+def test_lists_and_model_files():
+    listed = document("systems")["systems"]
+    assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)
+    assert listed[0]["parameters"]["m"] == 1.0
+    sections = document("systems", "kepler")
+    again = parse_model(invoke("systems", "kepler").stdout)
+    assert sections["initial"]["q"] == list(again.q)
+    by_name = {entry["example"]: entry for entry in document("methods")["methods"]}
+    for entry in by_name.values():
+        assert entry["symplectic"] in (True, False)
+    assert by_name[sc.SVI(4).name]["order"] == 8
+    tableau = document("methods", "--tableau", "gauss:2")
+    assert tableau["b"] == [0.5, 0.5]
+    assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
+
+
+def test_a_certificate_is_the_one_that_is_saved():
+    found = document("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
+    assert found == json.loads(Path("certificate.json").read_text())
+
+
+def test_what_is_no_number_is_none():
+    values = {"a": math.nan, "b": [math.inf, 1.5], "c": np.array([1.0, np.nan]), "d": np.int64(3), "e": Path("x")}
+    assert frame._plain(values) == {"a": None, "b": [None, 1.5], "c": [1.0, None], "d": 3, "e": "x"}
