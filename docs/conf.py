@@ -1,6 +1,6 @@
 """The documentation, by ``python -m sphinx -W docs site``: no network, no script but the search.
 
-``-t online`` adds links to the documentation of Python, NumPy, SciPy and SymPy, whose tables of contents are then fetched.
+``-t online`` adds links to the documentation of Python, NumPy, SciPy and SymPy, whose lists of names are then fetched.
 """
 
 import sys
@@ -13,7 +13,14 @@ sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
 project = "scvi_codegen"
 copyright = "the authors of scvi_codegen, MIT licence"  # noqa: A001  (Sphinx's name)
 release = version = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.intersphinx", "mathml", "public_names"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.intersphinx",
+    "mathml",
+    "public_names",
+]
 exclude_patterns = ["_extensions"]
 
 html_theme = "furo"
@@ -29,7 +36,7 @@ myst_heading_anchors = 3
 autodoc_typehints = "signature"
 maximum_signature_line_length = 90
 autodoc_type_aliases = {
-    name: name for name in ("Array", "ArrayLike", "Parameters", "EnsembleParameters", "EventLike", "Vector", "Number")
+    name: name for name in ("Array", "ArrayLike", "Parameters", "EnsembleParameters", "Vector", "Number")
 }
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True

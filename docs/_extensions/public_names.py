@@ -30,6 +30,4 @@ def _resolve(
         return None
     target = ".".join(["scvi_codegen", *parts[public:]])
     domain = environment.domains["py"]
-    return domain.resolve_xref(
-        environment, reference["refdoc"], app.builder, "obj", target, reference, content
-    )
+    return domain.resolve_xref(environment, reference["refdoc"], app.builder, "obj", target, reference, content)

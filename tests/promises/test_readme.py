@@ -28,7 +28,8 @@ def test_the_paper_is_run_again_as_the_readme_says(tmp_path, monkeypatch):
 
 
 def test_the_checks_use_the_commands_of_the_readme():
-    shown = [line for _, language, text in BLOCK.findall(README) if language == "sh" for line in re.split(r" && |\n", text)]
+    blocks = [text for _, language, text in BLOCK.findall(README) if language == "sh"]
+    shown = [line for text in blocks for line in re.split(r" && |\n", text)]
     assert "pip install -e '.[test]'" in shown
     assert "pytest -n auto" in shown
     used = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
