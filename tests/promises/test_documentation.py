@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browsing import VIEWS, looked_at
+from browsing import UNREADABLE, VIEWS, looked_at
 from pages import BLOCK, ROOT, run_page, runnable
 
 import scvi_codegen
@@ -110,12 +110,14 @@ class TestTheSite:
         assert [name for name, page in pages.items() if re.search(loaded, page)] == []
 
     def test_pages_fit_a_phone_and_a_desk_by_day_and_by_night(self, site, view):
-        wide = []
+        wide, pale = [], []
         for path in sorted(site.rglob("*.html")):
             view.goto(path.as_uri())
             if view.evaluate("document.documentElement.scrollWidth") > view.width:
                 wide.append(path.name)
+            pale += [(path.name, *found) for found in view.evaluate(UNREADABLE)]
         assert wide == []
+        assert pale == []
         assert {url.split(":")[0] for url in view.asked} <= {"file", "data"}
         assert view.said == []
 
