@@ -133,7 +133,7 @@ def advise(
         method: how its motion is discretised, or its name, ``"svi:8"``.
         q, p: (m,) initial positions and momenta.
         span: length of time of the run, negative to go back.
-        tolerance: wanted error |q - q_exact| / |q| at the end; half of it is aimed at.
+        tolerance: wanted error ``|q - q_exact| / |q|`` at the end; half of it is aimed at.
         parameters: by name (others keep their defaults) or all in order.
         t: initial time.
         degree: choose the degree (or number of stages) among 2, 4, ..., 12 too, the one with the fewest evaluations in

@@ -48,7 +48,6 @@ class Motion:
         y_events: (k, 2 m) states there.
         status: 0 the end of the span, 1 a terminal event, -1 a step failed, -2 a promise of :func:`advise` broke.
         message: the same in words.
-        success: whether the status is not negative.
         trajectory: the states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies.
     """
 
@@ -101,7 +100,7 @@ def solve_motion(
         velocity: (m,) initial velocities, in place of momenta.
         method: or its name, ``"svi:6"``; by default ``SVI(8)``, of constraints SVI(6) with Lobatto's points.
         h: longest step of one length, taken a little shorter so that whole steps fill the span.
-        tolerance: in place of ``h``: the error |q - q_exact| / |q| at the end, for which :func:`advise` chooses it.
+        tolerance: in place of ``h``: the error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses it.
             Where the run breaks the promise, ``success`` is False.
         rtol: the relative error of the end of each step whose length is its own; by default round-off.
         monitor: g of :func:`reparametrise`: by equal steps of tau, dt = g dtau, symplectic and of variable length in t.

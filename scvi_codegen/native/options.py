@@ -37,7 +37,7 @@ class SolverOptions:
     Attributes:
         tolerance: size of the last update relative to the state (default: round-off), or absolute.
         max_iterations: after which a step fails.
-        absolute: compare the update itself, the paper's rule max(|dQ|, |dP|) < TOL.
+        absolute: compare the update itself, the paper's rule ``max(|dQ|, |dP|) < TOL``.
     """
 
     tolerance: float = TOLERANCE

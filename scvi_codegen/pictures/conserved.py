@@ -22,7 +22,7 @@ BINS = 600
 
 @takes(trajectories=MOTIONS, path=PATH, ax=CANVAS)
 def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the energy error |H - H_0| / |H_0| over time (not divided where H_0 = 0), a colour a trajectory.
+    """Draw the energy error ``|H - H_0| / |H_0|`` over time (not divided where H_0 = 0), a colour a trajectory.
 
     Args:
         trajectories: one or several.

@@ -68,20 +68,27 @@ def chromium() -> Iterator[Any]:
 
 
 @contextmanager
-def opened(browser: Any, page: str, path: Path, size: str, scheme: str) -> Iterator[Any]:
-    """The page on a phone or a desk, by day or by night; ``view.asked`` is what it asked for."""
-    path.write_text(page, encoding="utf-8")
+def looked_at(browser: Any, size: str, scheme: str) -> Iterator[Any]:
+    """A phone or a desk, by day or by night, to go to pages with; ``view.asked`` is what these asked for."""
     view = browser.new_page(color_scheme=scheme)
     phone = {"width": WIDTHS[size], "height": 844, "deviceScaleFactor": 2, "mobile": size == "phone"}
     view.context.new_cdp_session(view).send("Emulation.setDeviceMetricsOverride", phone)
-    view.asked, view.said = [], []
+    view.asked, view.said, view.width = [], [], WIDTHS[size]
     view.on("request", lambda request: view.asked.append(request.url))
     view.on("console", lambda message: view.said.append(message.text))
-    view.goto(path.as_uri())
-    view.wait_for_load_state("networkidle")
-    view.own, view.width = path.as_uri(), WIDTHS[size]
     yield view
     view.close()
+
+
+@contextmanager
+def opened(browser: Any, page: str, path: Path, size: str, scheme: str) -> Iterator[Any]:
+    """The page, looked at."""
+    path.write_text(page, encoding="utf-8")
+    with looked_at(browser, size, scheme) as view:
+        view.goto(path.as_uri())
+        view.wait_for_load_state("networkidle")
+        view.own = path.as_uri()
+        yield view
 
 
 def assert_it_asks_for_nothing(view: Any) -> None:

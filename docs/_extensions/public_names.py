@@ -1,0 +1,33 @@
+"""References to where a public name is defined lead to where it is documented: ``scvi_codegen.NAME``."""
+
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+
+import scvi_codegen
+
+__all__ = ["setup"]
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Called by Sphinx."""
+    app.connect("missing-reference", _resolve)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def _resolve(
+    app: Sphinx, environment: BuildEnvironment, reference: pending_xref, content: nodes.Element
+) -> nodes.reference | None:
+    """The link for ``scvi_codegen.runtime.stepper.Stepper.step``, or for ``Stepper.step`` alone; else nothing."""
+    if reference.get("refdomain") != "py":
+        return None
+    parts = reference["reftarget"].split(".")
+    public = next((n for n, part in enumerate(parts) if part in scvi_codegen.__all__), None)
+    if public is None or not (public == 0 or parts[0] == "scvi_codegen"):
+        return None
+    target = ".".join(["scvi_codegen", *parts[public:]])
+    domain = environment.domains["py"]
+    return domain.resolve_xref(environment, reference["refdoc"], app.builder, "obj", target, reference, content)

@@ -1,0 +1,128 @@
+"""The pages of ``docs``: their code runs, links lead somewhere, all that is public is named, and the site builds.
+
+What ``docs/extending.md`` adds is run in ``test_seams.py``.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browsing import UNREADABLE, VIEWS, looked_at
+from pages import BLOCK, ROOT, run_page, runnable
+
+import scvi_codegen
+
+DOCS = ROOT / "docs"
+PAGES = {str(path.relative_to(DOCS)): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))}
+RUN = [name for name, page in PAGES.items() if name != "extending.md" and any(runnable(page))]
+PEERS = ("heyoka", "rebound")
+"""Libraries that a page may show beside this one, and without which it is skipped."""
+SHOWN = {"python", "console", "sh", "toml", "c", "julia", "diff"}
+"""Languages of blocks."""
+
+
+def imported(page: str) -> set[str]:
+    """Modules that the Python of a page asks for."""
+    trees = [ast.parse(part.text) for part in runnable(page) if part.kind == "python"]
+    nodes = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Import)]
+    return {alias.name for node in nodes for alias in node.names}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_has_code_of_known_kinds_and_links_to_what_is_there(name):
+    page = PAGES[name]
+    assert len(BLOCK.findall(page)) == len(re.findall(r"^```\w+$", page, re.MULTILINE))
+    assert {language for _, language, _ in BLOCK.findall(page)} <= SHOWN
+    assert imported(page) is not None  # all of its Python is read
+    prose = BLOCK.sub("", page)
+    targets = re.findall(r"\]\((?!https?:)([^)#\s]+)(?:#[^)]*)?\)", prose)
+    assert [target for target in targets if not ((DOCS / name).parent / target).exists()] == []
+
+
+def test_c_that_is_shown_alone_is_in_a_generated_file():
+    shown = [
+        text for page in PAGES.values() for name, language, text in BLOCK.findall(page) if language == "c" and not name
+    ]
+    generated = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "generated").glob("*.c")))
+    assert shown
+    assert [text for text in shown if text not in generated] == []
+
+
+def test_the_reference_has_every_public_name_once():
+    pages = "".join(page for name, page in PAGES.items() if name.startswith("reference/"))
+    assert sorted(re.findall(r"^\.\. auto\w+:: (\w+)", pages, re.MULTILINE)) == sorted(scvi_codegen.__all__)
+
+
+def test_every_page_is_in_a_table_of_contents():
+    listed = {"index.md"}
+    for name, page in PAGES.items():
+        for entries in re.findall(r"^```\{toctree\}\n(?::.*\n)*\n?((?:.+\n)*?)```$", page, re.MULTILINE):
+            listed |= {str((Path(name).parent / entry).with_suffix(".md")) for entry in entries.split()}
+    assert listed == set(PAGES)
+
+
+@pytest.mark.full
+@pytest.mark.usefixtures("as_users_compile")
+@pytest.mark.parametrize("name", RUN)
+def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
+    missing = [peer for peer in PEERS if peer in imported(PAGES[name]) and importlib.util.find_spec(peer) is None]
+    if missing:
+        pytest.skip(f"{missing[0]} is not installed: pip install 'scvi-codegen[bench]'")
+    run_page(name, list(runnable(PAGES[name])), tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built without a warning, and without the network."""
+    if any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")):
+        pytest.skip("sphinx, myst-parser or furo is not installed: pip install 'scvi-codegen[docs]'")
+    folder = tmp_path_factory.mktemp("site")
+    [said] = re.findall(r"^python (-m sphinx .*) site$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    command = [sys.executable, *said.split(), str(folder), "-q"]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+@pytest.mark.full
+class TestTheSite:
+    @pytest.fixture(params=VIEWS, ids="-".join)
+    def view(self, request: pytest.FixtureRequest, browser: Any) -> Iterator[Any]:
+        with looked_at(browser, *request.param) as view:
+            yield view
+
+    def test_every_public_name_has_a_place_with_its_docstring(self, site):
+        text = "".join(path.read_text(encoding="utf-8") for path in (site / "reference").glob("*.html"))
+        assert [name for name in scvi_codegen.__all__ if f'id="scvi_codegen.{name}"' not in text] == []
+
+    def test_formulas_are_mathml_and_no_page_needs_the_network(self, site):
+        pages = {path.name: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+        assert pages["galerkin.html"].count("<math") > 10
+        loaded = r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="https?:'
+        assert [name for name, page in pages.items() if re.search(loaded, page)] == []
+
+    def test_pages_fit_a_phone_and_a_desk_by_day_and_by_night(self, site, view):
+        wide, pale = [], []
+        for path in sorted(site.rglob("*.html")):
+            view.goto(path.as_uri())
+            if view.evaluate("document.documentElement.scrollWidth") > view.width:
+                wide.append(path.name)
+            pale += [(path.name, *found) for found in view.evaluate(UNREADABLE)]
+        assert wide == []
+        assert pale == []
+        assert {url.split(":")[0] for url in view.asked} <= {"file", "data"}
+        assert view.said == []
+
+    def test_the_search_finds(self, site, browser):
+        with looked_at(browser, "desk", "light") as view:
+            view.goto((site / "search.html").as_uri() + "?q=momentum")
+            view.wait_for_selector("#search-results li")
+            assert view.locator("#search-results li").count() > 3
