@@ -19,6 +19,7 @@ from scvi_codegen.errors import MethodError as MethodError
 from scvi_codegen.errors import MethodWarning as MethodWarning
 from scvi_codegen.errors import MissingLibraryError as MissingLibraryError
 from scvi_codegen.errors import ModelFileError as ModelFileError
+from scvi_codegen.errors import OrbitError as OrbitError
 from scvi_codegen.errors import PackageError as PackageError
 from scvi_codegen.errors import PlotError as PlotError
 from scvi_codegen.errors import RecordingError as RecordingError
@@ -86,6 +87,8 @@ from scvi_codegen.runtime.fitting import Fit as Fit
 from scvi_codegen.runtime.fitting import fit as fit
 from scvi_codegen.runtime.gradients import Gradient as Gradient
 from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
+from scvi_codegen.runtime.periodic import PeriodicOrbit as PeriodicOrbit
+from scvi_codegen.runtime.periodic import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.run import Run as Run
 from scvi_codegen.runtime.stepper import Stepper as Stepper
 from scvi_codegen.runtime.trajectory import Trajectory as Trajectory
