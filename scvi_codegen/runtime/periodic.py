@@ -3,7 +3,8 @@
 Such orbits are seldom alone: they may be begun anywhere on them, and belong to families, by energy or by another
 conserved quantity. Each step of the iteration is the shortest that meets the linearised equations, in the directions
 that these decide (Moore & Penrose), so that the orbit found is one near the guess, and no condition has to be thought
-of for what does not matter.
+of for what does not matter. What a motion keeps returns by itself: that much of the equations is left out
+(Munoz-Almaraz et al., Physica D 181 (2003) 1).
 """
 
 from __future__ import annotations
@@ -31,15 +32,21 @@ from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["PeriodicOrbit", "periodic_orbit"]
 
-MOST_ITERATIONS = 50
+MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 UNDECIDED = 1e-9
 """Beside the largest singular value: directions in which the end moves along with the start."""
 CLOSED = 1e-11
 """Beside the size of the state, and what the monodromy makes of its rounding: where an orbit ends where it began."""
-FLOW_STEP = 1e-3
-"""Of the step, for the direction in which a motion leaves a state."""
+KEPT = 1e-3
+"""Beside their sizes: how far slopes of an integral may change along a motion that keeps it, by the errors of steps."""
+BESIDE = 1e-6
+"""Beside the size of a state: where its neighbours are."""
 SAME = 1e-6
 """Beside 1: what may be rounding of a stability index."""
+SETTLED = 1e-13
+"""Beside the size of state and period: a step that is rounding."""
+WORSE = 10.0
+"""Than before: what a defect may become on the way."""
 RESTING = 1e-6
 """Beside the size of the state: how far a motion goes in a period that goes nowhere."""
 WHOLE = 1e-9
@@ -299,18 +306,24 @@ class _Search:
         )
 
     def _nearer(self, z: Array, found: _Closing) -> tuple[Array, _Closing] | None:
-        """A step of Newton's iteration, shortened until it helps; ``None`` where none does."""
-        left, sizes, right = np.linalg.svd(found.slopes[:, self.free], full_matrices=False)
-        decided = sizes > UNDECIDED * sizes[0]
-        change = np.zeros_like(z)
-        change[self.free] = right[decided].T @ ((left[:, decided].T @ found.defects) / sizes[decided])
-        for shortened in 0.5 ** np.arange(8):
+        """A step of Newton's iteration, shortened until it helps; ``None`` where none does, or is left.
+
+        It helps if what the same slopes would change next is less (Deuflhard's natural monotonicity): defects would be
+        those of the one direction in which motions part.
+        """
+        inverse = np.zeros((len(z), len(found.defects)))
+        inverse[self.free] = np.linalg.pinv(found.slopes[:, self.free], UNDECIDED)
+        change = inverse @ found.defects
+        if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
+            return None
+        for shortened in 0.5 ** np.arange(MOST_HALVINGS):
             trial = z - shortened * change
             if trial[-1] <= 0.0:
                 continue
             with suppress(StepFailedError):
                 at = self._closing(trial)
-                if np.linalg.norm(at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(found.defects):
+                less = np.linalg.norm(inverse @ at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(change)
+                if less and np.linalg.norm(at.defects) < WORSE * np.linalg.norm(found.defects):
                     return trial, at
         return None
 
@@ -325,22 +338,44 @@ class _Search:
         q, p = stepper.linearise(starts, vectors, self.parameters, self.options, chained=True)
         slopes = vectors[-1, :, :size].T
         monodromy, by_period = slopes[:, :size], slopes[:, size]
-        defects = np.concatenate([q[-1] - z[:m] - self.gain, p[-1] - z[m:-1]])
-        rows = np.column_stack([monodromy - np.eye(size), by_period])
+        end = np.concatenate([q[-1], p[-1]])
+        defects = end - z[:-1] - np.append(self.gain, np.zeros(m))
+        slopes = np.column_stack([monodromy - np.eye(size), by_period])
+        free = self._not_implied(z, end, monodromy)
+        rows, wanted = free @ slopes, free @ defects
         if self.energy is not None:
-            defects = np.append(defects, stepper.energy(z[:m], z[m:-1], self.t, self.parameters) - self.energy)
-            rows = np.vstack([rows, np.append(self._energy_slopes(z, h), 0.0)])
-        return _Closing(defects, rows, monodromy.copy(), by_period.copy())
+            wanted = np.append(wanted, stepper.energy(z[:m], z[m:-1], self.t, self.parameters) - self.energy)
+            rows = np.vstack([rows, np.append(self._slopes_of_integrals(z[:-1], self.t)[0], 0.0)])
+        return _Closing(float(np.abs(defects).max()), wanted, rows, monodromy.copy(), by_period.copy())
 
-    def _energy_slopes(self, z: Array, h: float) -> Array:
-        """(2m,) of the energy by the state, (-p', q'), from short steps either way."""
-        q, p = np.split(z[:-1], 2)
-        forth, back = (
-            self.stepper.sensitivity(q, p, step, self.t, self.parameters, options=self.options)
-            for step in (FLOW_STEP * h, -FLOW_STEP * h)
+    def _not_implied(self, z: Array, end: Array, monodromy: Array) -> Array:
+        """(2m, 2m) projection on the equations that are left: what a motion keeps returns by itself.
+
+        Energy and momentum maps are kept if their slopes are carried from the start to those at the end.
+        """
+        start, ends = (self._slopes_of_integrals(state, t) for state, t in ((z[:-1], self.t), (end, self.t + z[-1])))
+        carried = ends @ monodromy
+        sizes = np.linalg.norm(ends, axis=1) * np.linalg.norm(monodromy, 2)
+        kept = start[np.linalg.norm(carried - start, axis=1) <= KEPT * sizes]
+        directions, strengths, _ = np.linalg.svd(kept.T, full_matrices=False)
+        directions = directions[:, strengths > KEPT * strengths.max(initial=0.0)]
+        projection: Array = np.eye(len(end)) - directions @ directions.T
+        return projection
+
+    def _slopes_of_integrals(self, state: Array, t: float) -> Array:
+        """(r, 2m) of the energy, first, and of the momentum maps, by differences: they show directions only."""
+        size, width = len(state), BESIDE * max(1.0, float(np.abs(state).max()))
+        states = np.vstack([state + width * np.eye(size), state - width * np.eye(size)])
+        q, p = np.ascontiguousarray(states[:, : size // 2]), np.ascontiguousarray(states[:, size // 2 :])
+        times = np.full(2 * size, t)
+        values = np.column_stack(
+            [
+                self.stepper.energy(q, p, times, self.parameters),
+                self.stepper.momentum_maps(q, p, times, self.parameters).reshape(2 * size, -1),
+            ]
         )
-        velocity, force = np.split((np.asarray(forth.h) + np.asarray(back.h)) / 2.0, 2)
-        return np.concatenate([-force, velocity])
+        slopes: Array = (values[:size] - values[size:]).T / (2.0 * width)
+        return slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,17 +383,14 @@ class _Closing:
     """How far a motion is from closing.
 
     Attributes:
-        defects: (r,) of what has to be 0, the first 2m the end less the start.
+        error: the largest number of the end less the start.
+        defects: (r,) of what has to be 0.
         slopes: (r, 2m + 1) of them by (q, p, period).
-        monodromy, by_period: of the end.
+        monodromy, by_period: derivatives of the end.
     """
 
+    error: float
     defects: Array
     slopes: Array
     monodromy: Array
     by_period: Array
-
-    @property
-    def error(self) -> float:
-        """The largest number of the end less the start."""
-        return float(np.abs(self.defects[: len(self.monodromy)]).max())
