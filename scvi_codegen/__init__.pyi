@@ -19,6 +19,7 @@ from scvi_codegen.errors import MethodError as MethodError
 from scvi_codegen.errors import MethodWarning as MethodWarning
 from scvi_codegen.errors import MissingLibraryError as MissingLibraryError
 from scvi_codegen.errors import ModelFileError as ModelFileError
+from scvi_codegen.errors import OrbitError as OrbitError
 from scvi_codegen.errors import PackageError as PackageError
 from scvi_codegen.errors import PlotError as PlotError
 from scvi_codegen.errors import RecordingError as RecordingError
@@ -77,6 +78,7 @@ from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run
 from scvi_codegen.results.recording import resume_run as resume_run
+from scvi_codegen.runtime.deviations import Deviations as Deviations
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory as DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory as EnsembleTrajectory
 from scvi_codegen.runtime.events import Crossings as Crossings
@@ -85,6 +87,8 @@ from scvi_codegen.runtime.fitting import Fit as Fit
 from scvi_codegen.runtime.fitting import fit as fit
 from scvi_codegen.runtime.gradients import Gradient as Gradient
 from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
+from scvi_codegen.runtime.periodic import PeriodicOrbit as PeriodicOrbit
+from scvi_codegen.runtime.periodic import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.run import Run as Run
 from scvi_codegen.runtime.stepper import Stepper as Stepper
 from scvi_codegen.runtime.trajectory import Trajectory as Trajectory

@@ -17,6 +17,7 @@ __all__ = [
     "MethodWarning",
     "MissingLibraryError",
     "ModelFileError",
+    "OrbitError",
     "PackageError",
     "PlotError",
     "RecordingError",
@@ -68,6 +69,10 @@ class FitError(ScviCodegenError, ValueError):
 
 class MethodError(ScviCodegenError, ValueError):
     """A combination of degree, nodes and quadrature that makes no sense."""
+
+
+class OrbitError(ScviCodegenError, ArithmeticError):
+    """No periodic orbit was found near a guess."""
 
 
 class MethodWarning(UserWarning):

@@ -33,6 +33,7 @@ from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import record_states
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.workers import PROGRESS_SECONDS
 
 __all__ = [
     "Change",
@@ -46,7 +47,6 @@ FIRST_PORTION = 64
 """Steps of a block before the first look at the clock."""
 PORTION_SECONDS = 0.02
 """Time between looks, in a block, for a wish to stop."""
-PROGRESS_SECONDS = 0.1
 
 
 def integrate_ensemble(

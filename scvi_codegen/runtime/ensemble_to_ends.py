@@ -6,10 +6,7 @@ Trajectories are the single integrator's, which has a table for each change of l
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Callable
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +17,6 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.ensemble import PROGRESS_SECONDS
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
 from scvi_codegen.runtime.goal import Goal
@@ -30,6 +26,7 @@ from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.workers import Heed, run_each
 
 __all__ = ["EnsembleToEnds", "steps_of_ensemble"]
 
@@ -52,10 +49,6 @@ class KeptLane(NamedTuple):
     p: Array
     status: str
     steps: int
-
-
-class _Stopped(Exception):  # noqa: N818  (a wish, not an error)
-    """Another trajectory was interrupted, and so is this one."""
 
 
 class EnsembleToEnds:
@@ -131,30 +124,13 @@ class EnsembleToEnds:
             progress: called now and then with the number of trajectories done.
             threads: workers, by default one a core.
         """
-        workers, stop = checked_count(threads or os.cpu_count() or 1, "threads", least=1), threading.Event()
 
-        def heed(done: int) -> None:
-            if stop.is_set():
-                raise _Stopped
-
-        def drive(j: int) -> None:
-            heed(0)
+        def drive(j: int, heed: Heed) -> None:
             self.kept[j] = self._trajectory(j, heed)
 
-        with ThreadPoolExecutor(workers) as pool:
-            try:
-                pending = {pool.submit(drive, j) for j in range(len(self))}
-                while pending:
-                    finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
-                    for future in finished:
-                        future.result()
-                    if progress is not None:
-                        progress(len(self.kept))
-            finally:
-                stop.set()
-                pool.shutdown(cancel_futures=True)
+        run_each(len(self), drive, progress=progress, threads=threads)
 
-    def _trajectory(self, j: int, heed: Callable[[int], None]) -> KeptLane:
+    def _trajectory(self, j: int, heed: Heed) -> KeptLane:
         goal, status = self.goals[j], OK
         try:
             run = Memory.started(
@@ -173,7 +149,7 @@ class EnsembleToEnds:
             status, found = failure.status, Trajectory.before(failure)
         return KeptLane(found.t, found.q, found.p, status, run.steps)
 
-    def _states(self, run: Memory, goal: Goal, heed: Callable[[int], None]) -> Trajectory:
+    def _states(self, run: Memory, goal: Goal, heed: Heed) -> Trajectory:
         if self.t_eval is None:
             return record(run, None, every=self.every, progress=heed)
         reached = np.abs(self.t_eval - self.t0) <= abs(goal.t_end - self.t0)

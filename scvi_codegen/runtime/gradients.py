@@ -22,7 +22,7 @@ from scvi_codegen.runtime.linearised import Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.retaken import refuse_strays, steps_between
 
-__all__ = ["Gradient", "carried", "pulled_back", "sensitivity"]
+__all__ = ["Gradient", "carried", "carry", "pieces", "pulled_back", "sensitivity", "starts_of"]
 
 MOST_STEPS = 1024
 """Of a piece, where all states are kept."""
@@ -81,13 +81,13 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
     seeds = np.zeros((len(states), slopes[0].size // size, states.stepper.given))
     seeds[:, :, :size] = slopes.reshape(len(states), size, -1).transpose(0, 2, 1)
     now = np.zeros_like(seeds[0])
-    for first, last in reversed(list(_pieces(states))):
-        starts, numbers = _starts(states, first, last)
+    for first, last in reversed(list(pieces(states))):
+        starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
         kept = np.flatnonzero(numbers[1:] > 0) + 1
         vectors[kept] = seeds[numbers[kept]]
         vectors[-1] += now
-        _carry(states, starts, numbers, vectors, back=True)
+        carry(states, starts, numbers, vectors, back=True)
         now = vectors[0]
     found = (now + seeds[0]).T.reshape(states.stepper.given, *slopes.shape[2:])
     return Gradient(
@@ -111,25 +111,25 @@ def _forward(states: KeptStates, changes: Array) -> Array:
     size = 2 * states.stepper.dimension
     found = np.empty((len(states), size, len(changes)))
     found[0] = changes[:, :size].T
-    for first, last in _pieces(states):
-        starts, numbers = _starts(states, first, last)
+    for first, last in pieces(states):
+        starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *changes.shape))
         vectors[0] = changes
-        _carry(states, starts, numbers, vectors, back=False)
+        carry(states, starts, numbers, vectors, back=False)
         kept = np.flatnonzero(numbers[1:] > 0) + 1
         found[numbers[kept]] = vectors[kept, :, :size].transpose(0, 2, 1)
         changes = vectors[-1]
     return found
 
 
-def _carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
+def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Along the steps of a piece, whose ends are held against the states it is made of."""
     ends = states.stepper.linearise(starts, vectors, states.parameters, states.options, back=back)
     known = np.concatenate([starts.q, starts.p], axis=1)
     refuse_strays(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
 
 
-def _pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
+def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
     """First and last number of kept states: with no steps between them but those that are kept, or just two."""
     spans, lengths = np.diff(states.t), states.lengths[:-1]
     several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
@@ -143,7 +143,7 @@ def _pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def _starts(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
+def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
     """The steps of a piece, and (steps + 1,) the number of the kept state at each of their ends, -1 where none is."""
     length, span = float(states.lengths[first]), float(states.t[last] - states.t[first])
     count = steps_between(length, span) if last == first + 1 else 1

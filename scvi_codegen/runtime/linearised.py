@@ -68,6 +68,11 @@ class Starts:
         starts.q[0], starts.p[0] = q, p
         return starts
 
+    def part(self, first: int, last: int) -> Starts:
+        """Of the steps from ``first`` until before ``last``: the same memory."""
+        steps, states = slice(first, last), slice(first, last + 1)
+        return Starts(self.t[steps], self.h[steps], self.q[states], self.p[states])
+
 
 class LinearisedMethod(CompiledMethod):
     """A compiled method with the derivatives of its steps, in a library of their own, compiled when first asked for."""
@@ -112,12 +117,6 @@ class LinearisedMethod(CompiledMethod):
         Inputs are parameters, five each. Where constraints have parameters, the state is held and not moved to them.
         """
         return Sensitivity.of(self._columns(q, p, h, t, parameters, options, self.given)[2], self.dimension)
-
-    def tangent_step(
-        self, q: Array, p: Array, h: float, t: float, parameters: Parameters, options: SolverOptions | None
-    ) -> tuple[Array, Array, Array]:
-        """(q1, p1) and the derivative by (q, p)."""
-        return self._columns(q, p, h, t, parameters, options, 2 * self.dimension)
 
     def _columns(
         self,

@@ -19,16 +19,11 @@ from scvi_codegen.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
-from scvi_codegen.runtime.constrained_states import ConstrainedStates
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, parameters_of
-from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
-from scvi_codegen.runtime.ensemble import integrate_ensemble
-from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
-from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.ensembles import Ensembles
 from scvi_codegen.runtime.events import Event, EventLike
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Parameters
@@ -40,7 +35,7 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["Stepper"]
 
 
-class Stepper(ConstrainedStates):
+class Stepper(Ensembles):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -122,78 +117,6 @@ class Stepper(ConstrainedStates):
         if clocked:
             raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
         return _said(Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress))
-
-    def integrate_ensemble(
-        self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
-        *,
-        velocity: ArrayLike | None = None,
-        h: float | None = None,
-        steps: int | None = None,
-        t_end: ArrayLike | None = None,
-        tolerance: float | None = None,
-        every: int = 1,
-        t: float = 0.0,
-        t_eval: ArrayLike | None = None,
-        parameters: EnsembleParameters = None,
-        options: SolverOptions | None = None,
-        progress: Callable[[int], None] | None = None,
-        threads: int | None = None,
-    ) -> EnsembleTrajectory:
-        """Run k trajectories over all cores: with common steps, eight at a time as vector lanes, or each by its own.
-
-        Args:
-            q, p: (k, m) initial positions and momenta.
-            velocity: (k, m) initial velocities, in place of p.
-            h, steps, every, t, options, progress: as in :meth:`integrate`.
-            t_end: instead of h and steps: one time or (k,) times to go to, by steps that choose their length in each
-                trajectory. Every ``every``-th state of each is kept, and the last: ``times`` says when. ``progress`` is
-                then called with the number of trajectories done.
-            tolerance: relative error of the end of such a step; by default round-off.
-            t_eval: (n,) times: keep the states of all trajectories at these instead; NaN beyond their ends.
-            parameters: by name, one number or k each; or (k, number of parameters).
-            threads: workers, by default one a core.
-
-        Returns:
-            An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
-            fails has NaN from there on and says why in ``status``; the others are not disturbed.
-
-        Raises:
-            StateError: on wrong shapes, names or numbers.
-        """
-        if self.interface.monitor:
-            raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
-        p = momenta_of_each(self, q, p, velocity, t, parameters)
-        if h is None and steps is None and t_end is not None:
-            work = EnsembleToEnds(
-                self,
-                q,
-                p,
-                t_end=t_end,
-                tolerance=tolerance,
-                every=every,
-                t=t,
-                t_eval=t_eval,
-                parameters=parameters,
-                options=options,
-            )
-            work.run(progress=progress, threads=threads)
-            return work.result()
-        h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
-        return integrate_ensemble(
-            self,
-            q,
-            p,
-            h=h,
-            steps=steps,
-            every=every,
-            t=t,
-            parameters=parameters,
-            options=options,
-            progress=progress,
-            threads=threads,
-        )
 
     def start(
         self,
@@ -280,54 +203,6 @@ class Stepper(ConstrainedStates):
             options=options,
         )
         return drive(run, data, end, every=checked_count(every, "every", least=1), values=values, progress=progress)
-
-    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
-    def drive_ensemble(
-        self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
-        *,
-        inputs: Mapping[str, Any],
-        h: float,
-        velocity: ArrayLike | None = None,
-        steps: int | None = None,
-        t_end: float | None = None,
-        every: int = 1,
-        t: float = 0.0,
-        parameters: EnsembleParameters = None,
-        options: SolverOptions | None = None,
-        progress: Callable[[int], None] | None = None,
-        threads: int | None = None,
-    ) -> EnsembleTrajectory:
-        """Run k trajectories with inputs, by common steps that end at all breakpoints.
-
-        Args:
-            inputs: as of :meth:`drive`, the same for all trajectories; with values of shape (k, n) each has its own.
-            h: of steps; one that ends at a breakpoint is shorter.
-            steps, t_end: one of both.
-            q, p, velocity, every, t, parameters, options, progress, threads: as of :meth:`integrate_ensemble`.
-
-        Returns:
-            An :class:`EnsembleTrajectory` with the states of :meth:`drive`, equal to round-off.
-
-        Raises:
-            StateError: as :meth:`drive`.
-        """
-        work = DrivenEnsemble.of(
-            self,
-            q,
-            p,
-            velocity=velocity,
-            inputs=inputs,
-            h=h,
-            t_end=end_of(t, h, steps, t_end),
-            every=every,
-            t=t,
-            parameters=parameters,
-            options=options,
-        )
-        work.run(progress=progress, threads=threads)
-        return work.result()
 
     def restore(
         self,

@@ -23,11 +23,9 @@ from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.exchanges import exchanged_until
-from scvi_codegen.runtime.gradients import Gradient, carried, pulled_back, sensitivity
-from scvi_codegen.runtime.kept_states import Array, KeptStates
-from scvi_codegen.runtime.linearised import Sensitivity
+from scvi_codegen.runtime.kept_states import Array
+from scvi_codegen.runtime.nearby import NearbyMotions
 from scvi_codegen.runtime.quantities import quantities
-from scvi_codegen.runtime.tangents import lyapunov_exponents
 
 if TYPE_CHECKING:
     import pandas
@@ -43,7 +41,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trajectory(KeptStates):
+class Trajectory(NearbyMotions):
     """States along a run, the initial one first.
 
     Attributes:
@@ -113,44 +111,6 @@ class Trajectory(KeptStates):
         :meth:`work`.
         """
         return exchanged_until(self)[:, 1:]
-
-    def tangent(self, directions: ArrayLike | None = None) -> Array:
-        """(n, 2m, k) what becomes of (2m, k) directions of (q, p) at the first state; all 2m without any.
-
-        The exact derivative of the computed states, lengths of steps held (:meth:`Stepper.jacobian`).
-
-        Raises:
-            MethodError: in transformed time.
-            StateError: for directions of another shape, and states that do not stand at whole steps.
-        """
-        return carried(self, directions)
-
-    def sensitivity(self) -> Sensitivity:
-        """Derivatives of all states by the initial state, the parameters, the initial time and h, lengths held.
-
-        Of steps solved anew from the kept states, exact to round-off. For a few functions of the states
-        :meth:`pullback` costs less. Raises as :meth:`tangent`.
-        """
-        return sensitivity(self)
-
-    def pullback(self, cotangents: ArrayLike) -> Gradient:
-        """The gradient of a function of the states by the initial state, the parameters, the initial time and h.
-
-        One pass back along the run, whatever the number of parameters: the adjoint, exact to round-off of the computed
-        states. Where not all states are kept (``every``) the steps between them are taken again.
-
-        Args:
-            cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions.
-
-        Raises:
-            MethodError: in transformed time.
-            StateError: for another shape, and states that do not stand at whole steps.
-        """
-        return pulled_back(self, cotangents)
-
-    def lyapunov_exponents(self) -> Array:
-        """(2m,) Lyapunov exponents of the time that the run covers, descending; of symplectic maps their sum is 0."""
-        return lyapunov_exponents(self)
 
     def multipliers(self) -> Array:
         """(n, c) multipliers of the constraints: g_q^T lambda are the forces that keep the states on them.

@@ -1,0 +1,212 @@
+"""Indicators of chaos: against closed forms, variational equations by DOP853, published values, promises."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import solve_ivp
+
+from scvi_codegen import SVI, Gauss, LagrangianSystem, StateError, compile_stepper, problem
+
+REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
+"""Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""
+
+
+@pytest.fixture(scope="module")
+def galaxy():
+    return compile_stepper(problem("henon-heiles").system, SVI(2))
+
+
+def slope(x, y):
+    return np.polyfit(x, y, 1)[0]
+
+
+def test_exponents_are_opposite_in_pairs_at_all_times(galaxy):
+    run = galaxy.integrate(*CHAOTIC, h=0.2, steps=4000)
+    history = run.lyapunov_exponents(history=True)
+    assert np.isnan(history[0]).all()
+    assert np.abs(history[1:] + history[1:, ::-1]).max() < 1e-13
+    assert np.abs(history[1:].sum(axis=1)).max() < 1e-13
+    assert_array_equal(history[-1], run.lyapunov_exponents())
+    assert np.abs(history[10:, 0]).max() > 0.02
+
+
+def test_an_exponent_of_henon_and_heiles_is_the_published_one(galaxy):
+    """0.047 (Skokos, Bountis & Antonopoulos 2007): the mean over orbits near theirs: one stays near islands long.
+
+    That of the regular orbit goes to 0 as log(t)/t.
+    """
+    q, p = np.tile(CHAOTIC[0], (12, 1)), np.tile(CHAOTIC[1], (12, 1))
+    q[:, 1] += 1e-6 * np.arange(12)
+    found = galaxy.deviations_ensemble(q, p, h=0.2, steps=20_000, count=1)
+    assert found.lyapunov_exponents()[-1].mean() == pytest.approx(0.047, abs=0.01)
+    regular = galaxy.integrate(*REGULAR, h=0.2, steps=20_000, every=2000).lyapunov_exponents(history=True)
+    assert regular[-1, 0] < 2 * np.log(4000.0) / 4000.0
+    assert regular[-1, 0] < 0.25 * regular[1, 0]
+
+
+def test_a_saddle_has_the_exponents_of_its_linear_motion():
+    """x'' = a^2 x beside y'' = -b^2 y: a, 0, 0, -a; by a method of high order."""
+    saddle = LagrangianSystem.from_text(
+        name="saddle", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2 + 0.09*x**2 - 4*y**2)/2"
+    )
+    run = compile_stepper(saddle, Gauss(4)).integrate([0.0, 0.1], [0.0, 0.0], h=0.05, steps=20_000)
+    assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], atol=5e-3)
+    deviations = run.deviations()
+    assert deviations.log_gali(2)[-1] < -290.0
+    assert slope(run.t[10_000:], deviations.log_gali(2)[10_000:]) == pytest.approx(-0.3, rel=1e-3)
+    assert slope(run.t[10_000:], deviations.log_gali(4)[10_000:]) == pytest.approx(-1.2, rel=1e-3)
+    assert slope(run.t[10_000:], run.megno()[10_000:]) == pytest.approx(0.15, rel=1e-3)
+    assert slope(run.t[10_000:], run.fli()[10_000:]) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_free_particle_spreads_as_it_can_be_written_down():
+    """A change (u, v) becomes (u + v t, v), for every method; integrals by the steps, to their second order."""
+    free = LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2")
+    run = compile_stepper(free, SVI(2)).integrate([0.0], [1.0], h=0.01, steps=2000)
+    found, t = run.deviations(directions=[3.0, 4.0]), run.t
+    lengths = np.log(np.hypot(0.6 + 0.8 * t, 0.8))
+    assert_allclose(found.lengths[:, 0], lengths, atol=1e-13)
+    assert_allclose(found.fli(), np.maximum.accumulate(lengths), atol=1e-13)
+    areas = np.append(0.0, np.cumsum(np.diff(t) * (lengths[1:] + lengths[:-1]) / 2))
+    rates = 2.0 * (lengths[1:] - areas[1:] / t[1:])
+    assert_allclose(found.rates[1:, 0], rates, atol=1e-12)
+    assert found.megno()[-1] == pytest.approx(np.trapezoid(np.append(0.0, rates), t) / t[-1], abs=1e-12)
+
+
+def test_indicators_are_those_of_the_variational_equations(galaxy):
+    """Changes, the integrals of MEGNO and volumes of a chaotic orbit by DOP853."""
+    run = compile_stepper(problem("henon-heiles").system, SVI(6)).integrate(*CHAOTIC, h=0.02, steps=2500)
+    found = run.deviations(3)
+    changes = np.array(_start(run))[:, :3]
+
+    def motion(t, z):
+        x, y, v = z[0], z[1], z[4:16].reshape(4, 3)
+        hessian = np.array([[1 + 2 * y, 2 * x], [2 * x, 1 - 2 * y]])
+        moved = np.vstack([v[2:], -hessian @ v[:2]])
+        rate = (v[:, 0] @ moved[:, 0]) / (v[:, 0] @ v[:, 0])
+        mean = 2.0 * z[16] / t if t else 0.0
+        return [z[2], z[3], -x - 2 * x * y, -y - x**2 + y**2, *moved.ravel(), rate * t, mean]
+
+    start = [*CHAOTIC[0], *CHAOTIC[1], *changes.ravel(), 0.0, 0.0]
+    ends = solve_ivp(motion, (0, 50.0), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    moved = ends[4:16].reshape(4, 3)
+    sizes = np.linalg.norm(moved, axis=0)
+    assert_allclose(found.lengths[-1], np.log(sizes), atol=1e-7)
+    assert found.gali(3)[-1] == pytest.approx(np.prod(np.linalg.svd(moved / sizes)[1]), rel=1e-5)
+    one, other = (moved / sizes).T[:2]
+    smaller = min(np.linalg.norm(one + other), np.linalg.norm(one - other))
+    assert found.sali()[-1] == pytest.approx(smaller, rel=1e-5)
+    assert found.rates[-1, 0] == pytest.approx(2.0 * ends[16] / 50.0, rel=1e-3)
+    assert found.megno()[-1] == pytest.approx(ends[17] / 50.0, rel=1e-3)
+
+
+def _start(run):
+    """The changes at the start: those that one step makes, and its derivative undone."""
+    one = run.stepper.integrate(run.q[0], run.p[0], h=1e-9, steps=1)
+    frame = one.deviations()
+    assert np.abs(frame.lengths).max() < 1e-8
+    from scvi_codegen.runtime.spreading import Changes
+
+    return Changes.checked(run.stepper, None, None).at(run.q[0], run.p[0], 0.1, 0.0, run.parameters, None)
+
+
+def test_regular_and_chaotic_motions_are_told_apart(galaxy):
+    """MEGNO to 2 or along lambda t / 2; GALI_2 constant, GALI_3 and GALI_4 as t^-2 and t^-4, or exponential."""
+    regular, chaotic = (galaxy.integrate(*start, h=0.2, steps=15_000) for start in (REGULAR, CHAOTIC))
+    assert regular.megno()[-1] == pytest.approx(2.0, abs=0.1)
+    late, found = slice(1500, None), regular.deviations()
+    powers = [slope(np.log(regular.t[late]), found.log_gali(k)[late]) for k in (2, 3, 4)]
+    assert_allclose(powers, [0.0, -2.0, -4.0], atol=0.3)
+    assert slope(np.log(regular.t[late]), found.fli()[late]) == pytest.approx(1.0, abs=0.2)
+    assert regular.gali(2).min() > 0.05
+    found, t = chaotic.deviations(), chaotic.t[-1]
+    exponents = found.lyapunov_exponents()[-1]
+    assert 2.0 * chaotic.megno()[-1] / t == pytest.approx(exponents[0], rel=0.4)
+    assert chaotic.fli()[-1] / t == pytest.approx(exponents[0], rel=0.05)
+    assert found.log_gali(2)[-1] / t == pytest.approx(exponents[1] - exponents[0], rel=0.1)
+    assert found.log_gali(4)[-1] / t == pytest.approx(-4.0 * exponents[0], rel=0.05)
+    assert found.log_gali(4)[-1] < -400.0  # where products of lengths would long be rounding
+    assert 0.0 < chaotic.sali()[1000] < 1e-2 < regular.sali()[-1]
+
+
+def test_states_left_out_change_nothing(galaxy):
+    whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
+    some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, every=50)
+    for name in ("lengths", "stretches", "rates", "mean_rates"):
+        assert_allclose(getattr(some.deviations(), name), getattr(whole.deviations(), name)[::50], rtol=1e-9, atol=1e-9)
+    back = galaxy.integrate(whole.q[-1], whole.p[-1], h=-0.2, steps=600)
+    assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
+
+
+def test_friction_moves_the_middle_of_the_spectrum():
+    """Pairs add up to minus the damping: Dressler, Phys. Rev. A 38 (1988) 2103."""
+    driven = LagrangianSystem.from_text(
+        name="driven pendulum",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + cos(q)",
+        parameters={"c": 0.25},
+        forces={"q": "1.5*cos(2*t/3)"},
+        dissipation="c*q_dot**2/2",
+    )
+    run = compile_stepper(driven, SVI(4)).integrate([0.2], [0.0], h=0.1, steps=3000)
+    assert run.lyapunov_exponents().sum() == pytest.approx(-0.25, abs=1e-6)
+
+
+def test_constraints_leave_fewer_changes():
+    """A pendulum of rods: two changes, those of the angle."""
+    rod = LagrangianSystem.from_text(
+        name="rod",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["x**2 + y**2 = 1"],
+    )
+    run = compile_stepper(rod, SVI(4, "gauss-lobatto:5")).integrate([1.0, 0.0], [0.0, 0.0], h=0.1, steps=4000)
+    exponents = run.lyapunov_exponents()
+    assert exponents.shape == (2,)
+    assert np.abs(exponents).max() < 0.02
+    assert run.megno()[-1] == pytest.approx(2.0, abs=0.3)
+    with pytest.raises(StateError, match="constraints leave 2 independent changes of the state, not 3"):
+        run.deviations(3)
+
+
+def test_ensembles_are_the_same_as_runs(galaxy):
+    q, p = np.array([REGULAR[0], CHAOTIC[0], [0.0, 0.95]]), np.array([REGULAR[1], CHAOTIC[1], [0.4, 0.4]])
+    done = []
+    with np.errstate(all="ignore"):
+        found = galaxy.deviations_ensemble(q, p, h=0.2, steps=1200, every=200, threads=2, progress=done.append)
+    assert list(found.status) == ["ok", "ok", found.status[2]]
+    assert found.status[2] != "ok"
+    assert np.isnan(found.megno()[-1, 2])
+    assert done[-1] == 3
+    for j, start in enumerate((REGULAR, CHAOTIC)):
+        alone = galaxy.integrate(*start, h=0.2, steps=1200, every=200).deviations()
+        assert_array_equal(found.t, alone.t)
+        assert_allclose(found.lengths[:, j], alone.lengths, rtol=1e-5)
+        assert_allclose(found.megno()[:, j], alone.megno(), rtol=1e-5)
+        assert_allclose(found.lyapunov_exponents()[1:, j], alone.lyapunov_exponents()[1:], atol=1e-6)
+        assert_allclose(found.log_gali(3)[:, j], alone.log_gali(3), rtol=1e-5, atol=1e-9)
+    last = galaxy.deviations_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1, threads=1)
+    assert_array_equal(
+        last.megno()[-1], galaxy.deviations_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1).megno()[-1]
+    )
+    assert last.megno().shape == (2, 2)
+
+
+def test_what_is_refused(galaxy):
+    run = galaxy.integrate(*REGULAR, h=0.2, steps=4)
+    with pytest.raises(StateError, match="this run has no steps"):
+        galaxy.integrate(*REGULAR, h=0.2, steps=0).lyapunov_exponents()
+    with pytest.raises(StateError, match="whole steps"):
+        galaxy.integrate(*REGULAR, h=0.2, steps=4, t_eval=[0.1, 0.3]).megno()
+    with pytest.raises(StateError, match="number of changes must be at most 4, not 5"):
+        run.deviations(5)
+    with pytest.raises(StateError, match=r"shape \(4,\) or \(4, k\)"):
+        run.deviations(directions=[1.0, 2.0])
+    with pytest.raises(StateError, match="give one of them"):
+        run.deviations(1, directions=[1.0, 0.0, 0.0, 0.0])
+    with pytest.raises(StateError, match="finite, and not 0"):
+        run.deviations(directions=np.zeros(4))
+    with pytest.raises(StateError, match="there are 2 changes here"):
+        run.deviations(2).gali(3)
+    with pytest.raises(StateError, match="no multiple of every=3"):
+        galaxy.deviations_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, every=3)

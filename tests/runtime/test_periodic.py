@@ -1,0 +1,164 @@
+"""Periodic orbits: published ones, closed forms, monodromies by DOP853, and what is no orbit."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+
+from scvi_codegen import (
+    SVI,
+    ExplicitEuler,
+    LagrangianSystem,
+    MethodError,
+    OrbitError,
+    StateError,
+    compile_stepper,
+    periodic_orbit,
+    problem,
+)
+
+EARTH_MOON = 1.215058560962404e-2
+HALO = ([1.142732397667005, 0.0, 0.15915200933380999], [0.0, -0.22233902828510901, 0.0], 3.1327035113287223)
+"""Position, velocity and period of a northern halo orbit about L2 in the catalogue of three-body periodic orbits of the
+Jet Propulsion Laboratory (ssd.jpl.nasa.gov/tools/periodic_orbits.html)."""
+
+
+@pytest.fixture(scope="module")
+def restricted():
+    """Three bodies in the rotating frame, by its Lagrangian."""
+    system = LagrangianSystem.from_text(
+        name="restricted three-body problem",
+        coordinates=["x", "y", "z"],
+        lagrangian="((x_dot - y)**2 + (y_dot + x)**2 + z_dot**2)/2"
+        " + (1 - mu)/sqrt((x + mu)**2 + y**2 + z**2) + mu/sqrt((x - 1 + mu)**2 + y**2 + z**2)",
+        parameters={"mu": EARTH_MOON},
+    )
+    return compile_stepper(system, SVI(6))
+
+
+@pytest.fixture(scope="module")
+def galaxy():
+    return compile_stepper(problem("henon-heiles").system, SVI(4))
+
+
+def test_a_halo_orbit_is_the_published_one(restricted):
+    """From a guess that is off in the third digit, to the tenth; its monodromy against differences by DOP853."""
+    x, v, period = HALO
+    guess = [1.001 * x[0], 0.0, x[2]], [0.0, 0.998 * v[1], 0.0]
+    orbit = periodic_orbit(restricted, guess[0], velocity=guess[1], period=1.001 * period, steps=200, hold=["y", "z"])
+    assert_allclose(orbit.q, x, atol=1e-10)
+    assert_allclose(restricted.velocity(orbit.q, orbit.p), v, atol=1e-10)
+    assert orbit.period == pytest.approx(period, abs=1e-10)
+    assert orbit.residual < 1e-12
+    assert orbit.reciprocal_error < 1e-7
+    assert orbit.symplectic_error < 1e-13
+    assert not orbit.stable
+    assert_allclose(orbit.monodromy, _monodromy(orbit), atol=1e-8 * np.abs(orbit.monodromy).max())
+    greatest = orbit.multipliers[0].real
+    assert orbit.stability_indices[0] == pytest.approx((greatest + 1 / greatest) / 2, rel=1e-9)
+    assert np.abs(orbit.stability_indices - 1.0).min() < 1e-9
+    assert len(orbit.run(every=50)) == 5
+
+
+def _monodromy(orbit):
+    """Of positions and momenta: p = v + (-y, x, 0), H = p^2/2 + y p_x - x p_y - .."""
+
+    def motion(t, z):
+        (x, y, w), p = z[:3], z[3:]
+        v = np.array([p[0] + y, p[1] - x, p[2]])
+        near, far = (x + EARTH_MOON, y, w), (x - 1 + EARTH_MOON, y, w)
+        pull = sum(m * np.array(r) / np.linalg.norm(r) ** 3 for m, r in ((1 - EARTH_MOON, near), (EARTH_MOON, far)))
+        return [*v, p[1] - pull[0], -p[0] - pull[1], -pull[2]]
+
+    def end(z):
+        return solve_ivp(motion, (0, orbit.period), z, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+
+    start = np.concatenate([orbit.q, orbit.p])
+    columns = []
+    for unit in 1e-5 * np.eye(6):
+        a, b, c, d = (end(start + s * unit) for s in (1, -1, 2, -2))
+        columns.append((8 * (a - b) - (c - d)) / 12e-5)
+    return np.array(columns).T
+
+
+def test_a_pendulum_swings_as_long_as_the_elliptic_integral_says():
+    """The amplitude held, then the period, then the energy; and one that turns over."""
+    pendulum = compile_stepper(problem("planar-pendulum").system, SVI(8))
+    values = {"m": 1.0, "l": 1.0, "g": 1.0}
+    exact = 4 * ellipk(np.sin(0.5) ** 2)
+    amplitude = periodic_orbit(pendulum, [1.0], [0.1], period=7.0, steps=60, hold=["q"], parameters=values)
+    at_rest = periodic_orbit(pendulum, [1.0], [0.0], period=7.0, steps=60, hold=["q", "p_q"], parameters=values)
+    assert at_rest.period == pytest.approx(exact, rel=1e-12)
+    assert amplitude.period > exact
+    timed = periodic_orbit(
+        pendulum, [1.1], [0.0], period=exact, steps=60, hold=["p_q"], fixed_period=True, parameters=values
+    )
+    assert timed.q[0] == pytest.approx(1.0, abs=1e-9)
+    weighed = periodic_orbit(pendulum, [0.9], [0.05], period=6.5, steps=60, energy=-np.cos(1.0), parameters=values)
+    assert weighed.period == pytest.approx(exact, rel=1e-11)
+    assert weighed.energy == pytest.approx(-np.cos(1.0), abs=1e-12)
+    assert weighed.stable
+    assert_allclose(weighed.stability_indices, [1.0], atol=1e-10)
+    over = periodic_orbit(
+        pendulum, [0.0], [2.5], period=3.0, steps=60, hold=["q", "p_q"], gain=[2 * np.pi], parameters=values
+    )
+    assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
+
+
+def test_orbits_of_a_galaxy_by_energy(galaxy):
+    """The stable one at y = 0.3 or so, the unstable one below; and turned by a third, as the potential may be."""
+    energy = 1 / 8
+    stable = periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, h=0.1, energy=energy)
+    unstable = periodic_orbit(galaxy, [0.0, -0.2], [0.45, 0.01], period=6.8, h=0.1, energy=energy)
+    for orbit in (stable, unstable):
+        assert orbit.energy == pytest.approx(energy, abs=1e-13)
+        assert orbit.residual < 1e-12
+        assert orbit.reciprocal_error < 1e-5
+        assert np.prod(orbit.multipliers) == pytest.approx(1.0, abs=1e-8)
+        assert_allclose(orbit.monodromy, orbit.run().tangent()[-1], atol=1e-9 * np.abs(orbit.monodromy).max())
+        assert orbit.period / orbit.steps <= 0.12
+    assert stable.stable
+    assert not unstable.stable
+    turn = np.array([[-1.0, -np.sqrt(3.0)], [np.sqrt(3.0), -1.0]]) / 2.0
+    turned = periodic_orbit(galaxy, turn @ stable.q, turn @ stable.p, period=stable.period, steps=stable.steps)
+    assert turned.iterations <= 1
+    assert_allclose(turned.stability_indices, stable.stability_indices, atol=1e-9)
+
+
+def test_a_driven_oscillator_answers_in_its_period():
+    """x'' = -x - c x' + cos(w t): the closed form; multipliers exp(-c/2 +- i ..), no pairs."""
+    driven = LagrangianSystem.from_text(
+        name="driven oscillator",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2",
+        parameters={"c": 0.2, "w": 1.5},
+        forces={"x": "cos(w*t)"},
+        dissipation="c*x_dot**2/2",
+    )
+    stepper, period = compile_stepper(driven, SVI(6)), 2 * np.pi / 1.5
+    orbit = periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, fixed_period=True)
+    answer = 1.0 / (1.0 - 1.5**2 + 0.3j)
+    assert_allclose([orbit.q[0], orbit.p[0]], [answer.real, (1.5j * answer).real], atol=1e-10)
+    assert_allclose(np.abs(orbit.multipliers), np.exp(-0.1 * period), rtol=1e-9)
+    assert orbit.stable
+    with pytest.raises(MethodError, match="not symplectic here"):
+        orbit.stability_indices  # noqa: B018  (the access is the point)
+    with pytest.raises(MethodError, match="no energy to be given"):
+        periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
+
+
+def test_what_is_no_orbit(galaxy):
+    with pytest.raises(OrbitError, match=r"a state at rest|no orbit closes"):
+        periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
+    with pytest.raises(OrbitError, match="no orbit closes near here"):
+        periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, hold=["x", "y", "p_x", "p_y"])
+    losing = compile_stepper(problem("harmonic-oscillator").system, ExplicitEuler())
+    with pytest.raises(OrbitError, match=r"a state at rest|no orbit closes"):
+        periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, hold=["q"])
+    with pytest.raises(StateError, match="no 'p_z' to hold; did you mean"):
+        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, hold=["p_z"])
+    with pytest.raises(StateError, match="give one of them"):
+        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
+    with pytest.raises(StateError, match="a period is positive"):
+        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
