@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.stepper import Stepper
@@ -64,13 +65,14 @@ def longest_step(
         raise StateError(f"a span of {length:g} with a tolerance of {wanted:g}: the one is not 0, the other in [0, 1)")
     monitored, end = bool(stepper.interface.monitor), t + length
     start = partial(stepper.start, q, p, t=t, t_end=end if monitored else None, options=options)
-    known = start(h=length if not monitored else 1.0, parameters=parameters).parameters
+    first = abs(length) if monitored else length
+    known = start(h=first, parameters=parameters).parameters
     rate = float(stepper.rates(q, p, known)[0])
 
     def pilot(h: float) -> _Pilot:
         return _pilot(start(h=h, parameters=known), end)
 
-    return _longest(pilot, (abs(length) if monitored else length) / rate, wanted or ROUND_OFF)
+    return _longest(pilot, first / rate, wanted or ROUND_OFF)
 
 
 class _Pilot(NamedTuple):
@@ -99,6 +101,7 @@ def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> floa
     return next((longest for longest in between if pilot(longest).error <= allowed), h)
 
 
+@unwarned()
 def _pilot(run: Run, end: float) -> _Pilot:
     """The first steps; the error is infinite if one of them fails."""
     error, done = 0.0, 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,9 @@ def test_one_call_integrates_by_the_controller(shaken: Path) -> None:
     model = sc.load_model(shaken)
     state: Any = [*model.q, *(model.p or ())]
     exact = plain(model).integrate(model.q, model.p, t_end=12.0)
-    found = sc.solve_motion(model.system, (0.0, 12.0), state, monitor=model.monitor, controller="reversible")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of pilot runs, too
+        found = sc.solve_motion(model.system, (0.0, 12.0), state, monitor=model.monitor, controller="reversible")
     assert found.success
     assert np.abs(found.y[:2, -1] - exact.q[-1]).max() < 1e-11
     compiled = sc.solve_motion(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
