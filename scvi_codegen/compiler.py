@@ -25,7 +25,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cache, partial
 
 from sympy import Expr
@@ -175,7 +174,7 @@ class _Texts:
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
-        return render_derivatives(derivatives_of(self.system, stages, replace(found, sweep=None)))
+        return render_derivatives(derivatives_of(self.system, stages, found))
 
     def _rendered(self, control: Control | None = None) -> Source:
         return render(self.program(), control, fallback="borrowed" if self.borrows else None)
