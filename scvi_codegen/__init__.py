@@ -21,6 +21,8 @@ from scvi_codegen.version import __version__ as __version__
 
 _HOMES = {
     "advice.advice": ("Advice", "advise"),
+    "frameworks.casadi": ("casadi_flow",),
+    "frameworks.jax": ("JaxFlow", "jax_flow"),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper", "generate_source"),
     "runtime.ensemble_trajectory": ("EnsembleTrajectory",),

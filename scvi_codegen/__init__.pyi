@@ -34,6 +34,9 @@ from scvi_codegen.exact.discrete_lagrangian import exact_map as exact_map
 from scvi_codegen.files.cache import CacheInfo as CacheInfo
 from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache
+from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
+from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
+from scvi_codegen.frameworks.jax import jax_flow as jax_flow
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of

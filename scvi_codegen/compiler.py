@@ -15,6 +15,8 @@
 
 Beside the way: :func:`scvi_codegen.derivation.equations.derive` writes the equations out as the paper prints them, and
 :func:`scvi_codegen.exact.step.derived_step` solves them in 60 digits; both read a ``StageSystem`` of their own.
+:mod:`scvi_codegen.frameworks` puts many steps and their derivatives behind the C text that has those of one step, for
+JAX and CasADi.
 
 Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
 kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so the second time is quick.
@@ -25,7 +27,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cache, partial
 
 from sympy import Expr
@@ -175,7 +176,7 @@ class _Texts:
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
-        return render_derivatives(derivatives_of(self.system, stages, replace(found, sweep=None)))
+        return render_derivatives(derivatives_of(self.system, stages, found))
 
     def _rendered(self, control: Control | None = None) -> Source:
         return render(self.program(), control, fallback="borrowed" if self.borrows else None)

@@ -88,10 +88,11 @@ if hasattr(os, "register_at_fork"):
 
 
 class Library(NamedTuple):
-    """A loaded library: ``lib`` has its functions, ``ffi`` their types."""
+    """A loaded library: ``lib`` has its functions, ``ffi`` their types, ``path`` is where it was loaded from."""
 
     lib: Any
     ffi: Any
+    path: Path
 
 
 def find_compiler() -> tuple[str, ...]:
@@ -253,7 +254,7 @@ def _open(entry: Path) -> Library:
     try:
         loader = SourceFileLoader(entry.name, str(_binding(entry)))  # not imported, which would write beside it
         exec(loader.source_to_code(_binding(entry).read_bytes(), str(_binding(entry))), described.__dict__)
-        return Library(described.ffi.dlopen(str(_library(entry))), described.ffi)
+        return Library(described.ffi.dlopen(str(_library(entry))), described.ffi, _library(entry))
     except (OSError, ValueError) as error:
         raise ImportError(str(error)) from error
 

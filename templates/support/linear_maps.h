@@ -1,18 +1,18 @@
 /* Changes of what a step starts from, of its unknowns, of what stands at points, of rows; the linear maps between
- * them, and their transposes. Before it: real, M, B, GIVEN, LANES, band.h, stages.h. */
+ * them, and their transposes. Before it: real, M, B, GIVEN, WIDTH, band.h, stages.h. */
 
-/* LANES changes at a time. */
+/* WIDTH changes at a time. */
 typedef struct {
-  real lane[LANES];
+  real lane[WIDTH];
 } wide;
 
-/* y += factor x; or back: x += factor y. */
+/* y += factor x, another; or back: x += factor y. */
 static inline void flow(int back, wide *y, real factor, wide *x)
 {
-  wide *to = back ? x : y;
-  const wide from = *(back ? y : x);
-  for (int j = 0; j < LANES; j++)
-    to->lane[j] += factor * from.lane[j];
+  real *restrict to = back ? x->lane : y->lane;
+  const real *restrict from = back ? y->lane : x->lane;
+  for (int j = 0; j < WIDTH; j++)
+    to[j] += factor * from[j];
 }
 
 /* Sums between unknowns, or rows, and what stands at points from `offset` on: for so many sites from the first, times
@@ -202,11 +202,11 @@ static void lower_wide(const real *a, const band *shape, const real *pivot, int 
 static void upper_wide(const real *a, const band *shape, int k, int back, wide *x)
 {
   const real *column = a + shape->first + k * shape->stride;
-  for (int j = 0; !back && j < LANES; j++)
+  for (int j = 0; !back && j < WIDTH; j++)
     x[k].lane[j] *= column[k];
   for (int i = most(k - 2 * shape->reach, 0); i < k; i++)
     flow(back, x + i, -column[i], x + k);
-  for (int j = 0; back && j < LANES; j++)
+  for (int j = 0; back && j < WIDTH; j++)
     x[k].lane[j] *= column[k];
 }
 

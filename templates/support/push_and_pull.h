@@ -101,7 +101,7 @@ static void momentum_rows(const linearised_step *at, int back)
 }
 
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
-static void push(const linearised_step *at)
+static void push_step(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
   momentum_rows(at, 0);
@@ -114,8 +114,8 @@ static void push(const linearised_step *at)
   flow(0, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
 }
 
-/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose of push. */
-static void pull(const linearised_step *at)
+/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): its transpose. */
+static void pull_step(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
   memset(at->dz, 0, sizeof(wide) * N);
@@ -129,17 +129,17 @@ static void pull(const linearised_step *at)
   momentum_rows(at, 1);
 }
 
-/* Adds to vectors `to` what the step makes of `from`, LANES at a time. */
+/* Adds to vectors `to` what the step makes of `from`, WIDTH at a time. */
 static int carry_over(const linearised_step *at, int back, int count, const real *from, real *to)
 {
-  for (int first = 0; first < count; first += LANES) {
-    const int lanes = least(LANES, count - first);
+  for (int first = 0; first < count; first += WIDTH) {
+    const int own = least(WIDTH, count - first);
     memset(at->v, 0, sizeof(wide) * GIVEN);
-    for (int j = 0; j < lanes; j++)
+    for (int j = 0; j < own; j++)
       for (int i = 0; i < GIVEN; i++)
         at->v[i].lane[j] = from[(first + j) * GIVEN + i];
-    (back ? pull : push)(at);
-    for (int j = 0; j < lanes; j++)
+    (back ? pull_step : push_step)(at);
+    for (int j = 0; j < own; j++)
       for (int i = 0; i < GIVEN; i++)
         to[(first + j) * GIVEN + i] += at->v[i].lane[j];
   }

@@ -26,7 +26,7 @@ FLOORS = """
     mechanics rendering
     methods native pictures
     lowering exact runtime
-    compiler results
+    compiler frameworks results
     derivation models advice verification
     benchmark reproduce
     package distributed __init__
@@ -42,11 +42,14 @@ other.
 FLOOR_OF = {room: height for height, floor in enumerate(FLOORS.split("\n")) for room in floor.split()}
 
 OWNERS = {
+    "casadi": "frameworks",
     "cffi": "native",
     "click": "cli",
     "distributed": "runtime",
     "h5netcdf": "files",
     "h5py": "files",
+    "jax": "frameworks",
+    "jaxlib": "frameworks",
     "jinja2": "display rendering",
     "markupsafe": "display reproduce",
     "matplotlib": "benchmark pictures reproduce",

@@ -1,0 +1,1 @@
+"""Steps as differentiable functions of other libraries: what JAX and CasADi call in C, without Python between."""

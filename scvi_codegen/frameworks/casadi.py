@@ -1,0 +1,55 @@
+"""A flow for CasADi: an external function in C, with its derivatives, for trajectory optimisation and estimation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.frameworks.flow import Flow, imported
+from scvi_codegen.kinds import of, takes
+from scvi_codegen.native import building
+from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["casadi_flow"]
+
+ARGUMENTS = ("q", "p", "parameters", "t", "h")
+
+
+@takes(StateError, stepper=of("a compiled stepper", Stepper))
+def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Any:
+    """So many steps of a stepper as a ``casadi.Function``.
+
+    It is an external function in compiled C, which CasADi calls without Python, with its Jacobian and its adjoint by
+    CasADi's naming convention: ``jacobian``, ``gradient``, ``jtimes``, ``map`` and nonlinear programs take it like any
+    other. Derivatives are exact, those of the computed map. There are no second ones: give IPOPT
+    ``{"ipopt.hessian_approximation": "limited-memory"}``.
+
+    Args:
+        stepper: system and method.
+        steps: how many.
+        every: keep every so-many-th state and the initial one; by default that at the end alone.
+
+    Returns:
+        A ``casadi.Function`` of q (m), p (m), parameters (k), such as ``stepper.defaults``, t and h, by place or by
+        name, t then being 0 where it is left out. Its values q1 and p1 are (m), with ``every`` (m, n), states in
+        columns. Where a step fails, so does the call, and solvers try shorter ways.
+
+    Raises:
+        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MissingLibraryError: without CasADi (extra ``casadi``).
+        StateError: for steps that are no multiple of ``every``.
+    """
+    flow = Flow.checked(stepper, steps, every)
+    ca = imported("casadi", "casadi")
+    source = with_casadi_flow(flow.derivatives, flow.steps, flow.spacing)
+    library = building.load(source, flags=stepper.flags)
+    name, m = casadi_name(source.prefix), stepper.dimension
+    sizes = (m, m, len(stepper.parameters), 1, 1)
+    given = [ca.MX.sym(word, size) for word, size in zip(ARGUMENTS, sizes, strict=True)]
+    states = ca.external(name, str(library.path))(ca.vertcat(*given))
+    states = states if flow.every else states[:, -1]
+    found = [states[:m, :], states[m:, :]]
+    missing = float("nan")
+    defaults = [missing, missing, missing if stepper.parameters else 0.0, 0.0, missing]
+    return ca.Function(name, given, found, [*ARGUMENTS], ["q1", "p1"], {"default_in": defaults})

@@ -1,0 +1,93 @@
+"""What a flow is in any framework: so many steps as a function of (q, p, parameters, t, h)."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import MethodError, MissingLibraryError, StateError
+from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.inputs import check_inputs_given, parameter_index
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["Flow", "imported"]
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """So many steps of a stepper.
+
+    Attributes:
+        stepper: system and method.
+        steps: how many.
+        every: steps between kept states, the first of which is the initial one; 0 where only the end is wanted.
+    """
+
+    stepper: Stepper
+    steps: int
+    every: int
+
+    @classmethod
+    def checked(cls, stepper: Stepper, steps: int, every: int | None) -> Self:
+        """From what users give.
+
+        Raises:
+            MethodError: for a stepper that has no derivatives, or whose steps are not all of h.
+            StateError: for numbers of steps that are none, or do not fit.
+        """
+        if stepper.interface.monitor:
+            raise MethodError("a flow has steps of h, not of lengths that a monitor chooses: compile without one")
+        steps = checked_count(steps, "steps", least=1)
+        every = 0 if every is None else checked_count(every, "every", least=1)
+        if every and steps % every:
+            raise StateError(f"{steps} steps are no multiple of every={every}, so that the end would not be kept")
+        return cls(stepper, steps, every)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>"
+
+    @property
+    def spacing(self) -> int:
+        """Steps between kept states in C, where there are always some."""
+        return self.every or self.steps
+
+    @property
+    def kept(self) -> int:
+        """Number of these states."""
+        return self.steps // self.spacing + 1
+
+    @property
+    def derivatives(self) -> Source:
+        """The C text with derivatives of steps; MethodError in transformed time."""
+        self.stepper.tangent  # noqa: B018  (it says what is missing)
+        source = self.stepper.derivatives
+        assert source is not None
+        return source
+
+    def parameter_values(self, parameters: Any) -> Any:
+        """All in order: a list of numbers and whatever stood in a mapping, or, not given by name, as they are.
+
+        Raises:
+            StateError: for unknown names, and inputs that are not given.
+        """
+        interface = self.stepper.interface
+        check_inputs_given(interface, parameters)
+        if parameters is not None and not isinstance(parameters, Mapping):
+            return parameters
+        values: list[Any] = list(interface.defaults)
+        for name, value in (parameters or {}).items():
+            values[parameter_index(interface, name)] = value
+        return values
+
+
+def imported(library: str, extra: str) -> Any:
+    """A library; MissingLibraryError without it, which names the extra."""
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"this needs {library}, which is not installed: pip install 'scvi-codegen[{extra}]'"
+        ) from error

@@ -1,0 +1,125 @@
+"""A flow for JAX: called by XLA in C, with derivatives forward and back, batches, and compilation."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.frameworks.flow import Flow, imported
+from scvi_codegen.kinds import of, takes
+from scvi_codegen.native import building
+from scvi_codegen.rendering.flow import XLA_PARTS, with_xla_flow
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["JaxFlow", "jax_flow"]
+
+_registered: set[str] = set()
+
+
+@takes(StateError, stepper=of("a compiled stepper", Stepper))
+def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFlow:
+    """So many steps of a stepper as a function of JAX.
+
+    It is compiled C that XLA calls itself, without Python: ``jit``, ``vmap``, ``grad``, ``jvp``, ``vjp``, ``jacfwd``
+    and ``jacrev`` apply, in any order, on processors (not on GPUs) and in binary64 (``jax_enable_x64``). Derivatives
+    are exact, those of the computed map: forward by the linearised steps, back by their transpose; both take memory
+    for all states of one trajectory. There are no second ones.
+
+    Args:
+        stepper: system and method.
+        steps: how many.
+        every: keep every so-many-th state and the initial one; by default that at the end alone.
+
+    Raises:
+        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MissingLibraryError: without JAX (extra ``jax``).
+        StateError: for steps that are no multiple of ``every``.
+    """
+    flow = JaxFlow.checked(stepper, steps, every)
+    imported("jax", "jax")
+    return flow
+
+
+class JaxFlow(Flow):
+    """The states of a motion, as a function that JAX differentiates."""
+
+    def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
+        """States at the end, or where every so-many-th is kept, at these.
+
+        Args:
+            q, p: (.., m) initial positions and momenta. Leading axes are broadcast against each other.
+            h: (..) step.
+            t: (..) initial time.
+            parameters: by name, (..) each, others keeping their defaults; or (.., k) in order.
+
+        Returns:
+            (q, p), (.., m) each; with ``every`` (.., n, m). A step that fails raises JAX's error, with its time.
+
+        Raises:
+            StateError: for wrong shapes and names, and for anything but binary64.
+        """
+        import jax.numpy as jnp
+
+        from scvi_codegen.frameworks.jax_primitives import states_along
+
+        m, count = self.stepper.dimension, len(self.stepper.parameters)
+        values = self.parameter_values(parameters)
+        if isinstance(values, list):
+            each = jnp.broadcast_arrays(*(_binary64(value, "a parameter") for value in values)) if values else []
+            values = jnp.stack(each, -1) if each else jnp.zeros(0)
+        vectors = [_vector(q, m, "q"), _vector(p, m, "p"), _vector(values, count, "parameters")]
+        numbers = [jnp.expand_dims(_binary64(t, "t"), -1), jnp.expand_dims(_binary64(h, "h"), -1)]
+        x = _beside(*vectors, *numbers)
+        found = states_along(x, target=self._target, steps=self.steps, every=self.spacing, size=2 * m)
+        found = found if self.every else found[..., -1, :]
+        return found[..., :m], found[..., m:]
+
+    @cached_property
+    def _target(self) -> str:
+        """The name under which XLA knows the C functions, compiled and registered when first asked for."""
+        import jax
+        import jaxlib
+
+        source = with_xla_flow(self.derivatives, jaxlib.__version__)
+        flags = (*self.stepper.flags, f"-I{jax.ffi.include_dir()}")
+        name = f"scvi_{building.fingerprint(source, flags=flags)}"
+        if name not in _registered:
+            library = building.load(source, flags=flags)
+            for part in XLA_PARTS:
+                function = getattr(library.lib, f"{source.prefix}_xla_{part}")
+                address = int(library.ffi.cast("uintptr_t", function))
+                jax.ffi.register_ffi_target(f"{name}_{part}", jax.ffi.pycapsule(address), platform="cpu")
+            _registered.add(name)
+        return name
+
+
+def _binary64(value: Any, name: str) -> Any:
+    """An array of JAX; StateError for numbers of fewer digits, to which a flow would be rounded without a word."""
+    import jax
+    import jax.numpy as jnp
+
+    if not jax.config.jax_enable_x64:
+        raise StateError("a flow is computed in binary64: call jax.config.update('jax_enable_x64', True) at the start")
+    array = jnp.asarray(value)
+    if array.dtype != jnp.float64 and jnp.issubdtype(array.dtype, jnp.inexact):
+        raise StateError(f"{name} is {array.dtype}, but a flow is computed in binary64: give float64")
+    return array.astype(jnp.float64)
+
+
+def _vector(value: Any, length: int, name: str) -> Any:
+    array = _binary64(value, name)
+    if array.shape[-1:] != (length,):
+        raise StateError(f"{name} must have shape (.., {length}), not {array.shape}")
+    return array
+
+
+def _beside(*parts: Any) -> Any:
+    """(.., n) arrays, one behind the other."""
+    import jax.numpy as jnp
+
+    try:
+        batch = jnp.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    except ValueError as error:
+        raise StateError(f"the leading axes of q, p, parameters, t and h do not fit: {error}") from error
+    return jnp.concatenate([jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1)

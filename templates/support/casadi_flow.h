@@ -1,0 +1,110 @@
+/* The flow of FLOW_STEPS steps, states kept after every FLOW_EVERY, as CasADi finds external functions with their
+ * derivatives: by names. Before it: flow.h, EXTERNAL, which makes these. */
+
+typedef long long casadi_int;
+
+enum {
+  FLOW_COLUMNS = FLOW_STEPS / FLOW_EVERY + 1
+};
+
+/* Shapes, (rows, columns, 1), and of values that a derivative does not need, without entries. */
+static const casadi_int GIVEN_SHAPE[] = {GIVEN, 1, 1};
+static const casadi_int STATES_SHAPE[] = {FLOW_STATE, FLOW_COLUMNS, 1};
+static const casadi_int JACOBIAN_SHAPE[] = {FLOW_STATE * FLOW_COLUMNS, GIVEN, 1};
+static const casadi_int NO_STATES_SHAPE[2 + FLOW_COLUMNS + 1] = {FLOW_STATE, FLOW_COLUMNS};
+
+/* What is found is not asked for where there is no room; what is not given is 0. */
+static int external_flow(flow_part part, int count, const double *x, const double *given, double *found)
+{
+  flow_way way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = count};
+  solver_report report;
+  return found && flow_rows(part, &way, 1, x, given, found, &report) != OK;
+}
+
+int EXTERNAL(, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
+{
+  (void)iw, (void)w, (void)mem;
+  return external_flow(FLOW_STATES, 0, arg[0], NULL, res[0]);
+}
+
+casadi_int EXTERNAL(, _n_in)(void)
+{
+  return 1;
+}
+
+casadi_int EXTERNAL(, _n_out)(void)
+{
+  return 1;
+}
+
+const casadi_int *EXTERNAL(, _sparsity_in)(casadi_int i)
+{
+  return i == 0 ? GIVEN_SHAPE : NULL;
+}
+
+const casadi_int *EXTERNAL(, _sparsity_out)(casadi_int i)
+{
+  return i == 0 ? STATES_SHAPE : NULL;
+}
+
+/* The Jacobian, column by column: each is what becomes of a change of one number that is given. */
+int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
+{
+  double each[GIVEN * GIVEN] = {0};
+  (void)iw, (void)w, (void)mem;
+  for (int i = 0; i < GIVEN; i++)
+    each[i * GIVEN + i] = 1;
+  return external_flow(FLOW_PUSH, GIVEN, arg[0], each, res[0]);
+}
+
+casadi_int EXTERNAL(jac_, _n_in)(void)
+{
+  return 2;
+}
+
+casadi_int EXTERNAL(jac_, _n_out)(void)
+{
+  return 1;
+}
+
+const casadi_int *EXTERNAL(jac_, _sparsity_in)(casadi_int i)
+{
+  return i == 0 ? GIVEN_SHAPE : i == 1 ? NO_STATES_SHAPE
+                                       : NULL;
+}
+
+const casadi_int *EXTERNAL(jac_, _sparsity_out)(casadi_int i)
+{
+  return i == 0 ? JACOBIAN_SHAPE : NULL;
+}
+
+/* Slopes by what is given, from slopes by the states. */
+int EXTERNAL(adj1_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
+{
+  (void)iw, (void)w, (void)mem;
+  if (!arg[2] && res[0])
+    memset(res[0], 0, sizeof(double) * GIVEN);
+  return arg[2] && external_flow(FLOW_PULL, 1, arg[0], arg[2], res[0]);
+}
+
+casadi_int EXTERNAL(adj1_, _n_in)(void)
+{
+  return 3;
+}
+
+casadi_int EXTERNAL(adj1_, _n_out)(void)
+{
+  return 1;
+}
+
+const casadi_int *EXTERNAL(adj1_, _sparsity_in)(casadi_int i)
+{
+  return i == 0 ? GIVEN_SHAPE : i == 1 ? NO_STATES_SHAPE
+      : i == 2                         ? STATES_SHAPE
+                                       : NULL;
+}
+
+const casadi_int *EXTERNAL(adj1_, _sparsity_out)(casadi_int i)
+{
+  return i == 0 ? GIVEN_SHAPE : NULL;
+}

@@ -1,0 +1,201 @@
+/* Many steps as one function, from (q, p, parameters, t, h) to the states (q, p) at the start and after every so many
+ * steps, and what carries changes and slopes along it. Before it: run.h, push_and_pull.h. */
+#include <stdlib.h>
+
+#define FLOW_SAME_STATE 1e-6 /* beside the largest number of it and of that before: another solution is farther away */
+
+enum {
+  FLOW_STATE = 2 * M,
+  FLOW_PIECE = 64, /* steps whose vectors there is room for at a time */
+  FLOW_NO_MEMORY = 6
+};
+
+/* Its values; changes of them by changes of what is given; slopes by what is given from slopes by the values. */
+typedef enum {
+  FLOW_STATES,
+  FLOW_PUSH,
+  FLOW_PULL
+} flow_part;
+
+/* What a row is computed by, and room for it. */
+typedef struct {
+  long long steps, every;
+  int count; /* changes, or slopes, at a time */
+  real *states; /* (steps + 1, FLOW_STATE), all of them */
+  real *t, *h, *q, *p, *q1, *p1; /* of the steps of a piece */
+  real *vectors; /* (FLOW_PIECE + 1, count, GIVEN) */
+  real *workspace;
+} flow_way;
+
+static long long kept_states(const flow_way *way)
+{
+  return way->steps / way->every + 1;
+}
+
+/* Room for all of a way, to be freed at its workspace; of states alone there are no steps between. */
+static int make_way(flow_way *way)
+{
+  const size_t work = STATUS(LINEARISED_WORKSPACE), piece = (size_t)FLOW_PIECE * (2 + 4 * M);
+  const size_t vectors = (size_t)(FLOW_PIECE + 1) * (size_t)way->count * GIVEN;
+  const size_t states = way->count ? ((size_t)way->steps + 1) * FLOW_STATE : 0;
+  real *place = malloc(sizeof(real) * (work + piece + vectors + states));
+  way->workspace = place;
+  way->t = place + work;
+  way->h = way->t + FLOW_PIECE;
+  way->q = way->h + FLOW_PIECE;
+  way->p = way->q + FLOW_PIECE * M;
+  way->q1 = way->p + FLOW_PIECE * M;
+  way->p1 = way->q1 + FLOW_PIECE * M;
+  way->vectors = way->p1 + FLOW_PIECE * M;
+  way->states = way->vectors + vectors;
+  return place != NULL;
+}
+
+/* The states after every `every` steps from x, itself first. */
+static int follow(const flow_way *way, const real *x, long long every, real *states, solver_report *report)
+{
+  run_memory run;
+  NAME(start)(&run, x[GIVEN_H - 1], x[GIVEN_H], x, x + M);
+  memcpy(states, x, sizeof(real) * FLOW_STATE);
+  for (long long done = 0; done < way->steps; done += every) {
+    int iterations, status;
+    real t;
+    states += FLOW_STATE;
+    status = NAME(advance)(&run, every, every, x + FLOW_STATE, NULL, &t, states, states + M, &iterations, report,
+        way->workspace);
+    if (status != OK) {
+      report->steps += done;
+      return status;
+    }
+  }
+  return OK;
+}
+
+static real largest(const real *x, int n)
+{
+  real found = 0;
+  for (int i = 0; i < n; i++)
+    found = larger(found, fabs(x[i]));
+  return found;
+}
+
+/* The first step of a piece that, solved anew, does not lead where it led, or how many there are. */
+static int first_stray(const flow_way *way, const real *states, int length)
+{
+  for (int k = 0; k < length; k++, states += FLOW_STATE) {
+    real off[FLOW_STATE];
+    for (int i = 0; i < M; i++) {
+      off[i] = way->q1[k * M + i] - states[FLOW_STATE + i];
+      off[M + i] = way->p1[k * M + i] - states[FLOW_STATE + M + i];
+    }
+    if (!(largest(off, FLOW_STATE) <= FLOW_SAME_STATE * largest(states, 2 * FLOW_STATE)))
+      return k;
+  }
+  return length;
+}
+
+/* Carries the vectors over so many steps behind those done. */
+static int carry_piece(const flow_way *way, const real *x, long long done, int length, int back, solver_report *report)
+{
+  const real *states = way->states + done * FLOW_STATE;
+  int status, stray;
+  for (int k = 0; k < length; k++) {
+    way->t[k] = x[GIVEN_H - 1] + (real)(done + k) * x[GIVEN_H];
+    way->h[k] = x[GIVEN_H];
+    memcpy(way->q + k * M, states + k * FLOW_STATE, sizeof(real) * M);
+    memcpy(way->p + k * M, states + k * FLOW_STATE + M, sizeof(real) * M);
+  }
+  status = NAME(linearise)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, back, way->count, way->vectors,
+      way->q1, way->p1, report, way->workspace);
+  if (status != OK) {
+    report->steps = back ? done + length - 1 - report->steps : done + report->steps;
+    return status;
+  }
+  stray = first_stray(way, states, length);
+  if (stray < length) {
+    report->steps = done + stray;
+    report->t = way->t[stray];
+  }
+  return stray < length ? STATUS(STRAYED) : OK;
+}
+
+/* Where a step ends in a kept state: its place among (count, kept states, FLOW_STATE) numbers for the c-th, else -1. */
+static long long place_of(const flow_way *way, long long step, int c)
+{
+  return step % way->every ? -1 : (c * kept_states(way) + step / way->every) * FLOW_STATE;
+}
+
+static void tell_changes(const flow_way *way, long long step, const real *vectors, real *changes)
+{
+  for (int c = 0; c < way->count; c++)
+    if (place_of(way, step, c) >= 0)
+      memcpy(changes + place_of(way, step, c), vectors + c * GIVEN, sizeof(real) * FLOW_STATE);
+}
+
+static void add_slopes(const flow_way *way, long long step, const real *slopes, real *vectors)
+{
+  for (int c = 0; c < way->count; c++)
+    for (int i = 0; i < FLOW_STATE && place_of(way, step, c) >= 0; i++)
+      vectors[c * GIVEN + i] += slopes[place_of(way, step, c) + i];
+}
+
+/* (count, GIVEN) changes at the start to (count, kept states, FLOW_STATE) changes. */
+static int push_along(const flow_way *way, const real *x, const real *changes, real *kept, solver_report *report)
+{
+  const long long across = (long long)way->count * GIVEN;
+  int status = OK, length = 0;
+  memcpy(way->vectors, changes, sizeof(real) * (size_t)across);
+  tell_changes(way, 0, way->vectors, kept);
+  for (long long done = 0; done < way->steps && status == OK; done += length) {
+    length = (int)(way->steps - done < FLOW_PIECE ? way->steps - done : FLOW_PIECE);
+    memset(way->vectors + across, 0, sizeof(real) * (size_t)(across * length));
+    status = carry_piece(way, x, done, length, 0, report);
+    for (int k = 1; k <= length; k++)
+      tell_changes(way, done + k, way->vectors + k * across, kept);
+    memcpy(way->vectors, way->vectors + length * across, sizeof(real) * (size_t)across);
+  }
+  return status;
+}
+
+/* (count, kept states, FLOW_STATE) slopes by these to (count, GIVEN) slopes by what was given. */
+static int pull_along(const flow_way *way, const real *x, const real *kept, real *slopes, solver_report *report)
+{
+  const long long across = (long long)way->count * GIVEN;
+  int status = OK, length = 0;
+  memset(way->vectors, 0, sizeof(real) * (size_t)across);
+  for (long long end = way->steps; end > 0 && status == OK; end -= length) {
+    length = (int)(end < FLOW_PIECE ? end : FLOW_PIECE);
+    memcpy(way->vectors + length * across, way->vectors, sizeof(real) * (size_t)across);
+    memset(way->vectors, 0, sizeof(real) * (size_t)(across * length));
+    for (int k = 1; k <= length; k++)
+      add_slopes(way, end - length + k, kept, way->vectors + k * across);
+    status = carry_piece(way, x, end - length, length, 1, report);
+  }
+  add_slopes(way, 0, kept, way->vectors);
+  memcpy(slopes, way->vectors, sizeof(real) * (size_t)across);
+  return status;
+}
+
+/* A part of the flow of each of so many rows x, (GIVEN): of what is given for it to what is found. */
+static int flow_rows(flow_part part, flow_way *way, long long rows, const real *x, const real *given,
+    real *found, solver_report *report)
+{
+  const long long kept = kept_states(way) * FLOW_STATE, across = (long long)way->count * GIVEN;
+  const long long values = way->count * kept;
+  int status = OK;
+  memset(report, 0, sizeof *report);
+  if (!make_way(way))
+    return FLOW_NO_MEMORY;
+  for (long long row = 0; row < rows && status == OK; row++, x += GIVEN)
+    if (part == FLOW_STATES)
+      status = follow(way, x, way->every, found + row * kept, report);
+    else {
+      status = follow(way, x, 1, way->states, report);
+      if (status == OK && part == FLOW_PUSH)
+        status = push_along(way, x, given + row * across, found + row * values, report);
+      if (status == OK && part == FLOW_PULL)
+        status = pull_along(way, x, given + row * values, found + row * across, report);
+    }
+  free(way->workspace);
+  return status;
+}

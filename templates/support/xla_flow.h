@@ -1,0 +1,61 @@
+/* The flow as XLA calls it, through its C interface for foreign functions. Before it: flow.h. */
+#include <stdio.h>
+
+#include "xla/ffi/api/c_api.h"
+
+/* XLA asks which version of its interface a handler was compiled for: whether it did. */
+static int tells_version(const XLA_FFI_CallFrame *frame)
+{
+  for (XLA_FFI_Extension_Base *each = frame->extension_start; each; each = each->next)
+    if (each->type == XLA_FFI_Extension_Metadata) {
+      XLA_FFI_Metadata *asked = ((XLA_FFI_Metadata_Extension *)each)->metadata;
+      asked->api_version.major_version = XLA_FFI_API_MAJOR;
+      asked->api_version.minor_version = XLA_FFI_API_MINOR;
+      asked->traits = 0;
+      return 1;
+    }
+  return 0;
+}
+
+static XLA_FFI_Error *failure(const XLA_FFI_CallFrame *frame, int status, const solver_report *report)
+{
+  static const char *const words[] = {"not converged", "singular", "not finite", "vanished", "strayed", "no memory"};
+  char text[200];
+  XLA_FFI_Error_Create_Args error = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL, text, XLA_FFI_Error_Code_ABORTED};
+  snprintf(text, sizeof text, "step %lld at t = %.17g failed: %s (last update %.3g)", report->steps, report->t,
+      words[status - 1], report->change);
+  return frame->api->XLA_FFI_Error_Create(&error);
+}
+
+/* x (.., GIVEN), and for changes and slopes those, (.., count, size), to results. */
+static XLA_FFI_Error *flow_of_frame(flow_part part, XLA_FFI_CallFrame *frame)
+{
+  const XLA_FFI_Buffer *x = frame->args.args[0], *given = part == FLOW_STATES ? x : frame->args.args[1];
+  const XLA_FFI_Buffer *found = frame->rets.rets[0];
+  const long long *every = ((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value; /* attributes come sorted by name */
+  const long long *steps = ((XLA_FFI_Scalar *)frame->attrs.attrs[1])->value;
+  const int count = part == FLOW_STATES ? 0 : (int)given->dims[x->rank - 1];
+  flow_way way = {.steps = *steps, .every = *every, .count = count};
+  solver_report report;
+  long long rows = 1;
+  int status;
+  for (long long i = 0; i + 1 < x->rank; i++)
+    rows *= x->dims[i];
+  status = flow_rows(part, &way, rows, x->data, given->data, found->data, &report);
+  return status == OK ? NULL : failure(frame, status, &report);
+}
+
+XLA_FFI_Error *NAME(xla_states)(XLA_FFI_CallFrame *frame)
+{
+  return tells_version(frame) ? NULL : flow_of_frame(FLOW_STATES, frame);
+}
+
+XLA_FFI_Error *NAME(xla_push)(XLA_FFI_CallFrame *frame)
+{
+  return tells_version(frame) ? NULL : flow_of_frame(FLOW_PUSH, frame);
+}
+
+XLA_FFI_Error *NAME(xla_pull)(XLA_FFI_CallFrame *frame)
+{
+  return tells_version(frame) ? NULL : flow_of_frame(FLOW_PULL, frame);
+}

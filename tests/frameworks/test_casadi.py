@@ -1,0 +1,122 @@
+"""A flow in CasADi: against integrate and closed forms; programs that IPOPT solves to what is known."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS
+from scipy.special import ellipk
+
+from scvi_codegen import SVI, MethodError, StateError, casadi_flow, compile_stepper, problem
+
+ca = pytest.importorskip("casadi", reason="needs the extra 'casadi'")
+
+Q, P, H = [0.5, 0.1], [0.0, 1.6], 0.1
+GRADIENTS = {
+    "ipopt.hessian_approximation": "limited-memory",
+    "ipopt.print_level": 0,
+    "print_time": 0,
+    "ipopt.sb": "yes",
+}
+
+
+@cache
+def kepler():
+    return compile_stepper(problem("kepler").system, SVI(4), flags=QUICK_FLAGS)
+
+
+@cache
+def pendulum():
+    return compile_stepper(problem("planar-pendulum").system, SVI(6), flags=QUICK_FLAGS)
+
+
+def symbols(flow):
+    return [ca.MX.sym(flow.name_in(i), flow.size1_in(i)) for i in range(flow.n_in())]
+
+
+def run(every):
+    return kepler().integrate(Q, P, h=H, steps=90, every=every, t=0.0, parameters={"mu": 1.1})
+
+
+def test_states_are_those_of_integrate():
+    flow = casadi_flow(kepler(), steps=90, every=30)
+    found = flow(Q, P, 1.1, 0.0, H)
+    assert_allclose(found[0].full().T, run(30).q, rtol=0, atol=1e-13)
+    assert_allclose(found[1].full().T, run(30).p, rtol=0, atol=1e-13)
+    end = casadi_flow(kepler(), steps=90)(q=Q, p=P, parameters=1.1, h=H)
+    assert_allclose(end["q1"].full()[:, 0], run(30).q[-1], rtol=0, atol=1e-13)
+    assert flow.map(2)(np.c_[Q, Q], np.c_[P], 1.1, 0.0, H)[0].shape == (2, 8)
+
+
+def test_derivatives_forward_and_back_are_those_of_runs():
+    flow = casadi_flow(kepler(), steps=90, every=30)
+    given = symbols(flow)
+    x, states = ca.vertcat(*given), ca.vertcat(*flow(*given))
+    at = (Q, P, 1.1, 0.0, H)
+    expected = run(30).sensitivity()
+    columns = np.concatenate(
+        [expected.state, expected.parameters, expected.t[..., np.newaxis], expected.h[..., np.newaxis]], axis=-1
+    ).reshape(-1, 7)
+    size = abs(columns).max()
+    jacobian = ca.Function("J", given, [ca.jacobian(ca.vec(states), x)])(*at).full()
+    assert_allclose(jacobian, columns, rtol=0, atol=1e-11 * size)
+    weights = np.random.default_rng(0).normal(size=(4, 4))
+    gradient = ca.Function("g", given, [ca.gradient(ca.dot(states, weights), x)])
+    assert_allclose(gradient(*at).full()[:, 0], columns.T @ weights.T.ravel(), rtol=0, atol=1e-11 * size)
+    change = np.linspace(-1.0, 1.0, 7)
+    along = ca.Function("Jv", given, [ca.jtimes(ca.vec(states), x, change)])
+    assert_allclose(along(*at).full()[:, 0], columns @ change, rtol=0, atol=1e-11 * size)
+
+
+def test_ipopt_finds_how_a_pendulum_turns_at_an_angle():
+    """Momentum at the bottom and time to the turning point, both unknown; m = l = g = 1."""
+    flow, angle = casadi_flow(pendulum(), steps=12), 2.0
+    p, h = ca.MX.sym("p"), ca.MX.sym("h")
+    end = flow(q=0.0, p=p, parameters=pendulum().defaults, h=h)
+    program = {"x": ca.vertcat(p, h), "f": p**2, "g": ca.vertcat(end["q1"], end["p1"])}
+    solver = ca.nlpsol("solver", "ipopt", program, GRADIENTS | {"ipopt.tol": 1e-12})
+    found = solver(x0=[1.5, 0.15], lbg=[angle, 0.0], ubg=[angle, 0.0], lbx=[0.0, 0.01], ubx=[1.95, 0.3])
+    assert solver.stats()["success"]
+    p, h = found["x"].full()[:, 0]
+    assert_allclose(p, 2.0 * np.sin(angle / 2.0), rtol=1e-9)
+    assert_allclose(12 * h, ellipk(np.sin(angle / 2.0) ** 2), rtol=1e-9)
+
+
+def test_ipopt_finds_the_hohmann_transfer():
+    """The least change of velocities between two circles: two unknown velocities and the unknown time between them."""
+    flow, radius = casadi_flow(kepler(), steps=40), 2.0
+    p, h = ca.MX.sym("p", 2), ca.MX.sym("h")
+    end = flow(q=[1.0, 0.0], p=p, parameters=1.0, h=h)
+    q1, p1 = end["q1"], end["p1"]
+    circular = ca.vertcat(-q1[1], q1[0]) / radius**1.5
+    cost = ca.norm_2(p - ca.DM([0.0, 1.0])) + ca.norm_2(circular - p1)
+    program = {"x": ca.vertcat(p, h), "f": cost, "g": ca.sumsqr(q1)}
+    solver = ca.nlpsol("solver", "ipopt", program, GRADIENTS | {"ipopt.tol": 1e-10})
+    found = solver(x0=[0.1, 1.3, 0.1], lbg=radius**2, ubg=radius**2, lbx=[-0.5, 1.0, 0.05], ubx=[0.5, 1.5, 0.25])
+    assert solver.stats()["success"]
+    axis = (1.0 + radius) / 2.0
+    fast, slow = np.sqrt(2.0 - 1.0 / axis), np.sqrt(2.0 / radius - 1.0 / axis)
+    assert_allclose(float(found["f"]), fast - 1.0 + np.sqrt(1.0 / radius) - slow, rtol=1e-8)
+    assert_allclose(found["x"].full()[:, 0], [0.0, fast, np.pi * axis**1.5 / 40], atol=1e-6)
+
+
+def test_a_step_that_fails_fails_the_call_and_forgotten_arguments_do():
+    flow = casadi_flow(kepler(), steps=3)
+    with pytest.raises(RuntimeError, match="Evaluation failed"):
+        flow([0.0, 0.0], P, 1.0, 0.0, H)
+    with pytest.raises(RuntimeError, match="Evaluation failed"):
+        flow(q=Q, p=P, h=H)
+
+
+def test_what_there_is_not_is_refused():
+    with pytest.raises(StateError, match="stepper must be a compiled stepper"):
+        casadi_flow("kepler", steps=3)
+    with pytest.raises(StateError, match="steps must be at least 1, not 0"):
+        casadi_flow(kepler(), steps=0)
+    with pytest.raises(MethodError, match="monitor"):
+        casadi_flow(compile_stepper(problem("kepler").system, SVI(2), monitor="q1**2 + q2**2"), steps=3)
+    flow = casadi_flow(kepler(), steps=3)
+    given = symbols(flow)
+    with pytest.raises(RuntimeError, match="Derivatives cannot be calculated"):
+        ca.hessian(flow(*given)[0][0], given[0])[0]

@@ -1,0 +1,218 @@
+"""A flow in JAX: against leapfrog written in JAX, closed forms and runs; its transformations, and what it refuses."""
+
+import re
+import subprocess
+import sys
+from functools import cache, partial
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from samples import QUICK_FLAGS
+
+from scvi_codegen import (
+    SVI,
+    LagrangianSystem,
+    MethodError,
+    StateError,
+    StoermerVerlet,
+    compile_stepper,
+    jax_flow,
+    problem,
+    reparametrise,
+)
+
+jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
+jnp = jax.numpy
+
+SPECIAL = {"a": 0.7, "k": 1.2, "m": 1.3, "w": 0.9}
+Q, P, H, STEPS = 0.4, -0.3, 0.1, 150
+
+
+@pytest.fixture(autouse=True)
+def binary64():
+    before = jax.config.jax_enable_x64
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", before)
+
+
+@cache
+def driven(method):
+    system = LagrangianSystem.from_text(
+        name="driven",
+        coordinates=["x"],
+        lagrangian="m*x_dot**2/2 - k*x**4/4 + a*x*cos(w*t)",
+        parameters=SPECIAL,
+    )
+    return compile_stepper(system, method, flags=QUICK_FLAGS)
+
+
+@cache
+def kepler():
+    return compile_stepper(problem("kepler").system, SVI(4), flags=QUICK_FLAGS)
+
+
+def leapfrog(x):
+    """(2, steps + 1) positions and momenta from (q, p, a, k, m, w, t, h), which JAX differentiates itself."""
+    q, p, a, k, m, w, t, h = x
+
+    def kicked(q, p, t):
+        return p + h / 2 * (a * jnp.cos(w * t) - k * q**3)
+
+    def step(state, i):
+        q, p = state
+        p = kicked(q, p, t + i * h)
+        q = q + h * p / m
+        p = kicked(q, p, t + (i + 1) * h)
+        return (q, p), jnp.stack([q, p])
+
+    found = jax.lax.scan(step, (q, p), jnp.arange(STEPS))[1]
+    return jnp.concatenate([jnp.stack([q, p])[:, None], found.T], axis=1)
+
+
+def by_c(x, every=1):
+    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, every=every)
+    q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
+    return jnp.concatenate([q, p], axis=-1).T
+
+
+def given():
+    assert driven(StoermerVerlet()).parameters == tuple(sorted(SPECIAL))
+    return jnp.array([Q, P, *SPECIAL.values(), 0.2, H])
+
+
+def test_values_are_those_of_leapfrog_and_of_integrate():
+    assert_allclose(by_c(given()), leapfrog(given()), atol=1e-12)
+    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=H, steps=40, every=8, parameters={"mu": 1.1})
+    start = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.7])
+    q, p = jax_flow(kepler(), steps=40, every=8)(*start, h=H, parameters={"mu": 1.1})
+    assert_allclose(q, run.q, rtol=0, atol=1e-13)
+    assert_allclose(p, run.p, rtol=0, atol=1e-13)
+    q, p = jax_flow(kepler(), steps=40)(*start, h=H, parameters=jnp.array([1.1]))
+    assert_allclose(q, run.q[-1], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("every", [1, 50])
+def test_derivatives_by_all_that_is_given_are_those_of_leapfrog(derivative, every):
+    found = derivative(partial(by_c, every=every))(given())
+    expected = jax.jacfwd(leapfrog)(given())[:, ::every]
+    assert_allclose(found, expected, rtol=0, atol=1e-12 * float(abs(expected).max()))
+
+
+def test_derivatives_of_a_harmonic_oscillator_are_those_of_sines():
+    system = LagrangianSystem.from_text(
+        name="oscillator", coordinates=["x"], lagrangian="x_dot**2/2 - w**2*x**2/2", parameters={"w": 1.3}
+    )
+    flow = jax_flow(compile_stepper(system, SVI(6), flags=QUICK_FLAGS), steps=70)
+    end = jax.value_and_grad(lambda w, h: flow(jnp.ones(1), jnp.zeros(1), parameters={"w": w}, h=h)[0][0], (0, 1))
+    value, slopes = end(1.3, H)
+    time = 70 * H
+    assert_allclose(value, np.cos(1.3 * time), atol=1e-13)
+    assert_allclose(slopes, [-time * np.sin(1.3 * time), -70 * 1.3 * np.sin(1.3 * time)], rtol=1e-11)
+
+
+def test_transformations_apply_in_any_order():
+    flow = jax_flow(kepler(), steps=30)
+    q, p = jnp.array([[0.5, 0.0], [0.6, 0.1], [0.9, -0.2]]), jnp.array([0.0, 1.6])
+
+    def x_of_end(q, p, mu, h):
+        return flow(q, p, parameters={"mu": mu}, h=h)[0][..., 0]
+
+    each = [jax.grad(x_of_end, argnums=(0, 1, 2, 3))(row, p, 1.0, H) for row in q]
+    together = jax.jit(jax.vmap(jax.grad(x_of_end, argnums=(0, 1, 2, 3)), in_axes=(0, None, None, None)))(q, p, 1.0, H)
+    for k, found in enumerate(together):
+        assert_allclose(found, jnp.stack([one[k] for one in each]), rtol=1e-12, atol=1e-12)
+    summed = jax.grad(lambda q: jax.vmap(x_of_end, in_axes=(0, None, None, None))(q, p, 1.0, H).sum())(q)
+    assert_allclose(summed, together[0], rtol=1e-12, atol=1e-12)
+    last = jax.vmap(x_of_end, in_axes=(1, None, None, None))(q.T, p, 1.0, H)
+    assert_array_equal(last, x_of_end(q, p, 1.0, H))
+    lengths = jnp.array([0.05, 0.1])
+    grid = jax.vmap(jax.vmap(jax.jacfwd(x_of_end), (0, None, None, None)), (None, None, None, 0))(q, p, 1.0, lengths)
+    back = jax.vmap(jax.vmap(jax.jacrev(x_of_end), (0, None, None, None)), (None, None, None, 0))(q, p, 1.0, lengths)
+    assert grid.shape == (2, 3, 2)
+    assert_allclose(grid, back, rtol=1e-11, atol=1e-12)
+    assert_allclose(grid[1], together[0], rtol=1e-11, atol=1e-12)
+    along = jax.linearize(lambda q: x_of_end(q, p, 1.0, H), q[0])[1](jnp.array([0.3, 0.4]))
+    assert_allclose(along, together[0][0] @ jnp.array([0.3, 0.4]), rtol=1e-11)
+
+
+def test_a_jacobian_linearises_a_trajectory_once():
+    flow = jax_flow(kepler(), steps=30)
+    q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
+    for derivative, part in ((jax.jacfwd, "push"), (jax.jacrev, "pull")):
+        text = jax.jit(derivative(lambda q: flow(q, p, h=H)[0])).lower(q).as_text()
+        calls = re.findall(rf"custom_call @\w+_{part}.*", text)
+        assert len(calls) == 1
+        assert "(tensor<7xf64>, tensor<2x" in calls[0]  # one start, both columns or rows
+        assert "callback" not in text
+
+
+def test_inputs_that_are_held_are_parameters():
+    system = LagrangianSystem.from_text(
+        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u"}, inputs=["u"]
+    )
+    flow = jax_flow(compile_stepper(system, SVI(1), flags=QUICK_FLAGS), steps=10)
+    start = {"q": jnp.zeros(1), "p": jnp.zeros(1)}
+    slope = jax.grad(lambda u: flow(**start, parameters={"u_0": u}, h=0.2)[0][0])(3.0)
+    assert_allclose(slope, 2.0, rtol=1e-13)  # t^2 / 2
+    with pytest.raises(StateError, match="input u is not given"):
+        flow(**start, h=0.2)
+
+
+def test_motions_with_constraints_have_the_derivatives_of_their_runs():
+    system = LagrangianSystem.from_text(
+        name="rod",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - g*y",
+        parameters={"g": 9.0},
+        constraints=["x**2 + y**2 = 1"],
+    )
+    stepper = compile_stepper(system, SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
+    flow, run = jax_flow(stepper, steps=20), stepper.integrate([1.0, 0.0], [0.0, 0.5], h=0.02, steps=20)
+    found = jax.jacrev(lambda q, p: flow(q, p, h=0.02)[0], (0, 1))(jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]))
+    assert_allclose(np.concatenate(found, axis=1), run.sensitivity().state[-1, :2], rtol=0, atol=1e-12)
+
+
+def test_a_step_that_fails_says_when():
+    flow = jax_flow(kepler(), steps=5)
+    with pytest.raises((RuntimeError, ValueError), match=r"step 0 at t = 0 failed: not finite"):
+        jax.block_until_ready(flow(jnp.zeros(2), jnp.zeros(2), h=H))
+
+
+def test_what_there_is_not_is_refused():
+    q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
+    flow = jax_flow(kepler(), steps=5)
+    with pytest.raises(MethodError, match="no second derivatives"):
+        jax.hessian(lambda q: flow(q, p, h=H)[0].sum())(q)
+    with pytest.raises(StateError, match="q is float32, but a flow is computed in binary64"):
+        flow(q.astype(jnp.float32), p, h=H)
+    with pytest.raises(StateError, match=r"p must have shape \(.., 2\), not \(3,\)"):
+        flow(q, jnp.zeros(3), h=H)
+    with pytest.raises(StateError, match="leading axes"):
+        flow(jnp.zeros((3, 2)), jnp.zeros((4, 2)), h=H)
+    with pytest.raises(StateError, match="did you mean 'mu'"):
+        flow(q, p, h=H, parameters={"Mu": 1.0})
+    with pytest.raises(StateError, match="no multiple of every=3"):
+        jax_flow(kepler(), steps=10, every=3)
+    with pytest.raises(MethodError, match="monitor"):
+        jax_flow(compile_stepper(problem("kepler").system, SVI(2), monitor="q1**2 + q2**2"), steps=3)
+    clocked = compile_stepper(reparametrise(problem("kepler").system, "q1**2 + q2**2"), SVI(2))
+    with pytest.raises(MethodError, match="no derivatives"):
+        jax_flow(clocked, steps=3)(q, p, h=H)
+
+
+ALONE = """
+import jax.numpy as jnp, scvi_codegen as sc
+flow = sc.jax_flow(sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:1"), steps=3)
+try:
+    flow(jnp.ones(1), jnp.ones(1), h=0.1)
+except sc.StateError as error:
+    print(error)
+"""
+
+
+def test_without_binary64_it_says_how_to_have_it():
+    result = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=True)
+    assert "jax.config.update('jax_enable_x64', True)" in result.stdout

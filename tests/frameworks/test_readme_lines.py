@@ -1,0 +1,53 @@
+"""The README's lines on frameworks print what is known; without a library flows say which extra has it."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS
+from scipy.special import ellipk
+
+from scvi_codegen import SVI, MissingLibraryError, casadi_flow, compile_stepper, jax_flow, problem
+
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+LIBRARIES = {"jax": jax_flow, "casadi": casadi_flow}
+
+
+def printed(library, capfd):
+    """The numbers that the block prints last."""
+    [block] = re.findall(rf"^```py\n(import {library}\n.*?)^```$", README, re.MULTILINE | re.DOTALL)
+    exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
+    last = capfd.readouterr().out.splitlines()[-1]
+    return [float(number) for number in re.findall(r"-?\d+\.\d+", last)]
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_library_that_is_missing_is_named_with_its_extra(library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    stepper = compile_stepper(problem("planar-pendulum").system, SVI(1), flags=QUICK_FLAGS)
+    with pytest.raises(MissingLibraryError, match=rf"{library}, which .* pip install 'scvi-codegen\[{library}\]'"):
+        LIBRARIES[library](stepper, steps=3)
+
+
+def test_lines_for_jax(capfd):
+    jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
+    before = jax.config.jax_enable_x64
+    try:
+        found = printed("jax", capfd)
+    finally:
+        jax.config.update("jax_enable_x64", before)
+    stepper = compile_stepper(problem("kepler").system, "svi:8", flags=QUICK_FLAGS)
+
+    def end(mu):
+        return stepper.integrate([0.5, 0.0], [0.0, 3**0.5], h=0.1, steps=63, parameters={"mu": mu})
+
+    by_mu = (end(1.0 + 1e-5).q[-1, 0] - end(1.0 - 1e-5).q[-1, 0]) / 2e-5
+    assert_allclose(found, [by_mu, 63 * end(1.0).velocity[-1, 0]], rtol=1e-5)
+
+
+def test_lines_for_casadi(capfd):
+    pytest.importorskip("casadi", reason="needs the extra 'casadi'")
+    assert_allclose(printed("casadi", capfd), [2 * np.sin(1.0), ellipk(np.sin(1.0) ** 2) / 12], rtol=1e-5)

@@ -1,0 +1,46 @@
+"""The C text of flows: without a warning, in style, behind every kind of sweep, Newton's iteration and leapfrog."""
+
+import subprocess
+
+import pytest
+from samples import linkage, pumped_cart_pole
+from style import check_style
+
+from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, compile_stepper, problem
+from scvi_codegen.rendering.flow import with_casadi_flow, with_xla_flow
+
+STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
+CASES = {
+    "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),
+    "cart": (pumped_cart_pole(), SVI(2)),
+    "kepler": (problem("kepler").system, SVI(4)),
+    "shooting": (problem("double-pendulum").system, SCVI(2)),
+    "collocation": (problem("planar-pendulum").system, SpectralCollocation(3)),
+    "vortices": (problem("point-vortices").system, SVI(2)),
+    "gauss": (problem("henon-heiles").system, Gauss(2)),
+    "leapfrog": (problem("henon-heiles").system, StoermerVerlet()),
+}
+
+
+def compile_with(compiler, flags, source, folder):
+    (folder / f"{source.prefix}.h").write_text(source.header)
+    (folder / "all.c").write_text(source.code)
+    command = [compiler, *STRICT, *flags, "-c", "all.c"]
+    found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.covering
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("name", CASES)
+def test_compiles_without_a_warning(name, compiler, tmp_path):
+    source = with_casadi_flow(compile_stepper(*CASES[name]).derivatives, 10, 5).amalgamated()
+    check_style(source.code)
+    compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
+
+
+def test_compiles_with_the_interface_of_xla(tmp_path):
+    jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
+    source = with_xla_flow(compile_stepper(*CASES["kepler"]).derivatives, "0").amalgamated()
+    check_style(source.code)
+    compile_with("gcc", ["-isystem", jax.ffi.include_dir()], source, tmp_path)
