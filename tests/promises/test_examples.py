@@ -28,7 +28,9 @@ SCRIPTS = (
     "curves_and_quadratures",
     "duffing_fit",
     "eccentric_comet",
+    "halo_orbits",
     "hanging_chain",
+    "henon_heiles_map",
     "custom_sympy_system",
     "import_generated_stepper",
     "inspect_derivation",
@@ -47,11 +49,11 @@ ENERGY_ERRORS = {
 }
 
 
-def output_of(name: str, tmp_path: Path) -> str:
+def output_of(name: str, tmp_path: Path, *arguments: str) -> str:
     """What a Python example prints, run from elsewhere."""
     path = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
     result = subprocess.run(
-        [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")],
+        [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *arguments],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
@@ -139,6 +141,26 @@ def test_leapfrog_keeps_an_ellipse_by_its_logarithm(tmp_path):
     _, away, period = zip(*(map(float, row) for row in rows), strict=True)
     assert max(away) < 1e-14
     assert period[0] / period[2] == pytest.approx(16.0, rel=0.2)
+
+
+def test_halo_orbits_are_the_published_ones_and_their_family_turns(tmp_path):
+    output = output_of("halo_orbits", tmp_path)
+    away = [float(found) for found in re.findall(r"(\S+) from the published orbit", output)]
+    assert len(away) == 4
+    assert max(away) < 1e-10
+    assert float(re.search(r"pairs within (\S+)", output)[1]) < 1e-6
+    assert float(re.search(r"to (\S+), pairs", output)[1]) < 1.75
+    stable = [float(found) for found in re.search(r"stable between (\S+) and (\S+)", output).groups()]
+    assert 2.1 < stable[0] < 2.2 < 2.3 < stable[1] < 2.4
+    assert (tmp_path / "halo_orbits.png").stat().st_size > 10_000
+
+
+def test_the_map_of_henon_and_heiles_is_half_chaotic(tmp_path):
+    """Of coarser grids than by default; on fine ones 44 per cent are regular."""
+    output = output_of("henon_heiles_map", tmp_path, "24")
+    assert 30 < float(re.search(r"regular .*: (\d+)%", output)[1]) < 60
+    assert float(re.search(r"(\d+) a second", output)[1]) > 0
+    assert (tmp_path / "henon_heiles_map.png").stat().st_size > 10_000
 
 
 def test_curves_and_quadratures_win_where_they_say(tmp_path):

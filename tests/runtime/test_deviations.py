@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from scvi_codegen import SVI, Gauss, LagrangianSystem, StateError, compile_stepper, problem
+from scvi_codegen import SVI, Event, Gauss, LagrangianSystem, StateError, compile_stepper, problem
+from scvi_codegen.runtime.spreading import Changes
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
 """Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""
@@ -30,6 +31,7 @@ def test_exponents_are_opposite_in_pairs_at_all_times(galaxy):
     assert np.abs(history[10:, 0]).max() > 0.02
 
 
+@pytest.mark.full
 def test_an_exponent_of_henon_and_heiles_is_the_published_one(galaxy):
     """0.047 (Skokos, Bountis & Antonopoulos 2007): the mean over orbits near theirs: one stays near islands long.
 
@@ -49,14 +51,14 @@ def test_a_saddle_has_the_exponents_of_its_linear_motion():
     saddle = LagrangianSystem.from_text(
         name="saddle", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2 + 0.09*x**2 - 4*y**2)/2"
     )
-    run = compile_stepper(saddle, Gauss(4)).integrate([0.0, 0.1], [0.0, 0.0], h=0.05, steps=20_000)
-    assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], atol=5e-3)
+    run = compile_stepper(saddle, Gauss(4)).integrate([0.0, 0.1], [0.0, 0.0], h=0.1, steps=4000)
+    assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], atol=1e-2)
     deviations = run.deviations()
-    assert deviations.log_gali(2)[-1] < -290.0
-    assert slope(run.t[10_000:], deviations.log_gali(2)[10_000:]) == pytest.approx(-0.3, rel=1e-3)
-    assert slope(run.t[10_000:], deviations.log_gali(4)[10_000:]) == pytest.approx(-1.2, rel=1e-3)
-    assert slope(run.t[10_000:], run.megno()[10_000:]) == pytest.approx(0.15, rel=1e-3)
-    assert slope(run.t[10_000:], run.fli()[10_000:]) == pytest.approx(0.3, rel=1e-3)
+    assert deviations.log_gali(2)[-1] < -110.0
+    assert slope(run.t[2000:], deviations.log_gali(2)[2000:]) == pytest.approx(-0.3, rel=1e-3)
+    assert slope(run.t[2000:], deviations.log_gali(4)[2000:]) == pytest.approx(-1.2, rel=1e-3)
+    assert slope(run.t[2000:], run.megno()[2000:]) == pytest.approx(0.15, rel=1e-3)
+    assert slope(run.t[2000:], run.fli()[2000:]) == pytest.approx(0.3, rel=1e-3)
 
 
 def test_a_free_particle_spreads_as_it_can_be_written_down():
@@ -77,7 +79,8 @@ def test_indicators_are_those_of_the_variational_equations(galaxy):
     """Changes, the integrals of MEGNO and volumes of a chaotic orbit by DOP853."""
     run = compile_stepper(problem("henon-heiles").system, SVI(6)).integrate(*CHAOTIC, h=0.02, steps=2500)
     found = run.deviations(3)
-    changes = np.array(_start(run))[:, :3]
+    changes = Changes.checked(run.stepper, 3, None).at(run.q[0], run.p[0], 0.02, 0.0, run.parameters, None)
+    assert_allclose(changes.T @ changes, np.eye(3), atol=1e-14)
 
     def motion(t, z):
         x, y, v = z[0], z[1], z[4:16].reshape(4, 3)
@@ -100,21 +103,11 @@ def test_indicators_are_those_of_the_variational_equations(galaxy):
     assert found.megno()[-1] == pytest.approx(ends[17] / 50.0, rel=1e-3)
 
 
-def _start(run):
-    """The changes at the start: those that one step makes, and its derivative undone."""
-    one = run.stepper.integrate(run.q[0], run.p[0], h=1e-9, steps=1)
-    frame = one.deviations()
-    assert np.abs(frame.lengths).max() < 1e-8
-    from scvi_codegen.runtime.spreading import Changes
-
-    return Changes.checked(run.stepper, None, None).at(run.q[0], run.p[0], 0.1, 0.0, run.parameters, None)
-
-
 def test_regular_and_chaotic_motions_are_told_apart(galaxy):
     """MEGNO to 2 or along lambda t / 2; GALI_2 constant, GALI_3 and GALI_4 as t^-2 and t^-4, or exponential."""
-    regular, chaotic = (galaxy.integrate(*start, h=0.2, steps=15_000) for start in (REGULAR, CHAOTIC))
+    regular, chaotic = (galaxy.integrate(*start, h=0.2, steps=10_000) for start in (REGULAR, CHAOTIC))
     assert regular.megno()[-1] == pytest.approx(2.0, abs=0.1)
-    late, found = slice(1500, None), regular.deviations()
+    late, found = slice(1000, None), regular.deviations()
     powers = [slope(np.log(regular.t[late]), found.log_gali(k)[late]) for k in (2, 3, 4)]
     assert_allclose(powers, [0.0, -2.0, -4.0], atol=0.3)
     assert slope(np.log(regular.t[late]), found.fli()[late]) == pytest.approx(1.0, abs=0.2)
@@ -125,7 +118,7 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
     assert chaotic.fli()[-1] / t == pytest.approx(exponents[0], rel=0.05)
     assert found.log_gali(2)[-1] / t == pytest.approx(exponents[1] - exponents[0], rel=0.1)
     assert found.log_gali(4)[-1] / t == pytest.approx(-4.0 * exponents[0], rel=0.05)
-    assert found.log_gali(4)[-1] < -400.0  # where products of lengths would long be rounding
+    assert found.log_gali(4)[-1] < -250.0  # where products of lengths would long be rounding
     assert 0.0 < chaotic.sali()[1000] < 1e-2 < regular.sali()[-1]
 
 
@@ -190,6 +183,49 @@ def test_ensembles_are_the_same_as_runs(galaxy):
         last.megno()[-1], galaxy.deviations_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1).megno()[-1]
     )
     assert last.megno().shape == (2, 2)
+
+
+def test_a_run_that_an_event_ended_has_its_last_step_as_it_is(galaxy):
+    """Its length is held: the derivative is that of the state at that time, not of the crossing."""
+    run = galaxy.integrate(*CHAOTIC, h=0.2, steps=1000, events=Event("y", terminal=True, direction=1))
+    assert run.ended_by is not None
+    assert run.t[-1] % 0.2 > 1e-6
+    moved = run.tangent()[-1] @ Changes.checked(galaxy, 1, None).at(
+        *map(np.array, CHAOTIC), 0.2, 0.0, run.parameters, None
+    )
+    assert run.deviations(1).lengths[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)
+
+
+@pytest.mark.full
+def test_planets_are_regular_and_chaotic_where_rebound_says_so():
+    """Two of a thousandth of their star; its MEGNO by the variational equations of IAS15, of another change."""
+    rebound = pytest.importorskip("rebound")
+    pairs = ("01", "02", "12")
+    energy = " + ".join(f"m{i}*(x{i}_dot**2 + y{i}_dot**2)/2" for i in "012")
+    pull = " + ".join(f"m{i}*m{j}/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in pairs)
+    planets = LagrangianSystem.from_text(
+        name="two planets",
+        coordinates=["x0", "y0", "x1", "y1", "x2", "y2"],
+        lagrangian=f"{energy} + {pull}",
+        parameters={"m0": 1.0, "m1": 1e-3, "m2": 1e-3},
+    )
+    stepper, span = compile_stepper(planets, SVI(3)), 600 * np.pi
+    for distance, regular in ((1.3, False), (1.35, True)):
+        known = rebound.Simulation()
+        known.add(m=1.0)
+        known.add(m=1e-3, a=1.0, e=0.02)
+        known.add(m=1e-3, a=distance, e=0.02, f=2.0)
+        known.move_to_com()
+        q, v = (
+            [c for p in known.particles for c in pair(p)] for pair in (lambda p: (p.x, p.y), lambda p: (p.vx, p.vy))
+        )
+        found = stepper.deviations_ensemble([q], velocity=[v], h=0.15, steps=round(span / 0.15), count=1).megno()[-1, 0]
+        known.init_megno(seed=1)
+        known.integrate(span)
+        if regular:
+            assert_allclose([found, known.megno()], 2.0, atol=0.05)
+        else:
+            assert min(found, known.megno()) > 6.0
 
 
 def test_what_is_refused(galaxy):
