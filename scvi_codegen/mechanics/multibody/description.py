@@ -10,6 +10,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.vocabulary import shortened
 from scvi_codegen.mechanics.multibody.kinetics import gyroscopic_forces, kinetic_energy, load_forces, motions_of
 from scvi_codegen.mechanics.multibody.potential import potential_of
 from scvi_codegen.mechanics.multibody.variables import Variables, solved_for_speeds
@@ -61,14 +62,21 @@ class Multibody:
         equations = (
             [row for row in map(variables.read, self.kinematics) if row.has(*variables.u)] if variables.u else []
         )
-        beyond = self._beyond_configuration(variables)
-        missing = len(variables.u) - len(equations)
         idle = [u for u in variables.u if not any(row.has(u) for row in equations)]
-        if missing and missing == len(beyond) + len(idle):
+        if idle and len(equations) + len(idle) == len(variables.u):
             return self._with_ignored(list(map(variables.write, idle))).formulas()
-        if missing != len(beyond):
-            raise SystemDefinitionError(_counts(variables, len(equations), list(map(variables.write, beyond))))
-        variables.settle(solved_for_speeds([*equations, *beyond], variables))
+        if len(equations) != len(variables.u):
+            raise SystemDefinitionError(
+                f"{len(variables.u)} generalised speeds, but {len(equations)} kinematic equations for them: as many "
+                "are needed, so that speeds are an invertible combination of the rates of the coordinates"
+            )
+        if beyond := self._beyond_configuration(variables):
+            raise SystemDefinitionError(
+                f"the constraint on velocities {shortened(variables.write(beyond[0]))} = 0 does not follow from those "
+                "on the configuration: nonholonomic constraints are not supported. If it is the rate of a function "
+                "of the coordinates, give that as a configuration constraint"
+            )
+        variables.settle(solved_for_speeds(equations, variables))
         energy, forces = self._dynamics(variables)
         write = variables.write
         return {
@@ -98,27 +106,13 @@ class Multibody:
             motions = motions_of(self.bodies, self.frame, variables)
             groups = [load_forces(group, self.frame, variables) for group in self.loads]
         except (ValueError, TypeError) as error:
-            raise SystemDefinitionError(f"SymPy cannot tell how bodies and loads move: {error}") from error
+            said = " ".join(str(error).split())
+            raise SystemDefinitionError(f"SymPy cannot tell how bodies and loads move: {said}") from error
         if any(entry.has(*variables.x) for motion in motions for entry in motion.inertia):
             raise SystemDefinitionError("a mass or an inertia depends on a coordinate, which is not supported")
         potential, forces = _split(groups, variables)
         beyond = gyroscopic_forces(motions, variables)
         return kinetic_energy(motions) - potential, tuple(map(sympy.Add, forces, beyond))
-
-
-def _counts(variables: Variables, equations: int, beyond: Sequence[Expr]) -> str:
-    """Why speeds, kinematic equations and constraints on velocities do not make a Lagrangian system."""
-    if len(variables.u) == equations:
-        return (
-            f"the constraint on velocities {beyond[0]} = 0 does not follow from those on the configuration: "
-            "nonholonomic constraints are not supported between coordinates. If it is the rate of a function of them, "
-            "give that as a configuration constraint"
-        )
-    return (
-        f"{len(variables.u)} generalised speeds, {equations} kinematic equations and {len(beyond)} constraints on "
-        "velocities that do not follow from the configuration: speeds must be combinations of the rates of the "
-        "coordinates, as many as equations and such constraints together"
-    )
 
 
 def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:

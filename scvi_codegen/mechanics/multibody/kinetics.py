@@ -37,14 +37,14 @@ class BodyMotion:
     """How a body moves, or turns.
 
     Attributes:
-        rates: (3,) its velocity in the inertial frame, or its angular velocity in its own.
+        rates: (3,) its velocity in the inertial frame, or its angular velocity in the frame of its inertia.
         inertia: (3, 3) mass, or central inertia.
-        turns: whether it is the latter.
+        axes: (3,) the angular velocity of that frame, there.
     """
 
     rates: tuple[Expr, ...]
     inertia: Matrix
-    turns: bool
+    axes: tuple[Expr, ...]
 
     @property
     def momentum(self) -> tuple[Expr, ...]:
@@ -62,16 +62,18 @@ def motions_of(
 
 def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator[BodyMotion]:
     mass = variables.read(body.mass) * sympy.eye(3)
-    yield BodyMotion(_components(body, body.masscenter.vel(frame), frame, variables), mass, False)
+    yield BodyMotion(_components(body, body.masscenter.vel(frame), frame, variables), mass, (sympy.S.Zero,) * 3)
     if hasattr(body, "central_inertia"):
-        inertia = body.central_inertia.to_matrix(body.frame).applyfunc(lambda entry: _fixed(entry, variables))
-        yield BodyMotion(_components(body, body.frame.ang_vel_in(frame), body.frame, variables), inertia, True)
+        own = _frame_of(body.central_inertia, body.frame)
+        inertia = body.central_inertia.to_matrix(own).applyfunc(variables.read)
+        rates = _components(body, body.frame.ang_vel_in(frame), own, variables)
+        yield BodyMotion(rates, inertia, _components(body, own.ang_vel_in(frame), own, variables))
 
 
-def _fixed(entry: Expr, variables: Variables) -> Expr:
-    """A moment of inertia; that of a round body may be given in a frame that does not turn with it."""
-    found = variables.read(entry)
-    return sympy.trigsimp(found) if found.has(*variables.x) else found
+def _frame_of(inertia: Any, frame: ReferenceFrame) -> ReferenceFrame:
+    """Where an inertia is written, which for round bodies need not turn with them; else the frame given."""
+    frames = {own for _, *vectors in inertia.args for vector in vectors for _, own in vector.args}
+    return frames.pop() if len(frames) == 1 else frame
 
 
 def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
@@ -103,13 +105,13 @@ def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tu
 
 
 def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, ...]]:
-    """d/dt dw/dq_dot_i - dw/dq_i by coordinate; of angular velocities less dw/dq_dot_i x w, as axes turn, too."""
+    """d/dt dw/dq_dot_i - dw/dq_i by coordinate, less dw/dq_dot_i x W where axes turn with W."""
     partial, pulls = jacobian(motion.rates, variables.v), jacobian(motion.rates, variables.x)
     found = {}
     for i in {column for _, column in (*partial, *pulls)}:
         slopes = [partial.get((a, i), sympy.S.Zero) for a in range(3)]
         changes = [variables.rate(slope) for slope in slopes]
-        turned = Matrix(slopes).cross(Matrix(motion.rates)) if motion.turns else [sympy.S.Zero] * 3
+        turned = Matrix(slopes).cross(Matrix(motion.axes))
         found[i] = tuple(changes[a] - pulls.get((a, i), sympy.S.Zero) - turned[a] for a in range(3))
     return found
 

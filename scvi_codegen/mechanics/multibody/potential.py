@@ -45,9 +45,10 @@ def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:
         coefficient, power = term.as_independent(*bases.values(), as_Add=False)
         coefficients[power] = coefficients.get(power, sympy.S.Zero) + coefficient
     plain = manualintegrate(coefficients.pop(sympy.S.One, sympy.S.Zero), q)
+    plain = plain.replace(sympy.Piecewise, lambda generic, *special: generic[0])
     behind = {symbol: base for base, symbol in bases.items()}
     parts = [_by_chain_rule(factor, power, behind, q) for power, factor in coefficients.items() if factor != 0]
-    if plain.has(sympy.Integral, sympy.Piecewise) or None in parts:
+    if plain.has(sympy.Integral) or None in parts:
         return None
     return Add(plain, *parts)
 

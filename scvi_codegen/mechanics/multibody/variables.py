@@ -8,6 +8,7 @@ from typing import Any
 import sympy
 from sympy import Dummy, Expr, Matrix, Symbol
 from sympy.core.function import AppliedUndef
+from sympy.matrices.exceptions import NonInvertibleMatrixError
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import evaluated
@@ -86,13 +87,15 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
     """
     if not variables.u:
         return {}
-    resting = dict.fromkeys(variables.u, sympy.S.Zero)
-    constants = Matrix([equation.xreplace(resting) for equation in equations])
-    found = tuple(sympy.linsolve((Matrix(equations).jacobian(variables.u), -constants), *variables.u))
-    if not found or any(value.has(*variables.u) for value in found[0]):
-        names = ", ".join(str(variables.write(u)) for u in variables.u)
-        raise SystemDefinitionError(
-            f"the kinematic equations cannot be solved for the generalised speeds {names}: they must be an invertible "
-            "combination of the rates of the coordinates"
-        )
-    return dict(zip(variables.u, found[0], strict=True))
+    rows, resting = Matrix(equations), dict.fromkeys(variables.u, sympy.S.Zero)
+    try:
+        found = rows.jacobian(variables.u).LUsolve(-rows.xreplace(resting))
+        if not found.has(*variables.u, sympy.nan, sympy.zoo):
+            return dict(zip(variables.u, found, strict=True))
+    except NonInvertibleMatrixError:
+        pass
+    names = ", ".join(str(variables.write(u)) for u in variables.u)
+    raise SystemDefinitionError(
+        f"the kinematic equations cannot be solved for the generalised speeds {names}: they must be an invertible "
+        "combination of the rates of the coordinates"
+    )
