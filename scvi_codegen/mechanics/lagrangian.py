@@ -38,7 +38,8 @@ REMEDY = (
 class LagrangianSystem(MechanicalSystem):
     """A Lagrangian L(q, q_dot, t; parameters) in m coordinates, checked on construction.
 
-    Build one with ``from_text``, ``from_sympy`` or ``from_lagranges_method``. Equality is structural.
+    Build one with ``from_text``, ``from_sympy``, or from SymPy's mechanics with ``from_lagranges_method``,
+    ``from_kanes_method`` and ``from_system``. Equality is structural.
 
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
@@ -254,7 +255,9 @@ class LagrangianSystem(MechanicalSystem):
         Generalised speeds are written in the rates of the coordinates. Loads that depend on coordinates alone and are
         the slopes of a potential become one; all others are forces, and so is what Kane's equations have beyond
         Lagrange's where constraints are built into velocities (a disc that rolls). Potential energies of bodies are
-        not used, as in Kane's equations. Configuration constraints become constraints.
+        not used, as in Kane's equations; accelerations follow from velocities, and none that were set by hand are used.
+        Configuration constraints become constraints. A speed that is the rate of no coordinate, as nothing depends on
+        it, gets one, ``integral_u``.
 
         Args:
             method: with bodies and kinematic equations; its equations need not have been formed.

@@ -38,6 +38,8 @@ __all__ = ["MECHANISMS", "Mechanism", "bicycle", "links_on_a_cart", "masses_in_a
 
 T = dynamicsymbols._t
 G = 9.81
+EASY = 5
+"""Coordinates for which SymPy solves its equations in seconds."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,24 @@ class Mechanism:
         f = sympy.lambdify([list(plain.values())], expressions.xreplace(plain).xreplace(named), cse=True)
         return lambda q, u: np.asarray(f(np.concatenate([q, u])), dtype=float)[:, 0]
 
+    def _rates(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        return self._numbers(Matrix(self.method.rhs()[: 2 * len(self.q)]))
+
+    def _rates_solved_for(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """The same with the linear equations solved in numbers, where SymPy would take minutes."""
+        size = 2 * len(self.q)
+        rows = self._numbers(Matrix([*self.method.forcing_full, *self.method.mass_matrix_full]))
+
+        def rates(q: np.ndarray, u: np.ndarray) -> np.ndarray:
+            found = rows(q, u)
+            return np.linalg.solve(found[size:].reshape(size, size), found[:size])
+
+        return rates
+
     def motion(self) -> tuple[np.ndarray, np.ndarray]:
         """q and dq/dt after the span, by SymPy's ``rhs()`` and DOP853."""
         m = len(self.q)
-        rhs = self._numbers(Matrix(self.method.rhs()[: 2 * m]))
+        rhs = self._rates() if m < EASY else self._rates_solved_for()
         found = solve_ivp(
             lambda t, y: rhs(y[:m], y[m:]),
             (0.0, self.span),
