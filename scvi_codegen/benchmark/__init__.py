@@ -15,6 +15,7 @@
     hand_written  generated C against hand-written C
     start_up      from text to the first step
     compile_times the same for larger systems (in compile_systems), by what takes the time
+    mechanisms    from SymPy's bodies and loads to a motion, beside lambdify and PyDy (in multibody)
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation we know of, which are named; no step or tolerance chosen with the answer known, but whole curves.
@@ -38,6 +39,7 @@ from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.hand_written import run_hand_written
 from scvi_codegen.benchmark.machine import machine
+from scvi_codegen.benchmark.mechanisms import run_mechanisms
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
@@ -61,6 +63,7 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "hand-written": run_hand_written,
     "start-up": run_start_up,
     "compile": run_compile_times,
+    "mechanisms": run_mechanisms,
 }
 """All that can be measured: name on the command line -> function that does it."""
 

@@ -14,7 +14,7 @@ from scvi_codegen.version import __version__
 
 __all__ = ["machine"]
 
-PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine")
+PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "jitcode", "symengine", "pydy")
 
 
 def machine() -> dict[str, str | dict[str, str]]:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sympy import Symbol
+from sympy.core.function import AppliedUndef
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.vocabulary import FUNCTIONS
@@ -67,8 +68,8 @@ def _letter(character: str) -> str:
 
 
 def given_name(key: object) -> str:
-    """The name of a parameter given as a symbol or as text."""
-    if isinstance(key, Symbol):
+    """The name of a parameter given as a symbol, as a function of time or as text."""
+    if isinstance(key, (Symbol, AppliedUndef)):
         return str(key.name)
     if isinstance(key, str):
         return key

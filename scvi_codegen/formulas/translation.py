@@ -24,7 +24,7 @@ class Translation:
         others: what is translated, too.
         velocities, momenta: parallel to the coordinates.
         time: the symbol for it.
-        parameters: names.
+        parameters, inputs: names, also of functions of time.
 
     Attributes:
         coordinates, momenta, parameters: canonical symbols.
@@ -41,6 +41,7 @@ class Translation:
         momenta: Sequence[Expr] = (),
         time: Symbol | None,
         parameters: tuple[str, ...],
+        inputs: tuple[str, ...] = (),
     ) -> None:
         self.rules: dict[Expr, Expr] = {}
         free = expression.free_symbols.union(*(other.free_symbols for other in others))
@@ -57,6 +58,7 @@ class Translation:
             self._velocity(coordinate, None if velocities is None else velocities[index])
         self.momenta = tuple(self._coordinate(momentum, "momentum") for momentum in momenta)
         self.parameters = tuple(self._parameter(parameter) for parameter in parameters)
+        self._given_functions((expression, *others), {*parameters, *inputs})
         for free in self.free:
             if free not in self.rules:
                 self._add(free, identifier(free.name))
@@ -117,6 +119,13 @@ class Translation:
             for free in self.free:
                 if free.name == coordinate.name + DOT:
                     self._add(free, name)
+
+    def _given_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
+        """Functions of time alone that are called as a parameter or an input is."""
+        found = set().union(*(expression.atoms(AppliedUndef) for expression in expressions)) - self.rules.keys()
+        for function in sorted(found, key=str):
+            if function.func.__name__ in names and function.args == (self.user_time,):
+                self._add(function, identifier(function.func.__name__))
 
     def _parameter(self, parameter: str) -> Symbol:
         name = identifier(parameter)

@@ -15,7 +15,7 @@ Numerica 10 (2001), part 3; C. M. Campos, S. Ober-Bloebaum, Math. Model. Numer. 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -24,10 +24,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import given_name
 
-if TYPE_CHECKING:
-    from sympy.physics.mechanics import LagrangesMethod
-
-__all__ = ["dissipative_forces", "forces_by_coordinate", "generalised_forces"]
+__all__ = ["dissipative_forces", "forces_by_coordinate"]
 
 
 def forces_by_coordinate(
@@ -62,14 +59,3 @@ def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple
             f"no velocity occurs in the dissipation {dissipation}: Rayleigh's function D(q, v) gives the forces -dD/dv"
         )
     return tuple(-slopes.get(i, sympy.S.Zero) for i in range(len(velocities)))
-
-
-def generalised_forces(method: LagrangesMethod) -> dict[Expr, Expr]:
-    """The forces of a ``forcelist`` by coordinate: f_i = sum F . dv/dq_dot_i over points, of torques over frames."""
-    forces: dict[Expr, Expr] = {}
-    for place, vector in method.forcelist or ():
-        velocity = place.vel(method.inertial) if hasattr(place, "vel") else place.ang_vel_in(method.inertial)
-        for q in method.q:
-            partial = velocity.diff(q.diff(sympy.physics.vector.dynamicsymbols._t), method.inertial, var_in_dcm=False)
-            forces[q] = forces.get(q, sympy.S.Zero) + vector.dot(partial)
-    return {q: f for q, f in forces.items() if f != 0}

@@ -13,17 +13,20 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation
-from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, takes
+from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, Kind, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
-from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate, generalised_forces
+from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
 from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
 if TYPE_CHECKING:
-    from sympy.physics.mechanics import LagrangesMethod
+    from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
 
 __all__ = ["LagrangianSystem"]
+
+KANES_METHOD = Kind("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
+BODIES = Kind("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
 REMEDY = (
     "A variational integrator needs a regular Lagrangian: add the missing kinetic energy, use fewer coordinates "
@@ -35,7 +38,8 @@ REMEDY = (
 class LagrangianSystem(MechanicalSystem):
     """A Lagrangian L(q, q_dot, t; parameters) in m coordinates, checked on construction.
 
-    Build one with ``from_text``, ``from_sympy`` or ``from_lagranges_method``. Equality is structural.
+    Build one with ``from_text``, ``from_sympy``, or from SymPy's mechanics with ``from_lagranges_method``,
+    ``from_kanes_method`` and ``from_system``. Equality is structural.
 
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
@@ -142,11 +146,11 @@ class LagrangianSystem(MechanicalSystem):
         coordinates: Sequence[Expr],
         velocities: Sequence[Expr] | None = None,
         time: Symbol | None = None,
-        parameters: Mapping[Symbol | str, float] | None = None,
+        parameters: Mapping[Any, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
         dissipation: Expr | None = None,
         constraints: Sequence[Expr] = (),
-        inputs: Sequence[Symbol | str] = (),
+        inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
         """Take L from a SymPy expression, in plain symbols or in functions of time.
 
@@ -160,11 +164,11 @@ class LagrangianSystem(MechanicalSystem):
             velocities: parallel to ``coordinates``; by default ``Derivative(q(t), t)`` for a function of time, the
                 symbol called ``q_dot`` for a symbol ``q``.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
-            parameters: default value by symbol or by name.
+            parameters: default value by symbol, by name, or by a function of time that stays constant.
             forces: expression by coordinate, as the coordinate is given or by its name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
             constraints: expressions in coordinates, time and, linearly, velocities that stay 0.
-            inputs: symbols of functions of time that are given as data with each run.
+            inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
         if not isinstance(lagrangian, Expr):
             raise SystemDefinitionError(
@@ -175,7 +179,7 @@ class LagrangianSystem(MechanicalSystem):
         bound = tuple(sympy.sympify(g) for g in constraints)
         beside = (*(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0)), *bound)
         translation = Translation(
-            lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given)
+            lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given), inputs=own
         )
         driven = input_formulas(own, symbol(TIME))
 
@@ -201,13 +205,21 @@ class LagrangianSystem(MechanicalSystem):
 
     @classmethod
     def from_lagranges_method(
-        cls, method: LagrangesMethod, *, name: str, parameters: Mapping[Symbol | str, float] | None = None
+        cls,
+        method: LagrangesMethod,
+        *,
+        name: str,
+        parameters: Mapping[Any, float] | None = None,
+        inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
         """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces and constraints.
 
         Forces and torques of its ``forcelist`` act through the velocities of their points, the angular velocities of
-        their frames, projected on the coordinates: f_i = sum F . dv/dq_dot_i.
+        their frames, projected on the coordinates: f_i = sum F . dv/dq_dot_i. Its ``bodies`` add nothing, as in SymPy:
+        their energies are in its Lagrangian.
         """
+        from scvi_codegen.mechanics.multibody.readers import forces_of_lagranges_method
+
         bound = [sympy.sympify(g) for g in method._hol_coneqs]  # no public name either
         rolling = list(method.coneqs)[len(bound) :]  # after the rates of those
         lagrangian = method._L[0]  # LagrangesMethod has no public name for it
@@ -216,9 +228,66 @@ class LagrangianSystem(MechanicalSystem):
             lagrangian=lagrangian,
             coordinates=list(method.q),
             parameters=parameters,
-            forces=generalised_forces(method),
+            forces=forces_of_lagranges_method(method),
             constraints=[*bound, *rolling],
+            inputs=inputs,
         )
+
+    @classmethod
+    @takes(SystemDefinitionError, method=KANES_METHOD)
+    def from_kanes_method(
+        cls,
+        method: KanesMethod,
+        *,
+        name: str,
+        parameters: Mapping[Any, float] | None = None,
+        inputs: Sequence[Any] = (),
+    ) -> LagrangianSystem:
+        """Take over a ``sympy.physics.mechanics.KanesMethod``: the Lagrangian of its bodies, and its loads.
+
+        Generalised speeds are written in the rates of the coordinates. Loads that depend on coordinates alone and are
+        the slopes of a potential become one; all others are forces, and so is what Kane's equations have beyond
+        Lagrange's where constraints are built into velocities (a disc that rolls). Potential energies of bodies are
+        not used, as in Kane's equations; accelerations follow from velocities, and none that were set by hand are used.
+        Constraints on the configuration, and on velocities that say more, become constraints. A speed that is the rate
+        of no coordinate, as nothing depends on it, gets one, ``integral_u``.
+
+        Args:
+            method: with bodies and kinematic equations; its equations need not have been formed.
+            name: what the system is called.
+            parameters: default value by symbol, by function of time that stays constant, or by name.
+            inputs: functions of time, such as ``dynamicsymbols("F")``, that are given as data with each run.
+
+        Raises:
+            SystemDefinitionError: where generalised speeds are no invertible combination of the rates of the
+                coordinates, bodies are missing, or a symbol has no value.
+        """
+        from scvi_codegen.mechanics.multibody.readers import of_kanes_method
+
+        return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_kanes_method(method).formulas())
+
+    @classmethod
+    @takes(SystemDefinitionError, system=BODIES)
+    def from_system(
+        cls,
+        system: System,
+        *,
+        name: str,
+        parameters: Mapping[Any, float] | None = None,
+        inputs: Sequence[Any] = (),
+    ) -> LagrangianSystem:
+        """Take over a ``System`` of ``sympy.physics.mechanics``: bodies, joints, loads, actuators and constraints.
+
+        As :meth:`from_kanes_method`, with the potential energies of its bodies, unless its equations were formed by
+        Kane's method, which does without them.
+
+        Args:
+            system: its equations need not have been formed.
+            name, parameters, inputs: see :meth:`from_kanes_method`.
+        """
+        from scvi_codegen.mechanics.multibody.readers import of_system
+
+        return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_system(system).formulas())
 
     def _repr_latex_(self) -> str:
         dotted = {

@@ -17,6 +17,7 @@ from scvi_codegen.benchmark import (
     compositions,
     hand_written,
     measuring,
+    mechanisms,
     paper_tables,
     report,
     start_up,
@@ -446,6 +447,13 @@ class TestTables:
         assert row["lines_of_C"] > 100
         assert row["compiler_cpu_s"] > 0.0
         assert row["read_s"] + row["symmetries_s"] < row["first_step_s"]
+
+    def test_mechanisms_are_measured_at_equal_error(self, monkeypatch):
+        monkeypatch.setattr(mechanisms, "CONTENDERS", ("scvi-codegen", "lambdify", "none"))
+        ours, other, missing = mechanisms.run_mechanisms(bench.Plan(quick=True), lambda text: None).rows
+        assert max(ours["least_error"], other["least_error"]) < 1e-12
+        assert min(ours["second_ms"], other["second_ms"], ours["first_step_s"], other["first_step_s"]) > 0.0
+        assert "KeyError" in missing["why_not"]
 
     def test_start_up(self):
         cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows

@@ -37,6 +37,7 @@ SCRIPTS = (
     "joints",
     "kepler_conservation",
     "logarithmic_hamiltonian",
+    "mechanism_from_joints",
     "poincare_section",
     "which_step",
 )
@@ -185,6 +186,12 @@ def test_custom_sympy_system_finds_the_bifurcation(tmp_path):
     slow, fast = re.findall(r"between (\S+) and (\S+)", output)
     assert float(slow[0]) < 0 < float(slow[1])
     assert 0 < float(fast[0]) < float(fast[1])
+
+
+def test_a_mechanism_from_joints_moves_as_sympy_says(tmp_path):
+    output = output_of("mechanism_from_joints", tmp_path)
+    assert float(re.search(r"unaccounted for: (\S+)", output)[1]) < 1e-12
+    assert float(re.search(r"after 10 s: (\S+)", output)[1]) < 1e-11
 
 
 def test_inspect_derivation_shows_equations_latex_and_radicals(tmp_path):

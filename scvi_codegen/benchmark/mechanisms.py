@@ -1,0 +1,84 @@
+"""From SymPy's description of n links on a cart to a motion: by this project, by SymPy's lambdify and by PyDy."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.contenders.contenders import OURS
+from scvi_codegen.benchmark.curves import Point, time_at
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.native import building
+
+__all__ = ["CONTENDERS", "LINKS", "run_mechanisms"]
+
+CONTENDERS = (OURS, "lambdify", "PyDy")
+LINKS = (2, 5, 10, 20, 40)
+ERROR = 1e-9
+"""Largest of the coordinates after a second at which times are compared."""
+LONGEST = 1800
+
+
+def run_mechanisms(plan: Plan, say: Say) -> ResultTable:
+    """One process each, with an empty cache."""
+    rows: list[dict[str, Any]] = []
+    for links in LINKS[: 1 if plan.quick else None]:
+        found = {}
+        for name in CONTENDERS:
+            say(f"mechanisms: {links} links by {name}")
+            found[name] = _measured(name, links)
+        rows += [{"links": links, "by": name} | _row(name, found) for name in CONTENDERS]
+    return ResultTable(
+        name="mechanisms",
+        title="a pendulum of n links on a cart, from SymPy's bodies and loads, in a fresh process with an empty cache",
+        columns={
+            "links": "d",
+            "by": "",
+            "first_step_s": ".2f",
+            "second_ms": ".2f",
+            "least_error": ".0e",
+            "why_not": "",
+        },
+        rows=tuple(rows),
+        remarks=(
+            "first step: processor seconds from the model to the first step or right-hand side, C compilers included;",
+            f"second: milliseconds of the processor for a second of motion at an error of {ERROR:g};",
+            "errors of this project are against lambdify's most accurate result, all others against this project's.",
+        ),
+    )
+
+
+def _measured(name: str, links: int) -> dict[str, Any]:
+    """What the contender says, or why it says nothing."""
+    command = [sys.executable, "-m", "scvi_codegen.benchmark.contenders.multibody", name, str(links)]
+    with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
+        environment = os.environ | {building.CACHE_VARIABLE: folder}
+        try:
+            run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, timeout=LONGEST)
+        except subprocess.TimeoutExpired:
+            return {"why_not": f"more than {LONGEST} s"}
+    if run.returncode:
+        return {"why_not": (run.stderr.strip().splitlines() or [f"status {run.returncode}"])[-1][:80]}
+    measured: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
+    return measured
+
+
+def _row(name: str, found: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Its times, with errors against another contender's most accurate run."""
+    own, other = found[name], found["lambdify" if name == OURS else OURS]
+    if "why_not" in own or "why_not" in other:
+        return {"first_step_s": own.get("first_step"), "why_not": own.get("why_not") or "nothing to be held against"}
+    exact = np.array(other["runs"][-1]["q"])
+    errors = [float(np.abs(np.array(run["q"]) - exact).max()) for run in own["runs"]]
+    points = [Point(seconds=run["seconds"], error=error) for run, error in zip(own["runs"], errors, strict=True)]
+    seconds = time_at(points, ERROR)
+    spent = {} if seconds is None else {"second_ms": 1e3 * seconds}
+    return {"first_step_s": own["first_step"], "least_error": min(errors)} | spent

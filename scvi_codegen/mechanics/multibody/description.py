@@ -1,0 +1,130 @@
+"""Bodies as Kane's method and SymPy's ``System`` describe them, and their Lagrangian, forces and constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.multibody.kinetics import gyroscopic_forces, kinetic_energy, load_forces, motions_of
+from scvi_codegen.mechanics.multibody.potential import potential_of
+from scvi_codegen.mechanics.multibody.variables import Variables, solved_for_speeds
+from scvi_codegen.mechanics.multibody.velocity_constraints import independent_of
+
+if TYPE_CHECKING:
+    from sympy.physics.mechanics import ReferenceFrame
+
+__all__ = ["Multibody"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Multibody:
+    """Bodies and what acts on them, in SymPy's own terms.
+
+    Attributes:
+        frame: the inertial one.
+        time: the symbol for it.
+        coordinates, speeds: q(t), and generalised speeds u(t) or dq/dt.
+        kinematics: linear expressions in dq/dt and u that are 0.
+        auxiliary: speeds that are 0, of forces that do no work.
+        bodies: particles and rigid bodies.
+        loads: in groups that act together, each of pairs of a point and a force or of a frame and a torque.
+        potential: what bodies have as potential energy.
+        configuration: expressions in q and t that stay 0.
+        velocity: expressions in q, dq/dt, u and t that stay 0, the rates of the former among them or not.
+    """
+
+    frame: ReferenceFrame
+    time: Symbol
+    coordinates: tuple[Expr, ...]
+    speeds: tuple[Expr, ...]
+    kinematics: tuple[Expr, ...]
+    auxiliary: tuple[Expr, ...]
+    bodies: tuple[Any, ...]
+    loads: tuple[tuple[Any, ...], ...]
+    potential: Expr = sympy.S.Zero
+    configuration: tuple[Expr, ...]
+    velocity: tuple[Expr, ...]
+
+    def formulas(self) -> Mapping[str, Any]:
+        """What :meth:`LagrangianSystem.from_sympy` takes: lagrangian, coordinates, forces and constraints.
+
+        Raises:
+            SystemDefinitionError: where SymPy does not know a velocity, speeds are no combination of the rates of the
+                coordinates, or masses depend on them.
+        """
+        variables = Variables(self.coordinates, self.time, self.speeds, self.auxiliary)
+        equations = (
+            [row for row in map(variables.read, self.kinematics) if row.has(*variables.u)] if variables.u else []
+        )
+        idle = [u for u in variables.u if not any(row.has(u) for row in equations)]
+        if idle and len(equations) + len(idle) == len(variables.u):
+            return self._with_ignored(list(map(variables.write, idle))).formulas()
+        if len(equations) != len(variables.u):
+            raise SystemDefinitionError(
+                f"{len(variables.u)} generalised speeds, but {len(equations)} kinematic equations for them: as many "
+                "are needed, so that speeds are an invertible combination of the rates of the coordinates"
+            )
+        rolling = list(map(variables.write, self._beyond_configuration(variables)))
+        variables.settle(solved_for_speeds(equations, variables))
+        energy, forces = self._dynamics(variables)
+        write = variables.write
+        return {
+            "lagrangian": write(energy) - self.potential,
+            "coordinates": list(self.coordinates),
+            "forces": {q: write(f) for q, f in zip(self.coordinates, forces, strict=True) if f != 0},
+            "constraints": [*self.configuration, *(write(variables.read(each)) for each in rolling)],
+        }
+
+    def _beyond_configuration(self, variables: Variables) -> list[Expr]:
+        """The constraints on velocities, in plain symbols, that kinematics and configuration do not imply."""
+        velocity = list(map(variables.read, self.velocity))
+        known = [*map(variables.read, self.kinematics)]
+        known += [variables.rate(variables.read(g)) for g in self.configuration]
+        found = independent_of(known, velocity, (*variables.v, *variables.u)) if velocity else ()
+        return [velocity[k] for k in found]
+
+    def _with_ignored(self, speeds: Sequence[Expr]) -> Multibody:
+        """With a coordinate for each speed that has none, as nothing depends on it: its integral over time."""
+        new = tuple(sympy.Function(f"integral_{u.func}")(self.time) for u in speeds)
+        equations = tuple(q.diff(self.time) - u for q, u in zip(new, speeds, strict=True))
+        return replace(self, coordinates=(*self.coordinates, *new), kinematics=(*self.kinematics, *equations))
+
+    def _dynamics(self, variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
+        """T - V with the potential of the loads, and all other forces."""
+        try:
+            motions = motions_of(self.bodies, self.frame, variables)
+            groups = [load_forces(group, self.frame, variables) for group in self.loads]
+        except (ValueError, TypeError) as error:
+            said = " ".join(str(error).split())
+            raise SystemDefinitionError(f"SymPy cannot tell how bodies and loads move: {said}") from error
+        if any(entry.has(*variables.x) for motion in motions for entry in motion.inertia):
+            raise SystemDefinitionError("a mass or an inertia depends on a coordinate, which is not supported")
+        potential, forces = _split(groups, variables)
+        beyond = gyroscopic_forces(motions, variables)
+        return kinetic_energy(motions) - potential, tuple(map(sympy.Add, forces, beyond))
+
+
+def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
+    """The potential of loads that have one, all together or group by group, and the sum of the other forces."""
+    changing = (*variables.v, variables.time, *variables.given)
+    parts = [[sympy.expand_mul(f).as_independent(*changing, as_Add=True) for f in group] for group in groups]
+    still = [[part[0] for part in group] for group in parts]
+    moving = [[part[1] for part in group] for group in parts]
+    size = len(variables.x)
+    whole = potential_of(_sum(still, size), variables.x)
+    if whole is not None:
+        return whole, _sum(moving, size)
+    found = [potential_of(group, variables.x) for group in still]
+    rest = [group for group, potential in zip(still, found, strict=True) if potential is None]
+    return sympy.Add(*(potential for potential in found if potential is not None)), _sum([*rest, *moving], size)
+
+
+def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:
+    """Forces added up, coordinate by coordinate."""
+    rows = list(rows)
+    return tuple(sympy.Add(*(row[i] for row in rows)) for i in range(size))

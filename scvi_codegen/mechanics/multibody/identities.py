@@ -1,0 +1,38 @@
+"""Whether expressions are zero whatever their symbols are: at random points, in 60 digits."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+
+from sympy import Expr
+
+from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["vanish"]
+
+NEGLIGIBLE = mp.mpf(10) ** -40
+ATTEMPTS, POINTS = 24, 2
+SEED = 20250101
+
+
+def vanish(expressions: Iterable[Expr]) -> bool:
+    """Whether all are zero at two points at which they exist; not if no such points are found."""
+    unlike = [expression for expression in expressions if expression != 0]
+    if any(map(unsupported_part, unlike)):
+        return False
+    symbols = sorted(set().union(*(expression.free_symbols for expression in unlike)), key=str)
+    tape, generator, found = Tape(unlike, symbols), random.Random(SEED), 0
+    for _ in range(ATTEMPTS):
+        try:
+            values = tape([mp.mpf(generator.uniform(0.1, 1.0)) for _ in symbols])
+        except ArithmeticError:
+            continue
+        if any(abs(value) > NEGLIGIBLE for value in values):
+            return False
+        found += 1
+        if found == POINTS:
+            return True
+    return not unlike

@@ -1,0 +1,133 @@
+r"""Kinetic energy of bodies, their equations of motion beyond Lagrange's, and loads, from components of velocities.
+
+Kane's equations are those of d'Alembert, sum (m a - F) . dv/dq_dot_i = 0 over points (and the like for rotations). With
+v(q, q_dot, t) linear in the rates and T = sum m v.v/2 that is
+
+    d/dt T_v - T_q = f + N,        N_i = sum m v . (d/dt dv/dq_dot_i - dv/dq_i).
+
+Where velocities are the rates of positions N vanishes. Where constraints on velocities are built into them, as for a
+wheel that rolls, it does not: these are the gyroscopic forces of Chaplygin's equations, which do no work.
+
+Sources: T. R. Kane, D. A. Levinson, *Dynamics* (1985), chapters 2 to 6; Ju. I. Neimark, N. A. Fufaev, *Dynamics of
+Nonholonomic Systems* (1972), chapter III.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import sympy
+from sympy import Expr, Matrix
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.mechanics.multibody.identities import vanish
+from scvi_codegen.mechanics.multibody.variables import Variables
+
+if TYPE_CHECKING:
+    from sympy.physics.mechanics import Particle, ReferenceFrame, RigidBody
+
+__all__ = ["gyroscopic_forces", "kinetic_energy", "load_forces", "motions_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class BodyMotion:
+    """How a body moves, or turns.
+
+    Attributes:
+        rates: (3,) its velocity in the inertial frame, or its angular velocity in the frame of its inertia.
+        inertia: (3, 3) mass, or central inertia.
+        axes: (3,) the angular velocity of that frame, there.
+    """
+
+    rates: tuple[Expr, ...]
+    inertia: Matrix
+    axes: tuple[Expr, ...]
+
+    @property
+    def momentum(self) -> tuple[Expr, ...]:
+        """(3,) inertia times rates."""
+        return tuple(self.inertia * Matrix(self.rates))
+
+
+def motions_of(
+    bodies: Iterable[Particle | RigidBody], frame: ReferenceFrame, variables: Variables
+) -> tuple[BodyMotion, ...]:
+    """The motions of all bodies that have any."""
+    found = [motion for body in bodies for motion in _motions(body, frame, variables)]
+    return tuple(motion for motion in found if any(motion.rates))
+
+
+def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator[BodyMotion]:
+    mass = variables.read(body.mass) * sympy.eye(3)
+    yield BodyMotion(_components(body, body.masscenter.vel(frame), frame, variables), mass, (sympy.S.Zero,) * 3)
+    if hasattr(body, "central_inertia"):
+        own = _frame_of(body.central_inertia, body.frame)
+        inertia = body.central_inertia.to_matrix(own).applyfunc(variables.read)
+        rates = _components(body, body.frame.ang_vel_in(frame), own, variables)
+        yield BodyMotion(rates, inertia, _components(body, own.ang_vel_in(frame), own, variables))
+
+
+def _frame_of(inertia: Any, frame: ReferenceFrame) -> ReferenceFrame:
+    """Where an inertia is written, which for round bodies need not turn with them; else the frame given."""
+    frames = {own for _, *vectors in inertia.args for vector in vectors for _, own in vector.args}
+    return frames.pop() if len(frames) == 1 else frame
+
+
+def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
+    """Of a velocity, (3,)."""
+    found = tuple(variables.read(component) for component in vector.to_matrix(frame))
+    for symbol in variables.given:
+        if any(component.has(symbol) for component in found):
+            raise SystemDefinitionError(
+                f"the velocity of '{place}' depends on '{variables.write(symbol)}', which is neither a coordinate nor "
+                "a generalised speed: list it among them, or write a formula of time in its place"
+            )
+    return found
+
+
+def kinetic_energy(motions: Iterable[BodyMotion]) -> Expr:
+    """T, the sum of w . I w / 2."""
+    terms = (w * p / 2 for motion in motions for w, p in zip(motion.rates, motion.momentum, strict=True))
+    return sympy.Add(*terms)
+
+
+def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tuple[Expr, ...]:
+    """N, m expressions; exact zeros where it vanishes, as it does unless constraints are built into velocities."""
+    terms: list[list[Expr]] = [[] for _ in variables.x]
+    for motion in motions:
+        for i, excess in _excess(motion, variables).items():
+            terms[i] += [p * e for p, e in zip(motion.momentum, excess, strict=True)]
+    found = tuple(sympy.Add(*row) for row in terms)
+    return tuple(sympy.S.Zero for _ in found) if vanish(found) else found
+
+
+def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, ...]]:
+    """d/dt dw/dq_dot_i - dw/dq_i by coordinate, less dw/dq_dot_i x W where axes turn with W."""
+    partial, pulls = jacobian(motion.rates, variables.v), jacobian(motion.rates, variables.x)
+    found = {}
+    for i in {column for _, column in (*partial, *pulls)}:
+        slopes = [partial.get((a, i), sympy.S.Zero) for a in range(3)]
+        changes = [variables.rate(slope) for slope in slopes]
+        turned = Matrix(slopes).cross(Matrix(motion.axes))
+        found[i] = tuple(changes[a] - pulls.get((a, i), sympy.S.Zero) - turned[a] for a in range(3))
+    return found
+
+
+def load_forces(loads: Iterable[Any], frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
+    """The generalised forces of loads, m expressions: f_i = sum F . dv/dq_dot_i over points, of torques over frames.
+
+    Args:
+        loads: pairs of a point and a force, or of a frame and a torque.
+        frame: the inertial one.
+        variables: to read them with.
+    """
+    terms: list[list[Expr]] = [[] for _ in variables.x]
+    for place, vector in loads:
+        velocity = place.vel(frame) if hasattr(place, "vel") else place.ang_vel_in(frame)
+        force = [variables.read(component) for component in vector.to_matrix(frame)]
+        for (a, i), slope in jacobian(_components(place, velocity, frame, variables), variables.v).items():
+            terms[i].append(force[a] * slope)
+    return tuple(sympy.Add(*row) for row in terms)

@@ -1,0 +1,70 @@
+"""The potential energy of forces, where they have one: f = -V_q.
+
+One coordinate after the other is integrated: what V so far leaves of its force, term by term. Terms c s**e with a root
+or a denominator are taken by the chain rule, c/s_q being constant, which weights, springs and gravitation are; products
+of powers, sines and exponentials by SymPy. What is found counts if -V_q is f at random points, in 60 digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy
+from sympy import Add, Dummy, Expr, Pow, Symbol
+from sympy.integrals.manualintegrate import manualintegrate
+
+from scvi_codegen.mechanics.multibody.identities import vanish
+
+__all__ = ["potential_of"]
+
+
+def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr | None:
+    """V(q), or ``None`` if there is none, or none was found.
+
+    >>> x, y, k = sympy.symbols("x y k")
+    >>> potential_of([-k*x*y**2 - x/sympy.sqrt(x**2 + y**2), -k*x**2*y - y/sympy.sqrt(x**2 + y**2)], [x, y])
+    k*x**2*y**2/2 + sqrt(x**2 + y**2)
+    >>> potential_of([y, -x], [x, y])
+    """
+    potential: Expr = sympy.S.Zero
+    for q, force in zip(coordinates, forces, strict=True):
+        part = _antiderivative(force + potential.diff(q), q)
+        if part is None:
+            return None
+        potential -= part
+    return potential if vanish(f + potential.diff(q) for q, f in zip(coordinates, forces, strict=True)) else None
+
+
+def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:
+    """By ``q``; ``None`` where it is none of the simple ones."""
+    powers = [power for power in expression.atoms(Pow) if _is_steep(power, q)]
+    bases = {power.base: Dummy(positive=True) for power in powers}
+    hidden = expression.xreplace({power: bases[power.base] ** power.exp for power in powers})
+    coefficients: dict[Expr, Expr] = {}
+    for term in Add.make_args(sympy.expand(hidden)):
+        coefficient, power = term.as_independent(*bases.values(), as_Add=False)
+        coefficients[power] = coefficients.get(power, sympy.S.Zero) + coefficient
+    plain = manualintegrate(coefficients.pop(sympy.S.One, sympy.S.Zero), q)
+    plain = plain.replace(sympy.Piecewise, lambda generic, *special: generic[0])
+    behind = {symbol: base for base, symbol in bases.items()}
+    parts = [_by_chain_rule(factor, power, behind, q) for power, factor in coefficients.items() if factor != 0]
+    if plain.has(sympy.Integral) or None in parts:
+        return None
+    return Add(plain, *parts)
+
+
+def _is_steep(power: Expr, q: Symbol) -> bool:
+    """Whether it is a root of ``q``, or one over it."""
+    return bool(power.base.has(q) and not (power.exp.is_Integer and power.exp.is_positive))
+
+
+def _by_chain_rule(factor: Expr, power: Expr, behind: dict[Symbol, Expr], q: Symbol) -> Expr | None:
+    """The integral of c s**e where c/s_q does not depend on ``q``."""
+    symbol, exponent = power.as_base_exp()
+    if symbol not in behind or exponent.has(*behind, q):
+        return None
+    base = behind[symbol]
+    constant = sympy.cancel(factor.xreplace(behind) / base.diff(q))
+    if constant.has(q):
+        return None
+    return constant * (sympy.log(base) if exponent == -1 else base ** (exponent + 1) / (exponent + 1))

@@ -1,0 +1,71 @@
+"""Constraints on velocities that say more than other equations between velocities do."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["independent_of"]
+
+DEPENDENT = 1e-10
+"""Of the largest singular value."""
+ATTEMPTS = 24
+SEED = 20250101
+
+
+def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence[Symbol]) -> tuple[int, ...]:
+    """Which of the expressions asked for can be other than 0 where the known ones are, at a random point.
+
+    Args:
+        known, asked: linear in the rates.
+        rates: velocities and speeds.
+
+    Raises:
+        SystemDefinitionError: where they have no value at any of the points tried.
+    """
+    rows = _values((*known, *asked), rates)
+    basis, found = rows[: len(known)], []
+    for k, row in enumerate(rows[len(known) :]):
+        more = np.vstack([basis, row])
+        if _rank(more) > _rank(basis):
+            found.append(k)
+            basis = more
+    return tuple(found)
+
+
+def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.float64]:
+    """Coefficients of the rates and what is left without them, row by row."""
+    entries = dict(jacobian(expressions, rates))
+    resting = dict.fromkeys(rates, 0)
+    entries |= {(k, len(rates)): expression.xreplace(resting) for k, expression in enumerate(expressions)}
+    if problem := next(filter(None, map(unsupported_part, entries.values())), None):
+        raise SystemDefinitionError(f"in the constraints: {problem}")
+    symbols = sorted(set().union(*(entry.free_symbols for entry in entries.values())), key=str)
+    tape, generator = Tape(list(entries.values()), symbols), random.Random(SEED)
+    for _ in range(ATTEMPTS):
+        try:
+            values = tape([mp.mpf(generator.uniform(0.1, 1.0)) for _ in symbols])
+        except ArithmeticError:
+            continue
+        matrix = np.zeros((len(expressions), len(rates) + 1))
+        for place, value in zip(entries, values, strict=True):
+            matrix[place] = float(value)
+        return matrix
+    raise SystemDefinitionError("the constraints have no value at any of the points tried")
+
+
+def _rank(matrix: NDArray[np.float64]) -> int:
+    if not len(matrix):
+        return 0
+    sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(matrix / np.where(sizes > 0.0, sizes, 1.0), tol=DEPENDENT))
