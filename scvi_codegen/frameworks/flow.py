@@ -46,6 +46,9 @@ class Flow:
             raise StateError(f"{steps} steps are no multiple of every={every}, so that the end would not be kept")
         return cls(stepper, steps, every)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (type(self), (self.stepper, self.steps, self.every))  # not what this process knows of it
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>"
 
