@@ -196,7 +196,7 @@ def periodic_orbit(
         MethodError: in transformed time, with constraints, and for an energy where forces act.
         StateError: on wrong shapes, names or numbers.
     """
-    search = _Search.checked(
+    search = _OrbitSearch.checked(
         stepper,
         period=period,
         steps=steps,
@@ -215,7 +215,7 @@ def periodic_orbit(
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _OrbitSearch:
     """What an orbit has to meet, as a function of z = (q, p, period).
 
     Attributes:
@@ -247,7 +247,7 @@ class _Search:
         t: float,
         parameters: Parameters,
         options: SolverOptions | None,
-    ) -> _Search:
+    ) -> _OrbitSearch:
         """From what users give."""
         interface, names = stepper.interface, (*state_names(stepper), "period")
         if interface.constraints:

@@ -174,7 +174,8 @@ class _Spreading:
         count = changes.shape[1]
         self._frame, self._triangle = np.linalg.qr(changes)
         self._given, self._t, self._size = given, t, FIRST
-        diagonal = np.log(np.abs(np.diag(self._triangle)))
+        with np.errstate(divide="ignore"):  # directions that depend on each other span nothing
+            diagonal = np.log(np.abs(np.diag(self._triangle)))
         self._sums = _Sums(np.zeros(count), diagonal, *np.zeros((3, count)))
         self._found = np.full((4, len(t), count), np.nan)
         self._found[:, 0] = [self._sums.lengths, diagonal, self._sums.rates, self._sums.rates]

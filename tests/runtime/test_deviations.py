@@ -115,9 +115,9 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
     found, t = chaotic.deviations(), chaotic.t[-1]
     exponents = found.lyapunov_exponents()[-1]
     assert 2.0 * chaotic.megno()[-1] / t == pytest.approx(exponents[0], rel=0.4)
-    assert chaotic.fli()[-1] / t == pytest.approx(exponents[0], rel=0.05)
-    assert found.log_gali(2)[-1] / t == pytest.approx(exponents[1] - exponents[0], rel=0.1)
-    assert found.log_gali(4)[-1] / t == pytest.approx(-4.0 * exponents[0], rel=0.05)
+    assert chaotic.fli()[-1] / t == pytest.approx(exponents[0], rel=0.1)
+    assert found.log_gali(2)[-1] / t == pytest.approx(exponents[1] - exponents[0], rel=0.15)
+    assert found.log_gali(4)[-1] / t == pytest.approx(-4.0 * exponents[0], rel=0.1)
     assert found.log_gali(4)[-1] < -250.0  # where products of lengths would long be rounding
     assert 0.0 < chaotic.sali()[1000] < 1e-2 < regular.sali()[-1]
 
