@@ -91,17 +91,16 @@ static int rungs_up(const trial *now)
   return up;
 }
 
-/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail:
- * where some velocities are zero, rounding leaves nothing of what they become. */
+/* The first step: from one that is certainly too short by trial to one that is about right. Short ones may fail, also
+ * after shorter ones: where some velocities are zero, rounding leaves little of what they become. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
-  int found = 0, up = 1;
+  int up = 1;
   run->rung = rung_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
   try_step(run, now, 0, options, report);
   while (!now->last && up > 0) {
-    found = found || now->error < INFINITY;
-    up = found ? rungs_up(now) : MOST_UP;
+    up = now->error < INFINITY ? rungs_up(now) : MOST_UP;
     run->rung += up;
     if (up > 0)
       try_step(run, now, 0, options, report);

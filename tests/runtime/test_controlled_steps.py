@@ -298,6 +298,22 @@ def test_solve_motion_takes_the_tolerance_of_steps(kepler):
     assert not sc.solve_motion(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
 
 
+@pytest.mark.parametrize("method", ["svi:5", "svi:8", "gauss:4"])
+def test_a_first_step_is_found_where_a_velocity_is_zero(method):
+    """A cart at rest, pushed: rounding hides what short steps make of its velocity, and they fail."""
+    crane = sc.LagrangianSystem.from_text(
+        name="crane",
+        coordinates=["x", "a"],
+        lagrangian="x_dot**2 + x + (x_dot + 0.6*a_dot*cos(a))**2/4 + (0.6*a_dot*sin(a))**2/4 + 3*cos(a)",
+        forces={"a": "-0.05*a_dot"},
+    )
+    start = {"q": [0.1, 2.8], "velocity": [0.0, 0.3], "t_end": 1.0}
+    found = sc.compile_stepper(crane, method).integrate(**start)
+    known = sc.compile_stepper(crane, method, solver="newton").integrate(**start)
+    assert found.steps < 200
+    assert np.abs(found.q[-1] - known.q[-1]).max() < 1e-13
+
+
 def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
     stepper = sc.compile_stepper(sc.problem("cart-pole").system, sc.SCVI(2))
     start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
