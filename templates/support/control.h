@@ -1,5 +1,6 @@
 /* Steps that choose their own length, roots of 2 to the power of a rung. Before it: attempt of a solver, which tries a
- * step, MANTISSA, and GROWTH, what a rung up multiplies the error of a curve by. After it: advance_to.h. */
+ * step, and SHORT_STEPS_FAIL, whether rounding alone may make it fail; MANTISSA, and GROWTH, what a rung up multiplies
+ * the error of a curve by. After it: advance_to.h. */
 enum {
   OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
   MOST_UP = 4 * OCTAVE, /* rungs, while the first step is looked for */
@@ -91,16 +92,18 @@ static int rungs_up(const trial *now)
   return up;
 }
 
-/* The first step: from one that is certainly too short by trial to one that is about right. Short ones may fail, also
- * after shorter ones: where some velocities are zero, rounding leaves little of what they become. */
+/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail, and
+ * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
-  int up = 1;
+  int found = 0, up = 1;
   run->rung = rung_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
   try_step(run, now, 0, options, report);
   while (!now->last && up > 0) {
-    up = now->error < INFINITY ? rungs_up(now) : MOST_UP;
+    const int failed = !(now->error < INFINITY);
+    found = found || !failed;
+    up = failed && (SHORT_STEPS_FAIL || !found) ? MOST_UP : rungs_up(now);
     run->rung += up;
     if (up > 0)
       try_step(run, now, 0, options, report);

@@ -1,5 +1,6 @@
 /* Trials of steps that choose their length, by Newton's iteration. Before it: run.h, newton_solver.h, stage_error.h. */
 #define HOT static
+#define SHORT_STEPS_FAIL 0
 
 static inline real smaller(real a, real b)
 {

@@ -3,6 +3,8 @@
  *
  * Steps are roots of 2 to the power of a rung, so that a guess continues the curve of former steps by one of few
  * tables: from the last step, for each change of rung into the next; from the last two, for each pair of changes. */
+#define SHORT_STEPS_FAIL 1 /* their changes are held against velocities that are hardly more than rounding */
+
 enum {
   CHANGES = sizeof LADDER_ALONE / sizeof *LADDER_ALONE,
   REACH = CHANGES / 2
