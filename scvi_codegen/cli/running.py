@@ -203,8 +203,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None) -> str:
     order = "no order claimed" if method.order is None else f"order {method.order}"
     lines = [
         model.system.name,
-        f"{method.title}; {order}, {'' if is_symplectic(method, model.system) else 'not '}symplectic, "
-        f"{'' if method.symmetric else 'not '}symmetric",
+        f"{method.title}; {order}, {_geometry(model, run)}, {'' if method.symmetric else 'not '}symmetric",
         f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {outcome.end[0]:g}; "
         f"{counted(len(trajectory), 'state')} kept",
     ]
@@ -214,6 +213,13 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None) -> str:
             lines += conserved(model, trajectory)
         lines += worst_step(trajectory)
     return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
+
+
+def _geometry(model: Model, run: Run) -> str:
+    """Whether areas are kept: by steps of one length, if at all."""
+    if not is_symplectic(model.method, model.system):
+        return "not symplectic"
+    return "symplectic" if run.goal is None else "symplectic where steps have one length"
 
 
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:

@@ -258,6 +258,10 @@ class TestChoices:
 
 
 class TestRun:
+    def test_steps_that_choose_their_length_are_not_called_symplectic(self):
+        text = output_of("run", "kepler", "--tolerance", "1e-12", "--span", "3")
+        assert "order 16, symplectic where steps have one length, symmetric" in text
+
     def test_sums_up_what_was_conserved(self):
         text = output_of("run", "kepler")
         assert "order 16, symplectic, symmetric" in text
