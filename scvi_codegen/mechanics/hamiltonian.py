@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -18,11 +19,12 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.symbols import TIME, check_names, number, symbol
+from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, of, takes
 from scvi_codegen.mechanics.forces import forces_by_coordinate
+from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -64,7 +66,15 @@ class HamiltonianSystem(MechanicalSystem):
         self._check("Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
-    @takes(SystemDefinitionError, name=TEXT, coordinates=NAMES, hamiltonian=TEXT, momenta=NAMES, parameters=MAPPING)
+    @takes(
+        SystemDefinitionError,
+        name=TEXT,
+        coordinates=NAMES,
+        hamiltonian=TEXT,
+        momenta=NAMES,
+        parameters=MAPPING,
+        inputs=NAMES,
+    )
     def from_text(
         cls,
         *,
@@ -74,6 +84,7 @@ class HamiltonianSystem(MechanicalSystem):
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
+        inputs: Sequence[str] = (),
     ) -> HamiltonianSystem:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
@@ -84,6 +95,8 @@ class HamiltonianSystem(MechanicalSystem):
             momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
+            inputs: names of functions of time that are given as data with each run
+                (:mod:`scvi_codegen.mechanics.inputs`).
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
@@ -91,10 +104,15 @@ class HamiltonianSystem(MechanicalSystem):
         -p**2/2 + p*q_dot + cos(q)
         """
         names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
-        values = dict(parameters or {})
-        check_names(coordinates, tuple(values), names)
-        symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values]}
+        values = {**(parameters or {}), **input_parameters(inputs)}
+        check_names(coordinates, (*values, *inputs), names)
+        symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values, *inputs]}
         variables = tuple(symbols[given] for given in coordinates)
+        driven = input_formulas(inputs, symbols[TIME])
+
+        def read(text: str) -> Expr:
+            return parse_expression(text, symbols).xreplace(driven)
+
         return cls(
             name=name,
             coordinates=variables,
@@ -102,8 +120,9 @@ class HamiltonianSystem(MechanicalSystem):
             time=symbols[TIME],
             parameters=tuple(symbols[given] for given in values),
             defaults=tuple(number(given, value) for given, value in values.items()),
-            hamiltonian=parse_expression(hamiltonian, symbols),
-            forces=forces_by_coordinate(variables, forces or {}, lambda text: parse_expression(text, symbols)),
+            hamiltonian=read(hamiltonian),
+            forces=forces_by_coordinate(variables, forces or {}, read),
+            inputs=tuple(inputs),
         )
 
     @classmethod
@@ -117,6 +136,7 @@ class HamiltonianSystem(MechanicalSystem):
         time: Symbol | None = None,
         parameters: Mapping[Symbol | str, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
+        inputs: Sequence[Any] = (),
     ) -> HamiltonianSystem:
         """Take H from a SymPy expression, in plain symbols or in functions of time.
 
@@ -130,14 +150,19 @@ class HamiltonianSystem(MechanicalSystem):
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
             forces: expression by coordinate, in coordinates, momenta and time.
+            inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
         if not isinstance(hamiltonian, Expr):
             raise SystemDefinitionError(
                 f"the Hamiltonian is a {type(hamiltonian).__name__}, not a SymPy expression (text goes to from_text)"
             )
-        given = named_parameters(parameters)
+        own = tuple(given_name(each) for each in inputs)
+        given = named_parameters(parameters) | input_parameters(own)
         beside = tuple(sympy.sympify(f) for f in (forces or {}).values())
-        translation = Translation(hamiltonian, coordinates, beside, momenta=momenta, time=time, parameters=tuple(given))
+        translation = Translation(
+            hamiltonian, coordinates, beside, momenta=momenta, time=time, parameters=tuple(given), inputs=own
+        )
+        driven = input_formulas(own, symbol(TIME))
         return cls(
             name=name,
             coordinates=translation.coordinates,
@@ -145,12 +170,13 @@ class HamiltonianSystem(MechanicalSystem):
             time=symbol(TIME),
             parameters=translation.parameters,
             defaults=tuple(number(parameter, value) for parameter, value in given.items()),
-            hamiltonian=translation.apply(hamiltonian, "Hamiltonian"),
+            hamiltonian=translation.apply(hamiltonian, "Hamiltonian").xreplace(driven),
             forces=forces_by_coordinate(
                 translation.coordinates,
                 {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
-                lambda given: translation.apply(sympy.sympify(given), "forces"),
+                lambda given: translation.apply(sympy.sympify(given), "forces").xreplace(driven),
             ),
+            inputs=own,
         )
 
     @property

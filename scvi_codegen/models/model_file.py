@@ -279,11 +279,10 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     name, coordinates = _text(section, "name", "[system]"), _names(section, "coordinates")
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
     common["forces"] = {key: _text(forces, key, "[forces]") for key in forces}
+    common["inputs"] = _names(section, "inputs") if "inputs" in section else ()
     if "hamiltonian" in section:
         if "constraints" in section:
             raise ModelFileError("[system] has constraints beside a hamiltonian: they are kept with a lagrangian")
-        if "inputs" in section:
-            raise ModelFileError("[system] has inputs beside a hamiltonian: they are taken with a lagrangian")
         if "dissipation" in section:
             raise ModelFileError("[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]")
         common["hamiltonian"] = _text(section, "hamiltonian", "[system]")
@@ -293,8 +292,7 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
         raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
     common["lagrangian"] = _text(section, "lagrangian", "[system]")
     common["dissipation"] = _text(section, "dissipation", "[system]") if "dissipation" in section else None
-    for key in ("constraints", "inputs"):
-        common[key] = _names(section, key) if key in section else ()
+    common["constraints"] = _names(section, "constraints") if "constraints" in section else ()
     return _in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 

@@ -184,8 +184,6 @@ def test_what_is_no_input_of_the_system():
         parse_model(
             MODEL.replace('u = { file = "tables/u.csv", kind = "cubic" }', "v = { t = [0, 1], values = [0, 1] }")
         )
-    with pytest.raises(ModelFileError, match="inputs beside a hamiltonian"):
-        parse_model(MODEL.replace("lagrangian =", "hamiltonian ="))
     system = LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + u*q", inputs=["u"])
     given = {"system": system, "method": "svi:2", "q": (0.0,), "p": (0.0,), "h": 0.1, "span": 1.0}
     with pytest.raises(ModelFileError, match="is a table"):
@@ -193,3 +191,13 @@ def test_what_is_no_input_of_the_system():
     model = Model(**given)
     with pytest.raises(ModelFileError, match=r"the input u is not given: .*--input u=FILE"):
         next(model.stretches(model.start(compile_stepper(system, "svi:2"))))
+
+
+def test_a_hamiltonian_has_inputs_too():
+    """In a file, which is written and read again."""
+    text = MODEL.replace('lagrangian = "q_dot**2/2 + (1 + w)*cos(q)"', 'hamiltonian = "p_q**2/2 - (1 + w)*cos(q)"')
+    text = text.replace("c*q_dot", "c*p_q").replace("q_dot = [0.1]", "p = [0.1]")
+    text = text.replace('{ file = "tables/u.csv", kind = "cubic" }', "{ t = [0, 3.0], values = [0.0, 1.0] }")
+    model = parse_model(text)
+    assert model.system.inputs == ("u", "w")
+    assert parse_model(dump_model(model)) == model

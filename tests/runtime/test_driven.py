@@ -13,6 +13,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scvi_codegen import (
     SVI,
     Gauss,
+    HamiltonianSystem,
     LagrangianSystem,
     StateError,
     StoermerVerlet,
@@ -263,3 +264,31 @@ def test_inputs_stay_in_other_coordinates_and_other_forms(pendulum):
     assert_allclose(found.q, expected.q, atol=1e-8)
     found = compile_stepper(half, SVI(4)).drive([0.15], [0.2], inputs=data, h=0.05, t_end=2.3)
     assert_allclose(2.0 * found.q, expected.q, atol=1e-13)
+
+
+def test_inputs_of_a_hamiltonian(pendulum):
+    """In text and from SymPy, in H and in forces: as of the Lagrangian of the same motion."""
+    data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
+    expected = compile_stepper(pendulum, SVI(6)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    told = HamiltonianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        momenta=["p"],
+        hamiltonian="p**2/2 - (1 + w)*cos(q)",
+        parameters={"c": 0.2},
+        forces={"q": "u - c*p"},
+        inputs=["u", "w"],
+    )
+    q, p, c, u, w = sympy.symbols("q p c u w")
+    taken = HamiltonianSystem.from_sympy(
+        name="pushed pendulum",
+        coordinates=[q],
+        momenta=[p],
+        hamiltonian=p**2 / 2 - (1 + w) * sympy.cos(q),
+        parameters={c: 0.2},
+        forces={q: u - c * p},
+        inputs=[u, w],
+    )
+    assert told == taken
+    found = compile_stepper(told, SVI(6)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    assert_allclose(found.q, expected.q, atol=1e-13)
