@@ -166,12 +166,12 @@ def _product(a: Terms, b: Terms) -> Terms:
 
 
 def _rank(found: Sequence[Terms]) -> int:
-    """Of polynomials, with numbers in place of the parameters."""
+    """Of polynomials, with numbers in place of the parameters, of which roots may be complex."""
     places = {monomial: k for k, monomial in enumerate({monomial: None for terms in found for monomial in terms})}
     constants = sorted(set().union(*(x.free_symbols for terms in found for x in terms.values())), key=str)
     numbers = {constant: sympy.Rational(prime(k + 5), 7) for k, constant in enumerate(constants)}
-    matrix = np.zeros((len(found), len(places)))
+    matrix = np.zeros((len(found), len(places)), dtype=complex)
     for k, terms in enumerate(found):
         for monomial, coefficient in terms.items():
-            matrix[k, places[monomial]] = float(coefficient.xreplace(numbers))
+            matrix[k, places[monomial]] = complex(coefficient.xreplace(numbers))
     return int(np.linalg.matrix_rank(matrix))
