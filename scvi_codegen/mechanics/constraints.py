@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy
-from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.mechanics.regularity import sample_points
+from scvi_codegen.mechanics.regularity import row_rank, sample_points
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
@@ -40,9 +39,6 @@ __all__ = [
     "velocities_held",
     "with_reactions",
 ]
-
-DEPENDENT = 1e-10
-"""Of the largest singular value."""
 
 
 def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
@@ -91,16 +87,10 @@ def _dependent(system: MechanicalSystem) -> int:
         matrix = np.zeros((count, system.dimension))
         for (i, j), value in zip(slopes, values, strict=True):
             matrix[i, j] = float(value)
-        sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
-        matrix /= np.where(sizes > 0.0, sizes, 1.0)
-        if _rank(matrix) == count:
+        if row_rank(matrix) == count:
             return 0
-        first = max(first, next(k for k in range(count) if _rank(matrix[: k + 1]) <= k))
+        first = max(first, next(k for k in range(count) if row_rank(matrix[: k + 1]) <= k))
     return first
-
-
-def _rank(matrix: NDArray[np.float64]) -> int:
-    return int(np.linalg.matrix_rank(matrix, tol=DEPENDENT))
 
 
 def constraint_multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:

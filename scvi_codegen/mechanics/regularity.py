@@ -6,18 +6,29 @@ import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from sympy import Expr, Matrix, Symbol
 
 from scvi_codegen.formulas.derivatives import hessian
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Entries", "coupled_blocks", "null_direction", "sample_points", "singular_part"]
+__all__ = ["Entries", "coupled_blocks", "null_direction", "row_rank", "sample_points", "singular_part"]
 
 Entries = Mapping[tuple[int, int], Expr]
 
 NEGLIGIBLE = mp.mpf(10) ** -40
+DEPENDENT = 1e-10
+"""Of the largest singular value: rows that depend on each other but for rounding."""
 LARGEST_NULL_SPACE = 8
+
+
+def row_rank(matrix: NDArray[np.float64]) -> int:
+    """How many rows of (n, m) numbers are independent, each by its own size."""
+    if not matrix.size:
+        return 0
+    sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(matrix / np.where(sizes > 0.0, sizes, 1.0), tol=DEPENDENT))
 
 
 def singular_part(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import sympy
 from numpy.testing import assert_allclose
+from samples import pushed_pendulum
 from scipy.integrate import solve_ivp
 from scipy.interpolate import Akima1DInterpolator, CubicSpline
 
@@ -30,15 +31,7 @@ VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """Pushed by u, its hook shaken by w."""
-    return LagrangianSystem.from_text(
-        name="pushed pendulum",
-        coordinates=["q"],
-        lagrangian="q_dot**2/2 + (1 + w)*cos(q)",
-        parameters={"c": 0.2},
-        forces={"q": "u - c*q_dot"},
-        inputs=["u", "w"],
-    )
+    return pushed_pendulum()
 
 
 def reference(u, w, t_end):

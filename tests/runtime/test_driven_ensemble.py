@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from samples import pushed_pendulum
 from scipy.interpolate import CubicSpline
 
 from scvi_codegen import SCVI, SVI, Gauss, LagrangianSystem, StateError, StoermerVerlet, compile_stepper
@@ -17,15 +18,7 @@ COUNT = 11
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """Pushed by u, its hook shaken by w."""
-    return LagrangianSystem.from_text(
-        name="pushed pendulum",
-        coordinates=["q"],
-        lagrangian="q_dot**2/2 + (1 + w)*cos(q)",
-        parameters={"c": 0.2},
-        forces={"q": "u - c*q_dot"},
-        inputs=["u", "w"],
-    )
+    return pushed_pendulum()
 
 
 @pytest.fixture(scope="module")

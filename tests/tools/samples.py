@@ -76,6 +76,18 @@ def sleigh() -> LagrangianSystem:
     )
 
 
+def pushed_pendulum() -> LagrangianSystem:
+    """With inputs: pushed by u, its hook shaken by w."""
+    return LagrangianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + (1 + w)*cos(q)",
+        parameters={"c": 0.2},
+        forces={"q": "u - c*q_dot"},
+        inputs=["u", "w"],
+    )
+
+
 def turning_wire() -> LagrangianSystem:
     """A bead on a straight wire that turns: one constraint, with time, on coordinates that the masses couple."""
     return LagrangianSystem.from_text(

@@ -13,12 +13,11 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.tape import Tape
+from scvi_codegen.mechanics.regularity import row_rank
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["independent_of"]
 
-DEPENDENT = 1e-10
-"""Of the largest singular value."""
 ATTEMPTS = 24
 SEED = 20250101
 
@@ -37,7 +36,7 @@ def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence
     basis, found = rows[: len(known)], []
     for k, row in enumerate(rows[len(known) :]):
         more = np.vstack([basis, row])
-        if _rank(more) > _rank(basis):
+        if row_rank(more) > row_rank(basis):
             found.append(k)
             basis = more
     return tuple(found)
@@ -62,10 +61,3 @@ def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.
             matrix[place] = float(value)
         return matrix
     raise SystemDefinitionError("the constraints have no value at any of the points tried")
-
-
-def _rank(matrix: NDArray[np.float64]) -> int:
-    if not len(matrix):
-        return 0
-    sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
-    return int(np.linalg.matrix_rank(matrix / np.where(sizes > 0.0, sizes, 1.0), tol=DEPENDENT))
