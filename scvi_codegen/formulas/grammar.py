@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import NamedTuple, NoReturn
+from typing import ClassVar, NamedTuple, NoReturn
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
@@ -33,7 +33,7 @@ from scvi_codegen.formulas.canonical import (
 )
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 
-__all__ = ["parse_expression"]
+__all__ = ["Parser", "Token", "parse_expression", "parsed"]
 
 MAX_CHARACTERS = 400_000
 """Reading takes time in proportion to the length times the depth of brackets: fifty atoms in a gas are 212 000 long."""
@@ -61,7 +61,9 @@ _HINTS = {
 }
 
 
-class _Token(NamedTuple):
+class Token(NamedTuple):
+    """A number, a name, an operator or the end."""
+
     kind: str
     text: str
     column: int
@@ -84,11 +86,12 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
     >>> parse_expression("0.5*x**2 - cos(2*x)/3", {"x": x})
     x**2/2 - cos(2*x)/3
     """
-    if len(text) > MAX_CHARACTERS:
-        raise ExpressionError(
-            f"a formula of {len(text)} characters is too long: the limit is {MAX_CHARACTERS}", text, 0
-        )
-    parser = _Parser(text, symbols)
+    return parsed(Parser(text, symbols))
+
+
+def parsed(parser: Parser) -> Expr:
+    """What a parser reads, with an :class:`ExpressionError` for whatever it cannot."""
+    text = parser.text
     try:
         return parser.parse()
     except ExpressionError:
@@ -107,26 +110,34 @@ def _vanishes(part: Expr) -> bool:
     return bool(part.is_number and part.is_zero)
 
 
-def _tokens(text: str) -> list[_Token]:
+def _tokens(text: str, pattern: re.Pattern[str]) -> list[Token]:
+    if len(text) > MAX_CHARACTERS:
+        message = f"a formula of {len(text)} characters is too long: the limit is {MAX_CHARACTERS}"
+        raise ExpressionError(message, text, 0)
     tokens, position = [], _SPACE.match(text).end()  # type: ignore[union-attr]  # the pattern matches nothing, too
     while position < len(text):
-        match = _TOKEN.match(text, position)
+        match = pattern.match(text, position)
         if match is None:
             character = text[position]
             hint = _HINTS.get(character, "names are made of the letters a-z, A-Z, digits and underscores")
             raise ExpressionError(f"unexpected character {character!r}: {hint}", text, position)
-        tokens.append(_Token(str(match.lastgroup), match.group(), position))
+        tokens.append(Token(str(match.lastgroup), match.group(), position))
         position = _SPACE.match(text, match.end()).end()  # type: ignore[union-attr]  # as above
-    tokens.append(_Token("end", "", len(text.rstrip())))
+    tokens.append(Token("end", "", len(text.rstrip())))
     return tokens
 
 
-class _Parser:
-    """Recursive descent over the tokens; sums and products of any length are loops, only brackets recurse."""
+class Parser:
+    """Recursive descent over the tokens; sums and products of any length are loops, only brackets recurse.
+
+    A grammar with more kinds of atoms is a subclass, with a pattern of its tokens and an own :meth:`name`.
+    """
+
+    pattern: ClassVar[re.Pattern[str]] = _TOKEN
 
     def __init__(self, text: str, symbols: Mapping[str, Symbol]) -> None:
         self.text, self.symbols = text, symbols
-        self.tokens = _tokens(text)
+        self.tokens = _tokens(text, self.pattern)
         self.position = self.depth = 0
 
     @property
@@ -157,7 +168,7 @@ class _Parser:
         what = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
         self.refuse(f"an operator is missing before '{text}': {what}", column)
 
-    def accept(self, *operators: str) -> _Token | None:
+    def accept(self, *operators: str) -> Token | None:
         token = self.tokens[self.position]
         if token.kind != "operator" or token.text not in operators:
             return None

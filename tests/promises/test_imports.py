@@ -20,7 +20,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors version
-    counts kinds
+    counts indices kinds
     tables files
     formulas display ir
     mechanics rendering
