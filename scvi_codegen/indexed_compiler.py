@@ -40,8 +40,8 @@ def compile_indexed(
 
     Args:
         system: what moves.
-        method: how its motion is discretised, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods, and those whose
-            equations sweeps over positions solve: SVI, SC, Runge-Kutta.
+        method: how its motion is discretised, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods, and
+            those whose equations sweeps over positions solve: SVI, SC, Runge-Kutta.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 
@@ -85,5 +85,3 @@ def _work(source: Source) -> int:
     """Numbers a coordinate, as the header says."""
     line = next(line for line in source.header.split("\n") if line.startswith(f"#define {source.prefix.upper()}_WORK "))
     return int(line.split()[-1])
-
-

@@ -7,9 +7,9 @@
              | index (+|-) whole number                           i, i+1
              | table "[" index "," whole number "]"               bonds[b, 0]
 
-Sizes are names, whose values the arrays of a run have, or whole numbers. SymPy never sees an index: every *access* of an
-array (``q[i+1]``, ``m[bonds[b, 0]]``) is a symbol of its own in the formula of a term, a *slot*, of which derivatives
-are taken as of any other.
+Sizes are names, whose values the arrays of a run have, or whole numbers. SymPy never sees an index: every *access* of
+an array (``q[i+1]``, ``m[bonds[b, 0]]``) is a symbol of its own in the formula of a term, a *slot*, of which
+derivatives are taken as of any other.
 """
 
 from __future__ import annotations

@@ -142,9 +142,11 @@ class Parser:
 
     @property
     def column(self) -> int:
+        """Where the next token stands."""
         return self.tokens[self.position].column
 
     def parse(self) -> Expr:
+        """The whole text."""
         result = self.sum()
         if self.tokens[self.position].kind != "end":
             self.refuse_leftover()
@@ -155,9 +157,11 @@ class Parser:
         return result
 
     def refuse(self, message: str, column: int) -> NoReturn:
+        """Raise an error at a column."""
         raise ExpressionError(message, self.text, column)
 
     def refuse_leftover(self) -> NoReturn:
+        """Raise one at a token that fits nowhere."""
         kind, text, column = self.tokens[self.position]
         if kind == "operator" and text == "**":
             self.refuse("a tower of powers is ambiguous: write (x**y)**z or x**(y**z)", column)
@@ -169,6 +173,7 @@ class Parser:
         self.refuse(f"an operator is missing before '{text}': {what}", column)
 
     def accept(self, *operators: str) -> Token | None:
+        """The next token if it is one of these operators."""
         token = self.tokens[self.position]
         if token.kind != "operator" or token.text not in operators:
             return None
@@ -176,16 +181,19 @@ class Parser:
         return token
 
     def close(self) -> None:
+        """The bracket that closes."""
         if self.accept(")") is None:
             self.refuse_leftover()
         self.depth -= 1
 
     def open(self, column: int) -> None:
+        """One level of brackets more."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
             self.refuse(f"brackets are nested deeper than {MAX_DEPTH}", column)
 
     def sum(self) -> Expr:
+        """``product (("+" | "-") product)*``."""
         column, terms = self.column, [self.product(negative=False)]
         while token := self.accept("+", "-"):
             terms.append(self.product(negative=token.text == "-"))
@@ -201,11 +209,13 @@ class Parser:
         return Add(*(Mul(coefficient, rest) for rest, coefficient in coefficients.items()))
 
     def bounded(self, number: Expr, column: int) -> Expr:
+        """The number, unless it is too long."""
         if bits(number) > MAX_BITS:
             self.refuse(f"a constant grows beyond {MAX_BITS} bits here, more than any C double can hold", column)
         return number
 
     def product(self, *, negative: bool) -> Expr:
+        """``signed (("*" | "/") signed)*``."""
         column, coefficient, factors = self.column, S.NegativeOne if negative else S.One, []
         inverse = False
         while True:
@@ -227,15 +237,18 @@ class Parser:
         return result
 
     def sign(self) -> Expr:
+        """The product of all signs here."""
         sign = S.One
         while token := self.accept("+", "-"):
             sign = -sign if token.text == "-" else sign
         return sign
 
     def signed(self) -> tuple[Expr, Expr]:
+        """Sign and power."""
         return self.sign(), self.power()
 
     def power(self) -> Expr:
+        """``atom ["**" exponent]``."""
         column, base = self.column, self.atom()
         operator = self.accept("**")
         if operator is None:
@@ -260,6 +273,7 @@ class Parser:
         return result
 
     def atom(self) -> Expr:
+        """A number, a name, a call or a bracket."""
         kind, text, column = self.tokens[self.position]
         if kind == "end":
             self.refuse(
@@ -278,6 +292,7 @@ class Parser:
         return result
 
     def number(self, text: str, column: int) -> Expr:
+        """The exact value of a number."""
         following = self.tokens[self.position]
         if following.kind == "name" and following.text in ("j", "J") and following.column == column + len(text):
             self.refuse("complex numbers are not part of the grammar", column)
@@ -291,6 +306,7 @@ class Parser:
         return self.bounded(value, column)
 
     def name(self, name: str, column: int) -> Expr:
+        """The symbol, or the value, of a name."""
         if name in FUNCTIONS:
             return self.call(name, column)
         if self.tokens[self.position][:2] == ("operator", "("):
@@ -303,6 +319,7 @@ class Parser:
         return value
 
     def call(self, name: str, column: int) -> Expr:
+        """A function of its arguments."""
         opening = self.accept("(")
         if opening is None:
             self.refuse(f"'{name}' is a function: write {name}(...)", column)

@@ -18,8 +18,8 @@ from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.formulas.grammar import Parser, Token, parsed
-from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.formulas.symbols import check_name, symbol
+from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
 __all__ = ["IndexedTerm", "parse_array", "parse_indexed"]
 
@@ -64,13 +64,16 @@ def parse_array(text: str) -> Array:
     return _Declaration(text, {}).read()
 
 
-def parse_indexed(text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol]) -> tuple[IndexedTerm, ...]:
+def parse_indexed(
+    text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
+) -> tuple[IndexedTerm, ...]:
     """Read a sum of sums.
 
     Args:
         text: the formula.
-        arrays: every array that it may use: coordinates, their velocities, parameters and tables.
+        arrays: those whose entries it may use: coordinates, their velocities, parameters.
         symbols: what else it may use.
+        tables: arrays of places.
 
     Returns:
         Its terms, those over the same loops as one.
@@ -82,7 +85,7 @@ def parse_indexed(text: str, arrays: Sequence[Array], symbols: Mapping[str, Symb
     >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
     ['sum(i in 0..N-2, -k*(-q[i] + q[i+1])**2)']
     """
-    parser = _IndexedParser(text, symbols, arrays)
+    parser = _IndexedParser(text, symbols, arrays, tables)
     whole = parsed(parser)
     by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
     for placeholder, (loops, formula, column) in parser.sums.items():
@@ -172,10 +175,12 @@ class _Declaration(_Indices):
 
 
 class _IndexedParser(_Indices):
-    def __init__(self, text: str, symbols: Mapping[str, Symbol], arrays: Sequence[Array]) -> None:
+    def __init__(
+        self, text: str, symbols: Mapping[str, Symbol], arrays: Sequence[Array], tables: Sequence[Array]
+    ) -> None:
         super().__init__(text, symbols)
-        self.arrays = {array.name: array for array in arrays}
-        self.sizes = {name for array in arrays for name in array.names}
+        self.arrays, self.tables = ({each.name: each for each in group} for group in (arrays, tables))
+        self.sizes = {name for array in (*arrays, *tables) for name in array.names}
         self.bound: dict[str, Bound] = {}
         self.accesses: dict[Symbol, Access] = {}
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
@@ -185,6 +190,8 @@ class _IndexedParser(_Indices):
             return self.summed(column)
         if name in self.arrays:
             return self.entry(self.arrays[name], column)
+        if name in self.tables:
+            self.refuse(f"'{name}' is a table, whose entries are places: q[{name}[.., 0]]", column)
         if self.peek().text == "[":
             known = ", ".join(map(str, self.arrays.values())) or "none"
             self.refuse(f"'{name}' is no array{closest(name, self.arrays)} Arrays: {known}", column)
@@ -221,7 +228,9 @@ class _IndexedParser(_Indices):
     def written_out(self, loops: Sequence[Loop], column: int) -> Expr:
         """A sum whose bounds are whole numbers: the formula is read once for each."""
         if any(loop.first.name or loop.end.name for loop in loops):
-            message = "a sum within a sum has bounds that are whole numbers; write sum(i in N, j in N, ..) for a double sum"
+            message = (
+                "a sum within a sum has bounds that are whole numbers; write sum(i in N, j in N, ..) for a double sum"
+            )
             self.refuse(message, column)
         rows: list[dict[str, int]] = [{}]
         for loop in loops:
@@ -251,7 +260,9 @@ class _IndexedParser(_Indices):
         for bound in span:
             if bound.name and bound.name not in self.sizes:
                 known = ", ".join(sorted(self.sizes)) or "none"
-                self.refuse(f"'{bound.name}' is the size of no array{closest(bound.name, self.sizes)} Sizes: {known}", column)
+                self.refuse(
+                    f"'{bound.name}' is the size of no array{closest(bound.name, self.sizes)} Sizes: {known}", column
+                )
         periodic = self.peek().text == "periodic"
         self.position += periodic
         if pair is None:
@@ -268,7 +279,7 @@ class _IndexedParser(_Indices):
             self.refuse(str(error), token.column)
         if token.text in self.bound:
             self.refuse(f"the index '{token.text}' is used by a sum around this one: choose another", token.column)
-        if token.text in self.arrays or token.text in self.symbols or token.text in self.sizes:
+        if any(token.text in names for names in (self.arrays, self.tables, self.symbols, self.sizes)):
             self.refuse(f"'{token.text}' has a meaning: choose another index", token.column)
 
     def entry(self, array: Array, column: int) -> Expr:
@@ -298,7 +309,7 @@ class _IndexedParser(_Indices):
         token = self.peek()
         if token.kind != "name":
             return Place(base=self.size())
-        if token.text in self.arrays:
+        if token.text in self.tables:
             return self.entry_of_table()
         if token.text in self.sizes:
             return Place(base=self.size())
@@ -314,7 +325,7 @@ class _IndexedParser(_Indices):
 
     def entry_of_table(self) -> Place:
         token = self.take_name("a table")
-        table = self.arrays[token.text]
+        table = self.tables[token.text]
         row, *columns = self.brackets(table, token.column)
         plain = row.index and not row.table and not row.base.number
         if not plain or len(columns) != 1 or columns[0].index or columns[0].base.name:
@@ -339,9 +350,10 @@ class _IndexedParser(_Indices):
         remedy = f"or write '{loop.index} in {axis} periodic'"
         if not loop.first.name and (first := loop.first.number + base.number) < 0:
             begin = loop.first + -first
-            return f"{place} is {first} at {loop.index} = {loop.first}: begin at {loop.index} in {begin}..{last}, {remedy}"
+            return (
+                f"{place} is {first} at {loop.index} = {loop.first}: begin at {loop.index} in {begin}..{last}, {remedy}"
+            )
         if loop.end.name == axis.name and (beyond := loop.end.number + base.number - axis.number) > 0:
-            end = last + -beyond
-            return f"{place} is {last + base.number} at {loop.index} = {last}: end at {loop.index} in {loop.first}..{end}, {remedy}"
+            span, leaves = f"{loop.first}..{last + -beyond}", last + base.number
+            return f"{place} is {leaves} at {loop.index} = {last}: end at {loop.index} in {span}, {remedy}"
         return ""
-

@@ -101,7 +101,9 @@ def lower(
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(
-            MomentumMap(name=comment_text(each.name), formula=comment_text(each.formula), exact=method.exactness.keeps(each))
+            MomentumMap(
+                name=comment_text(each.name), formula=comment_text(each.formula), exact=method.exactness.keeps(each)
+            )
             for each in symmetries
         ),
         momentum_kernel=_momentum_kernel(system, symmetries),

@@ -197,8 +197,10 @@ class _Nest:
         if not offset or not loop.periodic:
             return moved
         end = _size_text(loop.end)
-        wrapped_place = f"{moved} < {end} ? {moved} : {moved} - {end}" if offset > 0 else (
-            f"{moved} >= 0 ? {moved} : {moved} + {end}"
+        wrapped_place = (
+            f"{moved} < {end} ? {moved} : {moved} - {end}"
+            if offset > 0
+            else (f"{moved} >= 0 ? {moved} : {moved} + {end}")
         )
         return f"({wrapped_place})"
 
@@ -238,4 +240,3 @@ def _head(loop: Loop) -> str:
     name = f"index_{loop.index}"
     first = f"index_{loop.behind} + 1" if loop.behind else _size_text(loop.first)
     return f"long long {name} = {first}; {name} < {_size_text(loop.end)}; {name}++"
-

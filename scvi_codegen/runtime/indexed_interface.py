@@ -12,7 +12,15 @@ from scvi_codegen.errors import StateError, closest
 from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.native.arguments import checked_number, real_array
 
-__all__ = ["IndexedInterface", "Numbers", "check_accesses", "field_values", "number_values", "read_state", "read_tables"]
+__all__ = [
+    "IndexedInterface",
+    "Numbers",
+    "check_accesses",
+    "field_values",
+    "number_values",
+    "read_state",
+    "read_tables",
+]
 
 Numbers = NDArray[np.float64]
 Places = NDArray[np.int32]
@@ -52,7 +60,9 @@ class IndexedInterface:
     work: int
 
 
-def read_state(interface: IndexedInterface, given: ArrayLike | Mapping[str, ArrayLike], what: str) -> dict[str, Numbers]:
+def read_state(
+    interface: IndexedInterface, given: ArrayLike | Mapping[str, ArrayLike], what: str
+) -> dict[str, Numbers]:
     """Arrays of coordinates (or of velocities, momenta) by name, from a mapping, or the only one as such.
 
     Raises:
@@ -164,7 +174,9 @@ def _check_finite(values: Numbers, what: str) -> None:
 def _check_named(given: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:
     for name in given:
         if name not in names:
-            raise StateError(f"there is no '{name}' among {what}{closest(name, names)} Known: {', '.join(names) or 'none'}")
+            raise StateError(
+                f"there is no '{name}' among {what}{closest(name, names)} Known: {', '.join(names) or 'none'}"
+            )
     for name in names:
         if whole and name not in given:
             raise StateError(f"'{name}' is missing among {what}")

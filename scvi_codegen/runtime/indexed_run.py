@@ -28,6 +28,10 @@ from scvi_codegen.runtime.portions import SLICE_SECONDS
 
 __all__ = ["IndexedRun"]
 
+ADVICE = {
+    "not converged": "sweeps contract where h times the highest frequency is less than about 2: try a smaller step",
+    "not finite": "the Lagrangian is undefined there, or the step is far too large",
+}
 ALIGNMENT = 64
 """Bytes: those of the widest vector."""
 
@@ -157,19 +161,22 @@ class IndexedRun:
         return found
 
     @property
-    def energy(self) -> float:
-        """p . v - L at the present state, its sums in twice the precision."""
-        pointers = map(self._pointer, ("q", "p", "inverse_mass"))
-        return float(self._binding.function("energy")(self._problem, self.t, *pointers))
+    def energies(self) -> tuple[float, float, float]:
+        """Kinetic and potential energy of the present state, and their sum; added up in twice the precision."""
+        found, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
+        self._binding.function("energies")(self._problem, self.t, *pointers, self._binding.pointer(found))
+        return (float(found[0]), float(found[1]), float(found[2]))
 
     @property
-    def momentum_maps(self) -> dict[str, float]:
-        """What symmetries conserve, by name (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`)."""
+    def energy(self) -> float:
+        """Their sum."""
+        return self.energies[2]
+
+    @property
+    def momentum_maps(self) -> Numbers:
+        """What symmetries conserve (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`), (count,)."""
         q, p = self.q, self.p
-        return {
-            name: _momentum(q[array], p[array], component, other)
-            for name, array, component, other in self.interface.maps
-        }
+        return np.array([_momentum(q[array], p[array], *components) for _, array, *components in self.interface.maps])
 
     @property
     def step_error(self) -> float:
@@ -186,7 +193,7 @@ class IndexedRun:
 
         Args:
             steps: their number.
-            progress: called now and then with the number of steps done.
+            progress: called now and then with the number of steps of the run.
 
         Raises:
             StepFailedError: if one fails; the run stands before it.
@@ -199,9 +206,9 @@ class IndexedRun:
             done += report.steps
             self.iterations += report.iterations
             if status:
-                raise step_failure(status, report, step=self.steps, h=self.h)
+                raise step_failure(status, report, step=self.steps, h=self.h, advice=ADVICE)
             if progress is not None:
-                progress(done)
+                progress(self.steps)
             elapsed = max(time.perf_counter() - began, 1e-6)
             portion = max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed)))
 

@@ -33,8 +33,8 @@ class IndexedTrajectory:
         q, p: positions and momenta by the name of their array, (k, ..) each; where a run was observed, the first and
             the last state alone.
         observed: (k, ..) what the observer returned, or ``None``.
-        energy: (k,) p . v - L.
-        momentum_maps: (k,) each, what symmetries conserve, by name.
+        energies: (k, 3) kinetic and potential energy, and their sum.
+        maps: (k, count) what symmetries conserve, in the order of ``stepper.momentum_map_names``.
         h: step; steps: their number; iterations: sweeps of all of them.
         step_error, step_error_t: an estimate of the error of the end of the worst step, relative to the largest
             coordinate, and when it began; not numbers for explicit methods.
@@ -44,8 +44,8 @@ class IndexedTrajectory:
     q: Mapping[str, Numbers]
     p: Mapping[str, Numbers]
     observed: Numbers | None
-    energy: Numbers
-    momentum_maps: Mapping[str, Numbers]
+    energies: Numbers
+    maps: Numbers
     h: float
     steps: int
     iterations: int
@@ -53,11 +53,18 @@ class IndexedTrajectory:
     step_error_t: float
     goal: None = None
 
-    @property
+    def energy(self) -> Numbers:
+        """P . v - L at each state (k,)."""
+        return self.energies[:, 2]
+
     def energy_error(self) -> float:
-        """The largest change of the energy over all kept states, relative to its largest size."""
-        largest = float(np.max(np.abs(self.energy)))
-        return float(np.max(np.abs(self.energy - self.energy[0]))) / (largest or 1.0)
+        """The largest change of the energy over all kept states, relative to the sizes of its two parts."""
+        largest = float(np.max(np.abs(self.energies[:, :2]).sum(axis=1)))
+        return float(np.max(np.abs(self.energy() - self.energy()[0]))) / (largest or 1.0)
+
+    def momentum_maps(self) -> Numbers:
+        """What symmetries conserve, at each state (k, count)."""
+        return self.maps
 
 
 class IndexedStepper:
@@ -77,6 +84,11 @@ class IndexedStepper:
 
     def __repr__(self) -> str:
         return f"IndexedStepper({self.interface.title})"
+
+    @property
+    def momentum_map_names(self) -> tuple[str, ...]:
+        """What symmetries conserve: shifts and turns of whole arrays."""
+        return tuple(name for name, *_ in self.interface.maps)
 
     @cached_property
     def _binding(self) -> Binding:
@@ -153,21 +165,19 @@ class IndexedStepper:
         """
         every = checked_count(every, "every", least=1)
         steps = checked_count(steps, "steps", least=0)
-        run = self.start(
-            q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables, options=options
-        )
+        run = self.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables, options=options)
         kept = _Kept(run, observe)
         kept.take(keep=True)
-        for k in range(steps // every):
+        while run.steps < steps:
             try:
-                run.advance(every, progress=None if progress is None else lambda done, k=k: progress(k * every + done))
+                run.advance(min(every, steps - run.steps), progress=progress)
             except StepFailedError as error:
                 error.trajectory = kept.trajectory()
                 raise
-            kept.take(keep=k == steps // every - 1)
-        run.advance(steps % every)
+            if run.steps % every == 0:
+                kept.take(keep=run.steps + every > steps)
         found = kept.trajectory()
-        warn_of_long_steps(found)
+        warn_of_long_steps(found, remedy="")
         return found
 
 
@@ -177,15 +187,15 @@ class _Kept:
     def __init__(self, run: IndexedRun, observe: Callable[[IndexedRun], ArrayLike] | None) -> None:
         self.run, self.observe = run, observe
         self.t: list[float] = []
-        self.energy: list[float] = []
-        self.maps: list[dict[str, float]] = []
+        self.energies: list[tuple[float, float, float]] = []
+        self.maps: list[Numbers] = []
         self.states: list[tuple[dict[str, Numbers], dict[str, Numbers]]] = []
         self.observed: list[Any] = []
 
     def take(self, *, keep: bool) -> None:
         """The present state, whole if nobody observes or it is to be kept."""
         self.t.append(self.run.t)
-        self.energy.append(self.run.energy)
+        self.energies.append(self.run.energies)
         self.maps.append(self.run.momentum_maps)
         if self.observe is not None:
             self.observed.append(np.array(self.observe(self.run), dtype=np.float64))
@@ -201,8 +211,8 @@ class _Kept:
             q={name: np.array([q[name] for q, _ in self.states]) for name in names},
             p={name: np.array([p[name] for _, p in self.states]) for name in names},
             observed=np.array(self.observed) if self.observe is not None else None,
-            energy=np.array(self.energy),
-            momentum_maps={name: np.array([maps[name] for maps in self.maps]) for name in self.maps[0]},
+            energies=np.array(self.energies),
+            maps=np.array(self.maps),
             h=run.h,
             steps=run.steps,
             iterations=run.iterations,

@@ -20,8 +20,8 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
-from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
+from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.kinds import MAPPING, TEXT, TEXTS, of, takes
 
 __all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
@@ -100,11 +100,10 @@ class IndexedSystem:
             SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
 
         >>> chain = IndexedSystem.from_text(
-        ...     name="FPUT", coordinates=["q[N]"], parameters={"beta": 0.25},
-        ...     lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 "
-        ...     "+ beta*(q[i+1] - q[i])**4/4)")
+        ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
+        ...     lagrangian="sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)")
         >>> print(chain)
-        FPUT: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -beta*(-q[i] + q[i+1])**4/4 - (-q[i] + q[i+1])**2/2)
+        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(-q[i] + q[i+1])**2/2)
         """
         arrays = tuple(map(parse_array, coordinates))
         places = tuple(map(parse_array, tables))
@@ -122,7 +121,7 @@ class IndexedSystem:
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
             tables=places,
-            terms=parse_indexed(lagrangian, (*arrays, *velocities, *fields.values(), *places), known),
+            terms=parse_indexed(lagrangian, (*arrays, *velocities, *fields.values()), known, places),
         )
 
     @property
@@ -177,7 +176,9 @@ class IndexedSystem:
                 raise SystemDefinitionError(f"'{name}' is the name of two things: rename one")
         for table in self.tables:
             if len(table.axes) != 2 or not table.axes[0].name or table.axes[1].name:
-                raise SystemDefinitionError(f"a table has a size and a whole number of columns, as bonds[B, 2]: {table}")
+                raise SystemDefinitionError(
+                    f"a table has a size and a whole number of columns, as bonds[B, 2]: {table}"
+                )
         for array in self.coordinates:
             if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                 raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
