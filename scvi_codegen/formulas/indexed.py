@@ -83,7 +83,7 @@ def parse_indexed(
 
     >>> q = parse_array("q[N]")
     >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
-    ['sum(i in 0..N-2, -k*(-q[i] + q[i+1])**2)']
+    ['sum(i in 0..N-2, -k*(q[i+1] - q[i])**2)']
     """
     parser = _IndexedParser(text, symbols, arrays, tables)
     whole = parsed(parser)

@@ -110,3 +110,45 @@ def test_what_cannot_be_written_out(sizes: dict[str, int], beside: dict[str, obj
     )
     with pytest.raises(SystemDefinitionError, match=message):
         expand_sums(chain, sizes, **beside)
+
+
+def test_sums_of_sympy_are_read() -> None:
+    """Rings, pairs, tables, several indices and decimals, as from text."""
+    q, v, bonds, k = map(sympy.IndexedBase, ("q", "q_dot", "bonds", "k"))
+    i, j, b, N, B = sympy.symbols("i j b N B", integer=True)
+    e = sympy.Symbol("e")
+    pairs = sympy.Sum(1 / sympy.sqrt((q[i] - q[j]) ** 2 + e**2), (j, i + 1, N - 1), (i, 0, N - 2))
+    ring = sympy.Sum(sympy.cos(q[sympy.Mod(i - 1, N)] - q[i]), (i, 0, N - 1))
+    net = sympy.Sum(k[b] * (q[bonds[b, 0]] - q[bonds[b, 1]]) ** 2, (b, 0, B - 1))
+    found = IndexedSystem.from_sympy(
+        name="system",
+        coordinates=["q[N]"],
+        parameters={"e": 1, "k[B]": 1},
+        tables=["bonds[B, 2]"],
+        lagrangian=sympy.Sum(0.5 * v[i] ** 2, (i, 0, N - 1)) - e * pairs - ring - net / 2,
+    )
+    expected = system(
+        "q[N]",
+        "sum(i in N, q_dot[i]**2/2) - e*sum(i < j in N, 1/sqrt((q[i] - q[j])**2 + e**2))"
+        "- sum(i in N periodic, cos(q[i-1] - q[i])) - sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)/2",
+        parameters={"e": 1, "k[B]": 1},
+        tables=["bonds[B, 2]"],
+    )
+    assert set(map(str, found.terms)) == set(map(str, expected.terms))
+
+
+@pytest.mark.parametrize(
+    ("index", "limits"),
+    [("Mod(2*i, N)", "(i, 0, N - 1)"), ("i", "(i, 0, N)"), ("i", "(j, i + 1, N - 1), (i, 1, N - 2)")],
+)
+def test_sums_of_sympy_that_are_refused(index: str, limits: str) -> None:
+    """Other rings, other limits, and what leaves its array."""
+    q, v = map(sympy.IndexedBase, ("q", "q_dot"))
+    i, j, N = sympy.symbols("i j N", integer=True)
+    names = {"i": i, "j": j, "N": N, "Mod": sympy.Mod}
+    place, spans = sympy.sympify(index, locals=names), sympy.sympify(f"[{limits}]", locals=names)
+    kinetic = sympy.Sum(v[i] ** 2 / 2, (i, 0, N - 1))
+    with pytest.raises(SystemDefinitionError):
+        IndexedSystem.from_sympy(
+            name="x", coordinates=["q[N]"], lagrangian=kinetic - sympy.Sum(q[place] ** 2, *map(tuple, spans))
+        )

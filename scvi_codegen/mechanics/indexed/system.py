@@ -20,6 +20,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.kinds import MAPPING, TEXT, TEXTS, of, takes
@@ -39,7 +40,7 @@ class MassTerm:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedSystem:
-    """A Lagrangian of sums over indices, checked on construction. Build one with :meth:`from_text`.
+    """A Lagrangian of sums over indices, checked on construction: :meth:`from_text`, :meth:`from_sympy`.
 
     Attributes:
         name: what the system is called.
@@ -103,7 +104,7 @@ class IndexedSystem:
         ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
         ...     lagrangian="sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)")
         >>> print(chain)
-        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(-q[i] + q[i+1])**2/2)
+        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
         arrays = tuple(map(parse_array, coordinates))
         places = tuple(map(parse_array, tables))
@@ -123,6 +124,34 @@ class IndexedSystem:
             tables=places,
             terms=parse_indexed(lagrangian, (*arrays, *velocities, *fields.values()), known, places),
         )
+
+    @classmethod
+    @takes(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TEXTS)
+    def from_sympy(
+        cls,
+        *,
+        name: str,
+        coordinates: Sequence[str],
+        lagrangian: Expr,
+        parameters: Mapping[str, float] | None = None,
+        tables: Sequence[str] = (),
+    ) -> IndexedSystem:
+        """Take L from a SymPy expression of ``Sum`` and ``Indexed``; the rest as of :meth:`from_text`.
+
+        A place on a ring is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``, an entry of a table is
+        ``q[bonds[b, 0]]``, the velocity of ``q[i]`` is that of ``IndexedBase("q_dot")``.
+
+        >>> from sympy import IndexedBase, Sum, symbols
+        >>> q, v, (i, N) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i N", integer=True)
+        >>> kinetic, springs = Sum(v[i] ** 2 / 2, (i, 0, N - 1)), Sum((q[i + 1] - q[i]) ** 2 / 2, (i, 0, N - 2))
+        >>> print(IndexedSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs))
+        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in 0..N-2, -(q[i+1] - q[i])**2/2)
+        """
+        if not isinstance(lagrangian, Expr):
+            what = type(lagrangian).__name__
+            raise SystemDefinitionError(f"the Lagrangian is a {what}, not a SymPy expression (text goes to from_text)")
+        text = indexed_text(lagrangian)
+        return cls.from_text(name=name, coordinates=coordinates, lagrangian=text, parameters=parameters, tables=tables)
 
     @property
     def sizes(self) -> tuple[str, ...]:
