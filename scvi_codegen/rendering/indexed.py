@@ -181,7 +181,8 @@ class _Nest:
         text = ""
         for place, axis in zip(access.places, access.array.axes, strict=True):
             here = self.index(place)
-            text = f"({text}) * {_size_text(axis)} + {here}" if text else here
+            first = text if text.isidentifier() else f"({text})"
+            text = f"{first} * {_size_text(axis)} + {here}" if text else here
         return text
 
     def index(self, place: Place) -> str:
