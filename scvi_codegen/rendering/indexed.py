@@ -84,15 +84,23 @@ def _size_text(size: Size) -> str:
 
 def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     """A function that adds to the forces."""
+    chunked = program.sweep is None
+    nest = _Nest(program, looped, "lanes", "X", chunked=chunked and bool(looped.loops))
     slots = range(len(looped.slots))
-    nest = _Nest(program, looped, "lanes", "X")
+    targets = [f"F[{nest.place_of(k)}]" if nest.is_innermost(k) else f"sum_{k}" for k in slots]
+    call = f"{looped.kernel.name}(u, t, parameters, value);"
+    if nest.chunked:
+        here = f"[index_{looped.loops[-1].index} - begin]"
+        innermost = [call, *(f"values[{k}]{here} = value[{k}];" for k in slots)]
+        behind = [f"{targets[k]} += values[{k}]{here};" for k in slots]
+    else:
+        innermost = [call, *(f"{targets[k]} += value[{k}];" for k in slots)]
+        behind = []
     lines = nest.text(
         prepare=lambda k: [f"lanes sum_{k} = zero;"],
-        innermost=[
-            f"{looped.kernel.name}(u, t, parameters, value);",
-            *(f"F[at_{k}] += value[{k}];" if nest.is_innermost(k) else f"sum_{k} += value[{k}];" for k in slots),
-        ],
-        finish=lambda k: [f"F[at_{k}] += sum_{k};"],
+        innermost=innermost,
+        behind=behind,
+        finish=lambda k: [f"F[{nest.place_of(k)}] += sum_{k};"],
     )
     zero = ["const lanes zero = {0};"] if any(not nest.is_innermost(k) for k in slots) else []
     arguments = ["const problem *given", "const lanes *restrict X", "times t", "lanes *restrict F"]
@@ -118,7 +126,7 @@ def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     nest = _Nest(program, looped, "", "")
     lines = nest.text(
         prepare=lambda k: [],
-        innermost=[f"{looped.kernel.name}(NULL, 0.0, parameters, value);", "mass[at_0] += value[0];"],
+        innermost=[f"{looped.kernel.name}(NULL, 0.0, parameters, value);", f"mass[{nest.place_of(0)}] += value[0];"],
         finish=lambda k: [],
     )
     arguments = ["const problem *given", "double *mass"]
@@ -126,17 +134,25 @@ def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
 
 
 class _Nest:
-    """The loops of a kernel, with places, arguments and parameters at the level where they are first known.
+    """The loops of a kernel, with arguments and parameters at the level where they are first known.
+
+    The innermost loop runs over parts of its span. On each part the places of a ring stand at the same distance from the
+    index, whether that goes around or not, so that nothing is asked an element.
 
     Args:
         program: whose arrays they are.
         looped: the kernel.
         scalar: type of the arguments.
         source: what they are read from; nothing where they are not.
+        chunked: whether all values of a part are found before any is added, in loops without conflicts, which a compiler
+            turns into vectors.
     """
 
-    def __init__(self, program: IndexedProgram, looped: LoopedKernel, scalar: str, source: str) -> None:
+    def __init__(
+        self, program: IndexedProgram, looped: LoopedKernel, scalar: str, source: str, *, chunked: bool = False
+    ) -> None:
         self.program, self.looped, self.scalar, self.source = program, looped, scalar, source
+        self.chunked = chunked
         self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
         self.loops = {loop.index: loop for loop in looped.loops}
         self.scalars = len(program.parameter_names)
@@ -149,39 +165,76 @@ class _Nest:
         """Whether a slot moves with the innermost loop."""
         return self.level(self.looped.slots[slot]) == len(self.looped.loops)
 
-    def text(self, *, prepare: Lines, innermost: Sequence[str], finish: Lines) -> list[str]:
-        """The nest; ``prepare`` and ``finish`` give lines of slots before and behind loops that do not move them."""
-        return self._inside(0, prepare, innermost, finish)
+    def text(self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str] = ()) -> list[str]:
+        """The nest.
 
-    def _inside(self, level: int, prepare: Lines, innermost: Sequence[str], finish: Lines) -> list[str]:
+        Args:
+            prepare, finish: lines of slots before and behind the loops that do not move them.
+            innermost: lines in the innermost loop.
+            behind: lines, each in a loop of its own over the same part.
+        """
+        return self._inside(0, prepare, innermost, finish, behind)
+
+    def _inside(
+        self, level: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str]
+    ) -> list[str]:
         lines = list(self._found(level))
         outer = [k for k, slot in enumerate(self.looped.slots) if self.level(slot) == level]
         if level == len(self.looped.loops):
             return [*lines, *innermost]
         lines += [line for k in outer for line in prepare(k)]
-        loop = self.looped.loops[level]
-        lines.append(f"for ({_head(loop)}) {{")
-        lines += [f"  {line}" for line in self._inside(level + 1, prepare, innermost, finish)]
-        lines.append("}")
+        loop, inner = self.looped.loops[level], self._inside(level + 1, prepare, innermost, finish, behind)
+        last = level + 1 == len(self.looped.loops)
+        lines += self._parts(loop, inner, behind) if last else _loop(loop, _first(loop), _size_text(loop.end), inner)
         return lines + [line for k in outer for line in finish(k)]
 
+    def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[str]) -> list[str]:
+        """The innermost loop, in parts where it needs some."""
+        first, end = _first(loop), _size_text(loop.end)
+        offsets = self._offsets(loop)
+        if not offsets and not self.chunked:
+            return _loop(loop, first, end, inner)
+        lines = [f"end = {end} - begin > CHUNK ? begin + CHUNK : {end};" if self.chunked else f"end = {end};"]
+        lines += [
+            f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {end}, &end);"
+            for offset in offsets
+        ]
+        lines += [f"lanes values[{len(self.looped.slots)}][CHUNK];"] if self.chunked else []
+        lines += _loop(loop, "begin", "end", inner)
+        for line in behind:
+            lines += _loop(loop, "begin", "end", [line])
+        return [
+            f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
+            *(f"  {line}" for line in lines),
+            "}",
+        ]
+
+    def _offsets(self, loop: Loop) -> list[int]:
+        """At which places of a ring stand from an index."""
+        places = [place for access in (*self.looped.slots, *self.looped.given) for place in access.places]
+        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
+        return sorted(moved - {0}) if loop.periodic else []
+
     def _found(self, level: int) -> Iterator[str]:
-        """What is known at a level: places of slots, arguments, parameters."""
+        """What is known at a level: arguments, parameters."""
         for k, slot in enumerate(self.looped.slots):
-            if self.level(slot) == level:
-                yield f"const long long at_{k} = start_{slot.array.name} + {self.place(slot)};"
-                if self.source:
-                    yield f"u[{k}] = {self.source}[at_{k}];"
+            if self.level(slot) == level and self.source:
+                yield f"u[{k}] = {self.source}[{self.place_of(k)}];"
         for k, access in enumerate(self.looped.given, self.scalars):
             if self.level(access) == level:
                 yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"
+
+    def place_of(self, slot: int) -> str:
+        """Where a slot stands in the state."""
+        access = self.looped.slots[slot]
+        return f"start_{access.array.name} + {self.place(access)}"
 
     def place(self, access: Access) -> str:
         """Where an entry stands in its array, the last axis running fastest."""
         text = ""
         for place, axis in zip(access.places, access.array.axes, strict=True):
             here = self.index(place)
-            first = text if text.isidentifier() else f"({text})"
+            first = text if text.isidentifier() or text.endswith(")") else f"({text})"
             text = f"{first} * {_size_text(axis)} + {here}" if text else here
         return text
 
@@ -193,17 +246,12 @@ class _Nest:
         if not place.index:
             return _size_text(place.base)
         name, offset = f"index_{place.index}", place.base.number
-        moved = f"{name} {'+' if offset > 0 else '-'} {abs(offset)}" if offset else name
         loop = self.loops[place.index]
         if not offset or not loop.periodic:
-            return moved
-        end = _size_text(loop.end)
-        wrapped_place = (
-            f"{moved} < {end} ? {moved} : {moved} - {end}"
-            if offset > 0
-            else (f"{moved} >= 0 ? {moved} : {moved} + {end}")
-        )
-        return f"({wrapped_place})"
+            return name + (f" {'+' if offset > 0 else '-'} {abs(offset)}" if offset else "")
+        if loop is self.looped.loops[-1]:
+            return f"{name} + {_shift(place.index, offset)}"
+        return f"place_on_ring({name} + {offset}, {_size_text(loop.end)})".replace("+ -", "- ")
 
     def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str) -> str:
         """The nest as a function."""
@@ -237,7 +285,17 @@ class _Nest:
                     yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
 
 
-def _head(loop: Loop) -> str:
+def _first(loop: Loop) -> str:
+    return f"index_{loop.behind} + 1" if loop.behind else _size_text(loop.first)
+
+
+def _shift(index: str, offset: int) -> str:
+    return f"shift_{index}_{'plus' if offset > 0 else 'minus'}_{abs(offset)}"
+
+
+def _loop(loop: Loop, first: str, end: str, lines: Sequence[str]) -> list[str]:
+    """A loop from first to the one before end."""
     name = f"index_{loop.index}"
-    first = f"index_{loop.behind} + 1" if loop.behind else _size_text(loop.first)
-    return f"long long {name} = {first}; {name} < {_size_text(loop.end)}; {name}++"
+    head = f"for (long long {name} = {first}; {name} < {end}; {name}++)"
+    body = [f"  {line}" for line in lines]
+    return [head, *body] if len(lines) == 1 else [f"{head} {{", *body, "}"]

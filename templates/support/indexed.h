@@ -21,6 +21,24 @@ static void add_kinetic_energy(compensated *total, const double *p, const double
     add_to_sum(total, 0.5 * inverse_mass[i] * (p[i] * p[i]));
 }
 
+/* The place on a ring that is so far from the first. */
+static inline long long place_on_ring(long long place, long long size)
+{
+  const long long above = place < size ? place : place - size;
+  return place < 0 ? place + size : above;
+}
+
+/* How far from an index the place `offset` behind it stands, which may go around: the same from begin to end, which is
+ * made smaller for that. */
+static inline long long around(long long begin, long long offset, long long size, long long *end)
+{
+  const long long moved = place_on_ring(begin + offset, size) - begin;
+  const long long change = offset > 0 ? size - offset : -offset; /* from there on it goes around, or no more */
+  if (begin < change && change < *end)
+    *end = change;
+  return moved;
+}
+
 /* Masses to 1 / mass, in place; SINGULAR where one is not positive. */
 static int invert_masses(double *mass, long long n)
 {

@@ -69,4 +69,4 @@ def test_what_belongs_to_the_first_of_a_pair_is_read_and_added_once() -> None:
     end = code.index("\n}\n", inner)
     assert code[outer:inner].count("] = X[") == 3
     assert code[inner:end].count("] = X[") == 3
-    assert code[inner:end].count("F[at_") == 6
+    assert code[inner:end].count("F[start_") == 6
