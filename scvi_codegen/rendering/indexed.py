@@ -83,18 +83,18 @@ def _size_text(size: Size) -> str:
 
 
 def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
-    """A function that adds to the forces."""
-    chunked = program.sweep is None
-    nest = _Nest(program, looped, "lanes", "X", chunked=chunked and bool(looped.loops))
+    """A function that adds to the forces; of an explicit method so many times the forces."""
+    explicit = program.sweep is None
+    nest = _Nest(program, looped, "lanes", "X", chunked=explicit and bool(looped.loops))
     slots = range(len(looped.slots))
     targets = [f"F[{nest.place_of(k)}]" if nest.is_innermost(k) else f"sum_{k}" for k in slots]
     call = f"{looped.kernel.name}(u, t, parameters, value);"
     if nest.chunked:
         here = f"[index_{looped.loops[-1].index} - begin]"
-        innermost = [call, *(f"values[{k}]{here} = value[{k}];" for k in slots)]
+        innermost = [call, *(f"values[{k}]{here} = by * value[{k}];" for k in slots)]
         behind = [f"{targets[k]} += values[{k}]{here};" for k in slots]
     else:
-        innermost = [call, *(f"{targets[k]} += value[{k}];" for k in slots)]
+        innermost = [call, *(f"{targets[k]} += {'by * ' * explicit}value[{k}];" for k in slots)]
         behind = []
     lines = nest.text(
         prepare=lambda k: [f"lanes sum_{k} = zero;"],
@@ -103,7 +103,8 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
         finish=lambda k: [f"F[{nest.place_of(k)}] += sum_{k};"],
     )
     zero = ["const lanes zero = {0};"] if any(not nest.is_innermost(k) for k in slots) else []
-    arguments = ["const problem *given", "const lanes *restrict X", "times t", "lanes *restrict F"]
+    factor = ["double by"] if explicit else []
+    arguments = ["const problem *given", "const lanes *restrict X", "times t", *factor, "lanes *restrict F"]
     values = f"lanes value[{len(looped.slots)}]"
     return nest.function(f"static void add_{looped.kernel.name}", arguments, [*zero, *lines], values=values)
 
@@ -136,16 +137,16 @@ def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
 class _Nest:
     """The loops of a kernel, with arguments and parameters at the level where they are first known.
 
-    The innermost loop runs over parts of its span. On each part the places of a ring stand at the same distance from the
-    index, whether that goes around or not, so that nothing is asked an element.
+    The innermost loop runs over parts of its span. On each part the places of a ring stand at the same distance from
+    the index, whether that goes around or not, so that nothing is asked an element.
 
     Args:
         program: whose arrays they are.
         looped: the kernel.
         scalar: type of the arguments.
         source: what they are read from; nothing where they are not.
-        chunked: whether all values of a part are found before any is added, in loops without conflicts, which a compiler
-            turns into vectors.
+        chunked: whether all values of a part are found before any is added, in loops without conflicts, which a
+            compiler turns into vectors.
     """
 
     def __init__(

@@ -1,82 +1,80 @@
 /* A step of any number of coordinates by kicks of h KICK[n] F, each followed by a drift of h DRIFT[n] v. Before it:
- * forces, LEAPS, the tables. */
+ * add_forces, LEAPS, CHUNK, the tables. */
 
-/* The parts of work: where forces are taken, forces, increments of positions and momenta. */
+/* The parts of work: where forces are taken, forces at the end of a step, increments of positions and momenta. */
 typedef struct {
   double *X, *F, *dq, *dp;
 } parts_of_work;
 
-/* Momenta by a kick. */
-static void kick_by(double by, const double *restrict F, double *restrict dp, long long n)
-{
-  for (long long i = 0; i < n; i++)
-    dp[i] += by * F[i];
-}
-
-/* Positions by a drift. */
+/* Increments by a drift, and where they lead. */
 static void drift_by(double by, const double *restrict inverse_mass, const double *restrict p,
-    const double *restrict carry_p, const double *restrict dp, double *restrict dq, long long n)
+    const double *restrict dp, const double *restrict q, double *restrict dq, double *restrict X, long long n)
 {
-  for (long long i = 0; i < n; i++)
-    dq[i] += by * (inverse_mass[i] * (p[i] + (carry_p[i] + dp[i])));
-}
-
-/* Where increments lead. */
-static void move_by(const double *restrict q, const double *restrict carry_q, const double *restrict dq,
-    double *restrict X, long long n)
-{
-  for (long long i = 0; i < n; i++)
-    X[i] = q[i] + (carry_q[i] + dq[i]);
-}
-
-/* A kick by h KICK F, a drift by h DRIFT v, and where that leads, in portions that stay near the processor. */
-static void leap(const run_memory *run, const parts_of_work *parts, double kick, double drift, long long n)
-{
-  for (long long i = 0; i < n; i += CHUNK) {
-    const long long count = n - i < CHUNK ? n - i : CHUNK;
-    kick_by(kick, parts->F + i, parts->dp + i, count);
-    drift_by(drift, run->inverse_mass + i, run->p + i, run->carry_p + i, parts->dp + i, parts->dq + i, count);
-    move_by(run->q + i, run->carry_q + i, parts->dq + i, parts->X + i, count);
+  for (long long i = 0; i < n; i++) {
+    dq[i] += by * (inverse_mass[i] * (p[i] + dp[i]));
+    X[i] = q[i] + dq[i];
   }
 }
 
-/* x + carry += increments; whether all are finite is asked before. */
-static void add_all(double *restrict x, double *restrict carry, const double *restrict increment, long long n)
+static void add_to(double *restrict x, const double *restrict y, double by, long long n)
 {
   for (long long i = 0; i < n; i++)
-    add_compensated(&x[i], &carry[i], increment[i], 0.0);
+    x[i] += by * y[i];
 }
 
-static int all_finite_increments(const run_memory *run, const parts_of_work *parts, long long n)
+static int all_sums_finite(const double *x, const double *y, long long n)
 {
   int faults = 0;
   for (long long i = 0; i < n; i++)
-    faults |= (0.0 * (run->q[i] + parts->dq[i]) != 0.0) | (0.0 * (run->p[i] + parts->dp[i]) != 0.0);
+    faults |= 0.0 * (x[i] + y[i]) != 0.0;
   return !faults;
 }
 
+/* x += y, and what rounding cuts off (Knuth). */
+static void add_all(double *restrict x, const double *restrict y, double *restrict rest, long long n)
+{
+  for (long long i = 0; i < n; i++) {
+    const double sum = x[i] + y[i], part = sum - x[i];
+    rest[i] = (x[i] - (sum - part)) + (y[i] - part);
+    x[i] = sum;
+  }
+}
+
+/* Whether the last kick of a step is at its end: its forces are those of the first of the next. */
+static int ends_with_a_kick(void)
+{
+  return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
+}
+
+/* Increments begin with what rounding cut off the state. */
 static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {
   double *work = run->work;
   const parts_of_work parts = {work, work + n, work + 2 * n, work + 3 * n};
   (void)options;
-  memset(parts.dq, 0, sizeof(double) * 2 * (size_t)n);
+  memcpy(parts.dq, run->carry_q, sizeof(double) * (size_t)n);
+  memcpy(parts.dp, run->carry_p, sizeof(double) * (size_t)n);
+  drift_by(0.0, run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, n);
   for (int k = 0; k < LEAPS; k++) {
-    if (KICK[k] != 0.0 && (k > 0 || !run->guess)) {
-      if (k == 0)
-        for (long long i = 0; i < n; i++)
-          parts.X[i] = run->q[i] + run->carry_q[i];
-      forces(given, parts.X, run->t + KICK_ABSCISSA[k] * run->h, parts.F, n);
-    }
-    leap(run, &parts, run->h * KICK[k], run->h * DRIFT[k], n);
+    const double kick = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
+    if (kick != 0.0 && k == 0 && run->guess)
+      add_to(parts.dp, parts.F, kick, n);
+    else if (kick != 0.0 && k == LEAPS - 1 && ends_with_a_kick()) {
+      memset(parts.F, 0, sizeof(double) * (size_t)n);
+      add_forces(given, parts.X, t, 1.0, parts.F);
+      add_to(parts.dp, parts.F, kick, n);
+    } else if (kick != 0.0)
+      add_forces(given, parts.X, t, kick, parts.dp);
+    if (DRIFT[k] != 0.0)
+      drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, n);
   }
   report->iterations++;
   run->error = NAN;
-  if (!all_finite_increments(run, &parts, n))
+  if (!all_sums_finite(run->q, parts.dq, n) || !all_sums_finite(run->p, parts.dp, n))
     return NOT_FINITE;
-  add_all(run->q, run->carry_q, parts.dq, n);
-  add_all(run->p, run->carry_p, parts.dp, n);
-  run->guess = KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
+  add_all(run->q, parts.dq, run->carry_q, n);
+  add_all(run->p, parts.dp, run->carry_p, n);
+  run->guess = ends_with_a_kick();
   return OK;
 }
