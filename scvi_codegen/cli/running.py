@@ -94,6 +94,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             pieces.append(work.stretch(steps))
             if work.failure is not None or work.stopped:
                 break
+    pieces = pieces or [run.record(0)]
     trajectory = DrivenTrajectory(tuple(pieces)) if model.system.inputs else pieces[0]
     return RunOutcome(
         trajectory=trajectory,

@@ -24,7 +24,7 @@ from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, of, takes
 from scvi_codegen.mechanics.forces import forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
+from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -104,7 +104,7 @@ class HamiltonianSystem(MechanicalSystem):
         -p**2/2 + p*q_dot + cos(q)
         """
         names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
-        values = {**(parameters or {}), **input_parameters(inputs)}
+        values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs), names)
         symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values, *inputs]}
         variables = tuple(symbols[given] for given in coordinates)
@@ -157,7 +157,7 @@ class HamiltonianSystem(MechanicalSystem):
                 f"the Hamiltonian is a {type(hamiltonian).__name__}, not a SymPy expression (text goes to from_text)"
             )
         own = tuple(given_name(each) for each in inputs)
-        given = named_parameters(parameters) | input_parameters(own)
+        given = with_inputs(named_parameters(parameters), own)
         beside = tuple(sympy.sympify(f) for f in (forces or {}).values())
         translation = Translation(
             hamiltonian, coordinates, beside, momenta=momenta, time=time, parameters=tuple(given), inputs=own

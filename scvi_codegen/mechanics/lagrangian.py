@@ -16,7 +16,7 @@ from scvi_codegen.formulas.translation import Translation
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, Kind, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
+from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -114,7 +114,7 @@ class LagrangianSystem(MechanicalSystem):
         >>> oscillator.lagrangian, oscillator.forces
         (-k*x**2/2 + m*x_dot**2/2, (-c*x_dot + cos(t),))
         """
-        values = {**(parameters or {}), **input_parameters(inputs)}
+        values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs))
         velocities = [coordinate + DOT for coordinate in coordinates]
         names = [*coordinates, *velocities, TIME, *values, *inputs]
@@ -175,7 +175,7 @@ class LagrangianSystem(MechanicalSystem):
                 f"the Lagrangian is a {type(lagrangian).__name__}, not a SymPy expression (text goes to from_text)"
             )
         own = tuple(given_name(each) for each in inputs)
-        given = named_parameters(parameters) | input_parameters(own)
+        given = with_inputs(named_parameters(parameters), own)
         bound = tuple(sympy.sympify(g) for g in constraints)
         beside = (*(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0)), *bound)
         translation = Translation(

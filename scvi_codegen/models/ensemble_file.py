@@ -180,7 +180,7 @@ def _read_table(text: str, check: Check) -> dict[str, Array]:
 
 def _check_names(model: Model, names: Sequence[str]) -> None:
     coordinates = [coordinate.name for coordinate in model.system.coordinates]
-    parameters = [symbol.name for symbol in model.system.parameters]
+    parameters = list(model.parameters)
     velocities, momenta = [f"{name}_dot" for name in coordinates], [f"p_{name}" for name in coordinates]
     known = [*coordinates, *velocities, *momenta, *parameters]
     for name in names:
