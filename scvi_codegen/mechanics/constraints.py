@@ -21,7 +21,6 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.formulas.tape import Tape
-from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.mechanics.regularity import row_rank, sample_points
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> 
 
 def check_constraints(system: MechanicalSystem) -> None:
     """Raise :class:`SystemDefinitionError` for constraints of nothing, that depend on others, or bend velocities."""
-    names = [format_expression(g) for g in system.constraints]
+    names = list(map(system.text_of, system.constraints))
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
             raise SystemDefinitionError(f"there is no coordinate in the constraint '{name}'")
