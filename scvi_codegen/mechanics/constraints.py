@@ -41,10 +41,11 @@ __all__ = [
 
 
 def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
-    """The g of a list of formulas; what is written ``left = right`` is left - right."""
+    """The g of a list of formulas; of an equation, ``left = right`` or SymPy's ``Eq``, left - right."""
     found = []
     for formula in given or ():
-        sides = formula.split("=") if isinstance(formula, str) else [formula]
+        equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
+        sides = formula.split("=") if isinstance(formula, str) else equation
         if len(sides) > 2:
             raise SystemDefinitionError(f"the constraint '{formula}' has more than one '='")
         found.append(read(sides[0]) - read(sides[1]) if len(sides) == 2 else read(formula))

@@ -21,8 +21,8 @@ from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.tape import evaluate
-from scvi_codegen.formulas.translation import Translation
-from scvi_codegen.kinds import MAPPING, NAMES, TEXT, of, takes
+from scvi_codegen.formulas.translation import Translation, given_expression
+from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, of, takes
 from scvi_codegen.mechanics.forces import forces_by_coordinate
 from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -126,6 +126,15 @@ class HamiltonianSystem(MechanicalSystem):
         )
 
     @classmethod
+    @takes(
+        SystemDefinitionError,
+        name=TEXT,
+        coordinates=FORMULAS,
+        momenta=FORMULAS,
+        parameters=MAPPED,
+        forces=MAPPED,
+        inputs=FORMULAS,
+    )
     def from_sympy(
         cls,
         *,
@@ -152,15 +161,18 @@ class HamiltonianSystem(MechanicalSystem):
             forces: expression by coordinate, in coordinates, momenta and time.
             inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
-        if not isinstance(hamiltonian, Expr):
-            raise SystemDefinitionError(
-                f"the Hamiltonian is a {type(hamiltonian).__name__}, not a SymPy expression (text goes to from_text)"
-            )
+        hamiltonian = given_expression(hamiltonian, "Hamiltonian")
+        acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
         own = tuple(given_name(each) for each in inputs)
         given = with_inputs(named_parameters(parameters), own)
-        beside = tuple(sympy.sympify(f) for f in (forces or {}).values())
         translation = Translation(
-            hamiltonian, coordinates, beside, momenta=momenta, time=time, parameters=tuple(given), inputs=own
+            hamiltonian,
+            coordinates,
+            tuple(acting.values()),
+            momenta=momenta,
+            time=time,
+            parameters=tuple(given),
+            inputs=own,
         )
         driven = input_formulas(own, symbol(TIME))
         return cls(
@@ -173,8 +185,8 @@ class HamiltonianSystem(MechanicalSystem):
             hamiltonian=translation.apply(hamiltonian, "Hamiltonian").xreplace(driven),
             forces=forces_by_coordinate(
                 translation.coordinates,
-                {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
-                lambda given: translation.apply(sympy.sympify(given), "forces").xreplace(driven),
+                {translation.rules.get(q, q): f for q, f in acting.items()},
+                lambda given: translation.apply(given, "forces").xreplace(driven),
             ),
             inputs=own,
         )

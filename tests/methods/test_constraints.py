@@ -242,6 +242,8 @@ def test_from_sympy_and_from_lagranges_method():
         LagrangesMethod(L, [x, y], hol_coneqs=[g]), name="rod", parameters=values
     )
     assert one == other
+    given = {"name": "rod", "lagrangian": L, "coordinates": [x, y], "parameters": values}
+    assert one == LagrangianSystem.from_sympy(**given, constraints=[sympy.Eq(x**2 + y**2, length**2)])
     assert one.constraints == rod().with_parameters(m=2.0).constraints
 
 
