@@ -189,7 +189,7 @@ class Stepper(Ensembles):
         """
         stepper = self if events is None else self.with_events(events)
         data = checked_inputs(self, inputs)
-        end = end_of(t, h, steps, t_end)
+        end = end_of(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         run = stepper.start(
             q,

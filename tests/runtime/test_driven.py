@@ -24,6 +24,7 @@ from scvi_codegen import (
     hamiltonian_of,
     lagrangian_of,
 )
+from scvi_codegen.runtime.longest_step import longest_step
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
@@ -284,6 +285,7 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
         lambda: stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 1.0}),
         lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
+        lambda: longest_step(compile_stepper(pendulum, SVI(2), monitor="1 + q**2"), *state, 1.0),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], t_end=1.0),
     ):
         with pytest.raises(StateError, match=r"the input [uw] is not given"):
