@@ -89,8 +89,8 @@ class Translation:
         if leftover:
             raise SystemDefinitionError(
                 f"'{leftover[0]}' in the {what} is neither a coordinate nor the velocity of one: list it among the "
-                "coordinates, or write a given function of time with the functions of the grammar (accelerations and "
-                "other higher derivatives are not supported)"
+                "coordinates, or among the inputs if it is data, or write it with the functions of the grammar "
+                "(accelerations and other higher derivatives are not supported)"
             )
         return result
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LagrangianSystem"]
 
+LAGRANGES_METHOD = Kind("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
 KANES_METHOD = Kind("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
 BODIES = Kind("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
@@ -213,6 +214,7 @@ class LagrangianSystem(MechanicalSystem):
         )
 
     @classmethod
+    @takes(SystemDefinitionError, method=LAGRANGES_METHOD)
     def from_lagranges_method(
         cls,
         method: LagrangesMethod,

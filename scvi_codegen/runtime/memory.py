@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
@@ -212,10 +213,10 @@ class Memory:
         self.stepper.binding.buffer(self._memory)[:] = saved
 
     def skip(self, steps: int) -> None:
-        """Advance by ``steps`` and keep nothing."""
-        nothing = np.empty(0)
-        never = self.steps + steps + 1
-        status, report = self.advance(steps, never, nothing, nothing, nothing, np.empty(0, dtype=np.int32))
+        """Advance by ``steps``, no more than lead to the goal, and keep nothing."""
+        nothing, count = np.empty(0), checked_count(steps, "steps", least=0)
+        never = self.steps + count + 1
+        status, report = self.advance(count, never, nothing, nothing, nothing, np.empty(0, dtype=np.int32))
         if status:
             raise step_failure(status, report, step=self.steps, h=self.h)
 
