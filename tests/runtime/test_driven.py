@@ -260,6 +260,8 @@ def test_names_and_runs_without_an_end(pendulum):
         stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
     with pytest.raises(StateError, match="no input"):
         stepper.start([0.3], [0.0], h=0.1).hold(v=1.0)
+    with pytest.raises(StateError, match="input u must be real numbers, not None"):
+        stepper.start([0.3], [0.0], h=0.1).hold(u=None)
     for steps, said in ((-1, "at least 0"), (2.5, "whole number"), ("3", "whole number")):
         with pytest.raises(StateError, match=f"steps must be .*{said}"):
             stepper.start([0.3], [0.0], h=0.1, parameters={"u_0": 0.0, "w_0": 0.0}).skip(steps)
