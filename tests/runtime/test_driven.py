@@ -23,6 +23,7 @@ from scvi_codegen import (
     compile_stepper,
     hamiltonian_of,
     lagrangian_of,
+    periodic_orbit,
 )
 from scvi_codegen.runtime.longest_step import longest_step
 
@@ -290,6 +291,7 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
         lambda: stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 1.0}),
         lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
+        lambda: periodic_orbit(stepper, *state, period=6.0, steps=20),
         lambda: longest_step(compile_stepper(pendulum, SVI(2), monitor="1 + q**2"), *state, 1.0),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], t_end=1.0),
     ):
