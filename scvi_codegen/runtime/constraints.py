@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -10,7 +11,15 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import STATUS
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_states, checked_vector
+from scvi_codegen.runtime.inputs import (
+    Array,
+    Parameters,
+    checked_parameters,
+    checked_states,
+    checked_vector,
+    inputs_not_given,
+    missing_input,
+)
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "projected"]
@@ -63,8 +72,11 @@ def consistent(
     """An initial state put on the constraints: silently by what rounding and typing explain, else with a warning.
 
     Raises:
-        StateError: if it is far off.
+        StateError: if it is far off, and where an input that constraints name is not given.
     """
+    for name in inputs_not_given(stepper.interface, parameters):
+        if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
+            raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     q1, p1, moved = projected(stepper, q0, p0, t, parameters)
     if moved <= 64 * np.finfo(float).eps:

@@ -224,6 +224,8 @@ def test_positions_do_not_follow_constraints_that_jump():
             stepper.drive(**given, inputs=jumping, h=h)
     with pytest.raises(StateError, match=r"at t = 1 the constraint .* jumps"):
         stepper.drive_ensemble([given["q"]], velocity=[given["velocity"]], inputs=jumping, h=0.05, t_end=1.5)
+    with pytest.raises(StateError, match="the input u is not given"):
+        stepper.start(given["q"], velocity=given["velocity"], h=0.05)
     run = stepper.start(given["q"], velocity=given["velocity"], h=0.05, parameters={"u_0": 0.0})
     for go_on in (lambda: run.hold(u=0.3), lambda: run.change(parameters={"u_0": 0.3})):
         with pytest.raises(StateError, match=r"at t = 0 the constraint .* jumps"):
