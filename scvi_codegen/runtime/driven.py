@@ -249,12 +249,13 @@ def with_end(piece: Trajectory, run: Run) -> Trajectory:
     """A stretch with the state that it ends at, whatever the number of that."""
     if piece.t[-1] == run.t or piece.ended_by is not None:
         return piece
+    iterations, run.iterations = run.iterations, 0
     return replace(
         piece,
         t=np.append(piece.t, run.t),
         q=np.append(piece.q, [run.q], axis=0),
         p=np.append(piece.p, [run.p], axis=0),
-        iterations=np.append(piece.iterations, np.int32(0)),
+        iterations=np.append(piece.iterations, np.int32(iterations)),
         lengths=np.append(piece.lengths, run.h),
     )
 

@@ -261,6 +261,15 @@ class Memory:
         return status, report
 
     @property
+    def iterations(self) -> int:
+        """Since the last state that was kept; the next one has these, too."""
+        return int(self._memory.iterations)
+
+    @iterations.setter
+    def iterations(self, count: int) -> None:
+        self._memory.iterations = count
+
+    @property
     def arrived(self) -> bool:
         """Whether the run stands at its goal."""
         return self.goal is not None and self.t == self.goal.t_end

@@ -145,6 +145,9 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
     assert (fewer.q == full.q[kept]).all()
     assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
     assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
+    watched = stepper.drive([0.3], [0.1], **given, every=3, events="q")
+    assert (watched.iterations == fewer.iterations).all()
+    assert (np.diff(np.cumsum(full.iterations)[kept]) == fewer.iterations[1:]).all()
     assert len(stepper.drive([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
     with pytest.raises(StateError, match=r"t = 3 is outside of the states, which go from 0 to 2\."):
         full.at(3.0)
