@@ -77,8 +77,9 @@ def checked_inputs(
     Raises:
         StateError: for names that are no inputs, inputs that are not given, and data that make no function of time.
     """
-    names = stepper.interface.inputs
-    given = dict(given or {})
+    names, given = stepper.interface.inputs, dict(given or {})
+    if stepper.interface.energy_parameter:
+        raise StateError("what moves in transformed time has no inputs: integrate(..., t_end=...) leads to a time")
     for name in given:
         if name not in names:
             raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
@@ -227,12 +228,13 @@ class Stretch(NamedTuple):
 def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Stretch]:
     """By steps of h, and one that is shorter where a breakpoint or the end comes before theirs."""
     forward, now, found = np.sign(t_end - t), (t, 0.0), []
+    negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in _ends(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])
         if whole := int(np.floor((end - now[0]) / h + NEGLIGIBLE_STEP)):
             found.append(Stretch(whole, h, now, middle))
             now = later(now, h, whole)
-        if forward * (end - now[0]) > NEGLIGIBLE_STEP * abs(h):
+        if forward * (end - now[0]) > negligible:
             found.append(Stretch(1, end - now[0], now, middle))
             now = later(now, end - now[0], 1)
     return found

@@ -24,6 +24,8 @@ from scvi_codegen import (
     hamiltonian_of,
     lagrangian_of,
     periodic_orbit,
+    problem,
+    reparametrise,
 )
 from scvi_codegen.runtime.longest_step import longest_step
 
@@ -279,6 +281,13 @@ def test_ways_that_lead_nowhere_and_a_run_of_no_time(pendulum):
         stepper.drive([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
     with pytest.raises(StateError, match=r"steps of h = -0.1 do not lead from t = 0 to t_end = 2"):
         stepper.drive([0.3], [0.0], inputs=inputs, h=-0.1, t_end=2.0)
+    assert (
+        stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, 0 * KNOTS)}, h=1e12, t_end=0.2).t[-1]
+        == 0.2
+    )
+    clocked = compile_stepper(reparametrise(problem("kepler").system, "frequency"), SVI(2))
+    with pytest.raises(StateError, match="transformed time has no inputs"):
+        clocked.drive([0.5, 0.0], [0.0, 1.7], inputs={}, h=0.1, t_end=2.0)
     for h in (0.1, None):
         still = stepper.drive([0.3], [0.2], inputs=inputs, h=h, t=1.0, t_end=1.0)
         assert (still.t.tolist(), still.q.tolist(), still.p.tolist()) == ([1.0], [[0.3]], [[0.2]])
