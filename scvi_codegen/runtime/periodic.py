@@ -23,7 +23,7 @@ from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedE
 from scvi_codegen.kinds import NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_vector
+from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_parameters, checked_vector
 from scvi_codegen.runtime.linearised import Starts
 from scvi_codegen.runtime.measurements import state_names
 from scvi_codegen.runtime.stepper import Stepper
@@ -252,6 +252,7 @@ class _OrbitSearch:
         interface, names = stepper.interface, (*state_names(stepper), "period")
         if interface.constraints:
             raise MethodError("periodic orbits are found without constraints: take coordinates that need none")
+        check_inputs_given(interface, parameters)
         if energy is not None and interface.exchange_names:
             raise MethodError(f"forces act on '{interface.system}', so an orbit has no energy to be given")
         if (period := checked_number(period, "the period")) <= 0.0:
