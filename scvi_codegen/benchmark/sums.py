@@ -171,10 +171,10 @@ def run_sums(plan: Plan, say: Say) -> ResultTable:
         | {"doubt": ".0e"},
         rows=tuple(rows),
         remarks=(
-            "ours: the fastest of SVI(2), (4), (6), (8); composition: ours of order 8; leapfrog, order 8: C by hand, the",
-            "second the same composition; below 1 another is faster than the first. Error: root mean square of positions",
-            "over that of the positions at the end; doubt: how far apart SVI(10), by which it is measured, and a composition",
-            "of order 10 are.",
+            "ours: the fastest of SVI(2), (4), (6), (8); composition: ours of order 8; leapfrog, order 8: C by hand,",
+            "the second the same composition; below 1 another is faster than the first. Error: root mean square of",
+            "positions over that of the positions at the end; doubt: how far apart SVI(10), by which it is measured,",
+            "and a composition of order 10 are.",
         ),
     )
 
