@@ -86,7 +86,8 @@ class Deviations:
         return volume
 
     def sali(self) -> Array:
-        """(n,) the smaller alignment index, min(|u + v|, |u - v|) of the first two changes, of length 1.
+        """(n,) the smaller alignment index, the length of the sum or of the difference of the
+        first two changes, of length 1, whichever is less.
 
         Skokos, J. Phys. A 34 (2001) 10029.
         """
