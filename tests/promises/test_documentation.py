@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 from browsing import UNREADABLE, VIEWS, looked_at
-from pages import BLOCK, ROOT, run_command, run_page, runnable
+from pages import BLOCK, ROOT, agree, run_command, run_page, runnable
 
 import scvi_codegen
 
@@ -73,6 +73,16 @@ def test_every_page_is_in_a_table_of_contents():
         for entries in re.findall(r"^```\{toctree\}\n(?::.*\n)*\n?((?:.+\n)*?)```$", page, re.MULTILINE):
             listed |= {str((Path(name).parent / entry).with_suffix(".md")) for entry in entries.split()}
     assert listed == set(PAGES)
+
+
+def test_numbers_that_a_page_prints_agree_with_those_on_it():
+    agree("period 6.325, kept to 3e-14, after 12 steps", "period 6.326, kept to 2e-15, after 12 steps\n")
+
+
+@pytest.mark.parametrize(("said", "printed"), [("1.234", "1.237"), ("12", "13"), ("3e-14", "4e-13"), ("x 1", "y 1")])
+def test_numbers_that_do_not_are_found(said, printed):
+    with pytest.raises(AssertionError, match=r"is said|said\n"):
+        agree(said, printed)
 
 
 def test_pages_of_the_gallery_have_a_light_picture_what_they_print_and_a_source():
