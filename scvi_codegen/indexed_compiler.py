@@ -49,7 +49,7 @@ def compile_indexed(
         BuildError: if there is no C compiler.
         MethodError: for a method without such sweeps.
     """
-    one = one_coordinate(system.name)
+    one = one_coordinate(system)
     chosen = as_method(method, one)
     name = c_identifier(prefix or f"{system.name}_{chosen.name}")
 
@@ -69,12 +69,13 @@ def _interface(system: IndexedSystem, method: Method, source: Source) -> Indexed
         method=method.name,
         sizes=system.sizes,
         coordinates=system.coordinates,
+        momenta=system.momenta,
         fields=system.fields,
         tables=system.tables,
         parameters=tuple(parameter.name for parameter in system.parameters),
         defaults=system.defaults,
         field_defaults=system.field_defaults,
-        maps=tuple((each.name, each.array, each.component, each.other) for each in momentum_maps(system)),
+        maps=momentum_maps(system),
         accesses=tuple((access, term.loops) for term in system.terms for _, access in term.slots),
         depends_on_time=system.depends_on_time,
         work=_work(source),

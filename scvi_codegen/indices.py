@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-__all__ = ["Access", "Array", "Loop", "Place", "Size"]
+__all__ = ["Access", "Array", "IndexedMap", "Loop", "Place", "Size"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,3 +129,30 @@ class Access:
 
     def __str__(self) -> str:
         return f"{self.array.name}[{', '.join(map(str, self.places))}]"
+
+
+@dataclass(frozen=True, slots=True)
+class IndexedMap:
+    """The momentum of a shift along a component of an array (of all of it: ``None``), or that of a turn of two.
+
+    Attributes:
+        array: of coordinates.
+        component, other: of its last axis.
+        phase: whether positions turn into momenta, each by the same angle: sum (q^2 + p^2)/2, the norm of a field.
+    """
+
+    array: str
+    component: int | None
+    other: int | None = None
+    phase: bool = False
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        if self.phase:
+            return f"norm of {self.array}"
+        if self.component is None:
+            return f"momentum of {self.array}"
+        if self.other is None:
+            return f"momentum of {self.array}[.., {self.component}]"
+        return f"angular momentum of {self.array}[.., {self.component}], {self.array}[.., {self.other}]"

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.sweeps import SeparableSweep, Splitting
+from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 
-__all__ = ["IndexedProgram", "IndexedSweep", "LoopedKernel"]
+__all__ = ["IndexedHamiltonianSweep", "IndexedProgram", "IndexedSweep", "LoopedKernel"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,8 +20,8 @@ class LoopedKernel:
         loops: outermost first.
         slots: the coordinates that are the kernel's arguments u.
         given: the entries of arrays that are its last parameters, behind those that are numbers.
-        kernel: of a potential: a value a slot, what is added to the force there; of a mass: one value, added to that of
-            the only slot.
+        kernel: of a potential: a value a slot, what is added to the force there (of a momentum: to the velocity); of a
+            mass: one value, added to that of the only slot.
         scalar: of a potential: L itself.
     """
 
@@ -56,6 +56,23 @@ class IndexedSweep(SeparableSweep):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class IndexedHamiltonianSweep(HamiltonianSweep):
+    """The iteration on positions and momenta together, whose rates are sums of several kernels."""
+
+    terms: tuple[Kernel, ...]
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those of the sums."""
+        return self.terms
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """One."""
+        return ("indexed_hamiltonian_sweep",)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedProgram:
     """An integrator of any number of coordinates, without syntax.
 
@@ -64,6 +81,7 @@ class IndexedProgram:
         order: of the method, for the error of its steps.
         sizes: names of the sizes of arrays.
         coordinates, fields, tables: arrays.
+        momenta: of a Hamiltonian, behind the coordinates in the state.
         parameter_names, parameter_defaults: of the numbers.
         forces, masses: loops.
         sweep: the fixed-point iteration of one coordinate, whose kernels are those of ``forces``.
@@ -76,11 +94,12 @@ class IndexedProgram:
     order: int
     sizes: tuple[str, ...]
     coordinates: tuple[Array, ...]
+    momenta: tuple[Array, ...]
     fields: tuple[Array, ...]
     tables: tuple[Array, ...]
     parameter_names: tuple[str, ...]
     parameter_defaults: tuple[float, ...]
     forces: tuple[LoopedKernel, ...]
     masses: tuple[LoopedKernel, ...]
-    sweep: IndexedSweep | None
+    sweep: IndexedSweep | IndexedHamiltonianSweep | None
     splitting: Splitting | None

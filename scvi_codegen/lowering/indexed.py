@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 from sympy import Expr, S, Symbol
 
@@ -16,23 +17,29 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.indexed import IndexedProgram, IndexedSweep, LoopedKernel
+from scvi_codegen.ir.indexed import IndexedHamiltonianSweep, IndexedProgram, IndexedSweep, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.sweeps import SeparableSweep
+from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.choice import sweep_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.system import IndexedSystem, MassTerm
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 
 __all__ = ["lower_indexed", "one_coordinate"]
 
 
-def one_coordinate(name: str = "one") -> LagrangianSystem:
+def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
     """A system of the same form: what a method's tables are taken from."""
-    return LagrangianSystem.from_text(name=name, coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    if system.momenta:
+        hamiltonian = "(x**2 + p_x**2)**2"  # of no other form
+        return HamiltonianSystem.from_text(name=system.name, coordinates=["x"], hamiltonian=hamiltonian)
+    return LagrangianSystem.from_text(name=system.name, coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
 
 
 def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> IndexedProgram:
@@ -41,7 +48,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     Raises:
         MethodError: for a method that solves its equations neither explicitly nor by sweeps over positions.
     """
-    one = one_coordinate(system.name)
+    one = one_coordinate(system)
     splitting = splitting_of(one, method)
     forces = tuple(_force(system, term, number) for number, term in enumerate(system.potentials))
     sweep = None if splitting else _sweep(one, method, forces)
@@ -52,6 +59,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
         order=method.order or 2,
         sizes=system.sizes,
         coordinates=system.coordinates,
+        momenta=system.momenta,
         fields=system.fields,
         tables=system.tables,
         parameter_names=tuple(parameter.name for parameter in system.parameters),
@@ -63,22 +71,31 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     )
 
 
-def _sweep(one: LagrangianSystem, method: Method, forces: Sequence[LoopedKernel]) -> IndexedSweep:
-    found = sweep_of(one, discretise(one, method))
-    if not isinstance(found, SeparableSweep):
-        raise MethodError(
-            f"{method.name} has no sweeps over positions: for sums over indices take an SVI, an SC, a Runge-Kutta "
-            "method of at most 32 points, Stoermer-Verlet or a composition"
-        )
-    own = {field.name: getattr(found, field.name) for field in fields(found)}
-    return IndexedSweep(**own, terms=tuple(each.kernel for each in forces))
+def _sweep(
+    one: MechanicalSystem, method: Method, forces: Sequence[LoopedKernel]
+) -> IndexedSweep | IndexedHamiltonianSweep:
+    found, terms = sweep_of(one, discretise(one, method)), tuple(each.kernel for each in forces)
+    if isinstance(found, SeparableSweep):
+        return IndexedSweep(**_fields(found), terms=terms)
+    if isinstance(found, HamiltonianSweep):
+        return IndexedHamiltonianSweep(**_fields(found), terms=terms)
+    explicit = "" if one.auxiliaries else ", Stoermer-Verlet or a composition"
+    raise MethodError(
+        f"{method.name} has no sweeps over positions: for sums over indices take an SVI, a Runge-Kutta method of at "
+        f"most 32 points{explicit}"
+    )
+
+
+def _fields(found: Sweep) -> dict[str, Any]:
+    return {field.name: getattr(found, field.name) for field in fields(found)}  # type: ignore[arg-type]  # all are
 
 
 def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:
     arrays = dict(term.slots)
-    u = [slot for slot, access in term.slots if access.array in system.coordinates]
+    u = [slot for slot, access in term.slots if access.array in system.state]
     slopes = gradient(term.formula, u)
-    values = [slopes.get(place, S.Zero) for place in range(len(u))]
+    signs = [-1 if arrays[slot].array in system.momenta else 1 for slot in u]  # of -H: -H_q and H_p
+    values = [signs[place] * slopes.get(place, S.Zero) for place in range(len(u))]
     looped = LoopedKernel(
         text=comment_text(str(term)),
         loops=term.loops,

@@ -48,7 +48,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "mass_names": [each.kernel.name for each in program.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": _inverse_roots(scalars),
-        "starts": list(_starts(program.coordinates)),
+        "coordinates": " + ".join(map(_product, program.coordinates)),
         "sweep": sweep_text(program.sweep, POINTS, program.sweep.lanes, fallback="none") if program.sweep else None,
         "hot": "static",
     }
@@ -67,13 +67,16 @@ def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:
     return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in names if name.startswith(INVERSE_ROOT))
 
 
-def _starts(coordinates: Sequence[Array]) -> Iterator[tuple[str, str]]:
-    """Where each array of coordinates begins in the state, and where the last ends."""
+def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
+    """Where each array begins in the state: coordinates, then momenta of a Hamiltonian."""
     sizes: list[str] = []
-    for array in coordinates:
+    for array in (*program.coordinates, *program.momenta):
         yield array.name, " + ".join(sizes) or "0"
-        sizes.append(" * ".join(map(_size_text, array.axes)))
-    yield "", " + ".join(sizes)
+        sizes.append(_product(array))
+
+
+def _product(array: Array) -> str:
+    return " * ".join(map(_size_text, array.axes))
 
 
 def _size_text(size: Size) -> str:
@@ -277,7 +280,7 @@ class _Nest:
 
     def _arrays(self, text: str) -> Iterator[str]:
         """Where those begin that occur."""
-        for name, start in _starts(self.program.coordinates):
+        for name, start in _starts(self.program):
             if re.search(rf"\bstart_{name}\b", text):
                 yield f"const long long start_{name} = {start};"
         for kind, arrays, number in (("field", self.program.fields, "double"), ("table", self.program.tables, "int")):

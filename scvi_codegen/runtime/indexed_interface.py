@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
-from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.indices import Access, Array, IndexedMap, Loop
 from scvi_codegen.native.arguments import checked_number, real_array
 
 __all__ = [
@@ -35,9 +35,10 @@ class IndexedInterface:
         title, system, method: in words.
         sizes: names of sizes, in the order of the C struct.
         coordinates, fields, tables: arrays in that order.
+        momenta: of a Hamiltonian.
         parameters, defaults: numbers.
         field_defaults: what fields are filled with unless they are given.
-        maps: (name, array, component, other component) of each momentum map.
+        maps: what symmetries conserve.
         accesses: every access of an array, with the loops around it.
         depends_on_time: whether energy is not conserved.
         work: numbers a coordinate.
@@ -49,12 +50,13 @@ class IndexedInterface:
     method: str
     sizes: tuple[str, ...]
     coordinates: tuple[Array, ...]
+    momenta: tuple[Array, ...]
     fields: tuple[Array, ...]
     tables: tuple[Array, ...]
     parameters: tuple[str, ...]
     defaults: tuple[float, ...]
     field_defaults: tuple[float, ...]
-    maps: tuple[tuple[str, str, int | None, int | None], ...]
+    maps: tuple[IndexedMap, ...]
     accesses: tuple[tuple[Access, tuple[Loop, ...]], ...]
     depends_on_time: bool
     work: int

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.indices import IndexedMap
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
@@ -29,7 +30,7 @@ from scvi_codegen.runtime.portions import SLICE_SECONDS
 __all__ = ["IndexedRun"]
 
 ADVICE = {
-    "not converged": "sweeps contract where h times the highest frequency is less than about 2: try a smaller step",
+    "not converged": "sweeps contract where h times the highest frequency is less than 1 or 2: try a smaller step",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
 ALIGNMENT = 64
@@ -89,13 +90,17 @@ class IndexedRun:
         return problem
 
     def _momenta(self, p: Any, velocity: Any) -> tuple[Any, str]:
+        if velocity is not None and self.interface.momenta:
+            raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
         if p is not None and velocity is not None:
             raise StateError("give momenta p or the velocity, not both")
         return (p, "momenta") if velocity is None else (velocity, "velocities")
 
     def _start(self, state: Mapping[str, Numbers], moving: tuple[Any, str], h: float, t: float) -> None:
         n = self._binding.function("coordinates")(self._problem)
-        self._numbers = {name: aligned(n) for name in ("q", "p", "carry_q", "carry_p", "inverse_mass")}
+        state_of, rest_of = aligned(2 * n), aligned(2 * n)  # of a Hamiltonian momenta stand behind positions
+        self._numbers = {"q": state_of[:n], "p": state_of[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
+        self._numbers["inverse_mass"] = aligned(n)
         self._numbers["work"] = aligned(n * self.interface.work)
         inverse = self._numbers["inverse_mass"]
         if self._binding.function("inverse_masses")(self._problem, self._pointer("inverse_mass")):
@@ -148,7 +153,13 @@ class IndexedRun:
 
     @property
     def velocity(self) -> dict[str, Numbers]:
-        """Velocities by the name of the array of their coordinates."""
+        """Velocities by the name of the array of their coordinates.
+
+        Raises:
+            StateError: where a Hamiltonian is given.
+        """
+        if self.interface.momenta:
+            raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
@@ -162,7 +173,7 @@ class IndexedRun:
 
     @property
     def energies(self) -> tuple[float, float, float]:
-        """Kinetic and potential energy of the present state, and their sum; added up in twice the precision."""
+        """Kinetic and potential energy of the present state, and their sum, in twice the precision; 0, H and H."""
         found, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
         self._binding.function("energies")(self._problem, self.t, *pointers, self._binding.pointer(found))
         return (float(found[0]), float(found[1]), float(found[2]))
@@ -176,7 +187,7 @@ class IndexedRun:
     def momentum_maps(self) -> Numbers:
         """What symmetries conserve (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`), (count,)."""
         q, p = self.q, self.p
-        return np.array([_momentum(q[array], p[array], *components) for _, array, *components in self.interface.maps])
+        return np.array([_momentum(q[each.array], p[each.array], each) for each in self.interface.maps])
 
     @property
     def step_error(self) -> float:
@@ -223,9 +234,11 @@ def aligned(count: int) -> Numbers:
     return memory[start : start + count]
 
 
-def _momentum(q: Numbers, p: Numbers, component: int | None, other: int | None) -> float:
-    if component is None:
+def _momentum(q: Numbers, p: Numbers, of: IndexedMap) -> float:
+    if of.phase:
+        return float(np.sum(q**2 + p**2) / 2)
+    if of.component is None:
         return float(np.sum(p))
-    if other is None:
-        return float(np.sum(p[..., component]))
-    return float(np.sum(q[..., component] * p[..., other] - q[..., other] * p[..., component]))
+    if of.other is None:
+        return float(np.sum(p[..., of.component]))
+    return float(np.sum(q[..., of.component] * p[..., of.other] - q[..., of.other] * p[..., of.component]))

@@ -88,7 +88,7 @@ class IndexedStepper:
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
         """What symmetries conserve: shifts and turns of whole arrays."""
-        return tuple(name for name, *_ in self.interface.maps)
+        return tuple(each.name for each in self.interface.maps)
 
     @cached_property
     def _binding(self) -> Binding:

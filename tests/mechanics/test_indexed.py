@@ -89,7 +89,7 @@ def test_what_is_written_out() -> None:
     q, v, k = (sympy.symbols(f"{name}_:3{end}", real=True) for name, end in (("q", ""), ("q", "_dot"), ("k", "")))
     c = sympy.Symbol("c", real=True)
     springs = k[0] * (q[0] - q[2]) ** 2 + k[1] * (q[2] - q[1]) ** 2
-    assert sympy.expand(found.lagrangian - sum(x**2 for x in v) / 2 + c * springs) == 0
+    assert sympy.expand(found.formula - sum(x**2 for x in v) / 2 + c * springs) == 0
     assert found.constants == {c: 3.0, k[0]: 5.0, k[1]: 7.0}
 
 
@@ -152,3 +152,36 @@ def test_sums_of_sympy_that_are_refused(index: str, limits: str) -> None:
         IndexedSystem.from_sympy(
             name="x", coordinates=["q[N]"], lagrangian=kinetic - sympy.Sum(q[place] ** 2, *map(tuple, spans))
         )
+
+
+def test_maps_of_a_hamiltonian() -> None:
+    """Shifts, turns of positions with their momenta, and phases."""
+    bodies = IndexedSystem.from_text(
+        name="charges",
+        coordinates=["r[N, 2]"],
+        parameters={"B": 1},
+        hamiltonian="sum(i in N, (p_r[i, 0] + B*r[i, 1]/2)**2 + (p_r[i, 1] - B*r[i, 0]/2)**2)/2"
+        f"- sum(i < j in N, 1/{DISTANCE.replace('3', '2', 1)})",
+    )
+    assert [each.name for each in momentum_maps(bodies)] == ["angular momentum of r[.., 0], r[.., 1]"]
+    oscillators = IndexedSystem.from_text(
+        name="oscillators", coordinates=["q[N]"], hamiltonian="sum(i in N, (q[i]**2 + p_q[i]**2)**2)"
+    )
+    assert [each.name for each in momentum_maps(oscillators)] == ["norm of q"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "give a lagrangian or a hamiltonian"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "hamiltonian": "sum(i in N, q[i])"}, "one of them"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "momenta": ["p[N]"]}, "a Lagrangian has velocities"),
+        ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["p[K]"]}, "momenta are arrays like"),
+        ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["q[N]"]}, "'q'"),
+        ({"hamiltonian": "sum(i in N, q_dot[i]**2)"}, "'q_dot' is no array"),
+    ],
+)
+def test_a_lagrangian_or_a_hamiltonian(given: dict[str, object], message: str) -> None:
+    """One of both, with what belongs to it."""
+    with pytest.raises(SystemDefinitionError, match=message):
+        IndexedSystem.from_text(name="x", coordinates=["q[N]"], **given)

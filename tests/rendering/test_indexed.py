@@ -15,7 +15,7 @@ from scvi_codegen.rendering.source import Source
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wno-psabi", "-Werror"]
 
-LAGRANGIANS = {
+FORMULAS = {
     "bodies": (
         ["r[N, 3]"],
         "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2)"
@@ -27,25 +27,29 @@ LAGRANGIANS = {
         "- sum(b in B, exp(k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]]))) - q[0]*q[N-1]**3"
         "- sum(i in 1..N-2, m[i]*q[i-1]*q[i+1])",
     ),
+    "hamiltonian": (
+        ["u[NX, NY]", "q[N]"],
+        "sum(i in NX periodic, j in NY, p_u[i+1, j]*u[i, j]**2 + p_u[i, j]**2) - sum(i in N, m[i]*p_q[i]**4*q[i])",
+    ),
     "free": (["q[N]"], "sum(i in N, q_dot[i]**2/2)"),
 }
 
 
 def rendered(name: str, method: str) -> Source:
     """The text of an integrator."""
-    coordinates, lagrangian = LAGRANGIANS[name]
+    coordinates, formula = FORMULAS[name]
     system = IndexedSystem.from_text(
         name=name,
         coordinates=coordinates,
-        lagrangian=lagrangian,
+        **{"hamiltonian" if name == "hamiltonian" else "lagrangian": formula},
         parameters={"m[N]": 1, "k[B]": 1, "g": 2},
         tables=["bonds[B, 2]"],
     )
-    return render_indexed(lower_indexed(system, as_method(method, one_coordinate()), "indexed"))
+    return render_indexed(lower_indexed(system, as_method(method, one_coordinate(system)), "indexed"))
 
 
 @pytest.mark.parametrize("method", ["svi:4", "stoermer-verlet"])
-@pytest.mark.parametrize("name", LAGRANGIANS)
+@pytest.mark.parametrize("name", FORMULAS)
 def test_it_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
     """No warnings, in the style of all C here, and nothing that is not declared in the header."""
     source = rendered(name, method)

@@ -114,6 +114,35 @@ def test_as_written_out(name: str, method: str) -> None:
         assert own.step_error == pytest.approx(other.step_error, rel=2.0)
 
 
+@pytest.mark.parametrize("method", ["svi:4", "gauss:3", "svi:9"])
+def test_a_hamiltonian_as_written_out(method: str) -> None:
+    """The discrete nonlinear Schroedinger equation on a net; its norm, an angular momentum of all phases, is kept."""
+    field = sc.IndexedSystem.from_text(
+        name="field",
+        coordinates=["q[N]"],
+        momenta=["p[N]"],
+        parameters={"g": 1},
+        tables=["bonds[B, 2]"],
+        hamiltonian="sum(b in B, (q[bonds[b, 0]] - q[bonds[b, 1]])**2 + (p[bonds[b, 0]] - p[bonds[b, 1]])**2)/2"
+        "- sum(i in N, g/4*(q[i]**2 + p[i]**2)**2)",
+    )
+    bonds = {"bonds": [[0, 1], [1, 2], [2, 0], [2, 3]]}
+    q, p = 0.5 * random(2, 4)
+    stepper = sc.compile_indexed(field, method)
+    run = stepper.integrate(q, p, h=0.05, steps=100, every=25, tables=bonds)
+    written = sc.expand_sums(field, {"N": 4, "B": 4}, tables=bonds)
+    other = sc.compile_stepper(written, method).integrate(q, p, h=0.05, steps=100, every=25)
+    assert run.q["q"] == pytest.approx(other.q, abs=1e-13)
+    assert run.p["q"] == pytest.approx(other.p, abs=1e-13)
+    assert run.energy() == pytest.approx(other.energy(), abs=1e-13)
+    assert stepper.momentum_map_names == ("norm of q",)
+    assert np.ptp(run.momentum_maps()) < 1e-14
+    with pytest.raises(sc.StateError, match="momenta p are the start"):
+        stepper.start(q, velocity=p, h=0.05, tables=bonds)
+    with pytest.raises(sc.StateError, match="velocities are not known"):
+        stepper.start(q, p, h=0.05, tables=bonds).velocity  # noqa: B018  (the access is the point)
+
+
 @pytest.mark.parametrize("count", [2, 3, 64, 1000])
 def test_one_library_serves_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""

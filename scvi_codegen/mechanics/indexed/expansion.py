@@ -8,6 +8,7 @@ the expanded system, which was derived on another way.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +18,10 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place
 from scvi_codegen.kinds import MAPPING, takes
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["expand_sums"]
 
@@ -33,7 +36,7 @@ def expand_sums(
     *,
     tables: Mapping[str, ArrayLike] | None = None,
     parameters: Mapping[str, ArrayLike] | None = None,
-) -> LagrangianSystem:
+) -> MechanicalSystem:
     """The system of the coordinates q_0, q_1, .. (r_0_0, r_0_1, ..), an array's last axis running fastest.
 
     Args:
@@ -48,7 +51,7 @@ def expand_sums(
     >>> chain = IndexedSystem.from_text(
     ...     name="chain", coordinates=["q[N]"],
     ...     lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2)")
-    >>> expand_sums(chain, {"N": 2}).lagrangian
+    >>> expand_sums(chain, {"N": 2}).formula
     q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
     """
     given, places = dict(parameters or {}), {name: np.asarray(table) for name, table in (tables or {}).items()}
@@ -62,7 +65,7 @@ def expand_sums(
         array.name: _filled(array, given.pop(array.name, default), sizes)
         for array, default in zip(system.fields, system.field_defaults, strict=True)
     }
-    names = {array.name: _names(array, sizes) for array in (*system.coordinates, *system.fields)}
+    names = {array.name: _names(array, sizes) for array in (*system.state, *system.fields)}
     values = {
         str(name): float(value)
         for array in system.fields
@@ -78,15 +81,20 @@ def expand_sums(
         for at in _elements(term.loops, sizes):
             rule = {slot: _entry(access, at, term.loops, sizes, places, names) for slot, access in term.slots}
             summands.append(term.formula.xreplace(rule))
-    coordinates = [symbol(str(name)) for array in system.coordinates for name in names[array.name].flat]
-    return LagrangianSystem(
-        name=system.name,
-        coordinates=tuple(coordinates),
-        time=system.time,
-        parameters=tuple(map(symbol, [*numbers, *values])),
-        defaults=(*numbers.values(), *values.values()),
-        lagrangian=Add(*summands),
+    coordinates, momenta = (
+        tuple(symbol(str(name)) for array in arrays for name in names[array.name].flat)
+        for arrays in (system.coordinates, system.momenta)
     )
+    same: dict[str, Any] = {
+        "name": system.name,
+        "coordinates": coordinates,
+        "time": system.time,
+        "parameters": tuple(map(symbol, [*numbers, *values])),
+        "defaults": (*numbers.values(), *values.values()),
+    }
+    if momenta:
+        return HamiltonianSystem(**same, momenta=momenta, hamiltonian=Add(*summands))
+    return LagrangianSystem(**same, lagrangian=Add(*summands))
 
 
 def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:

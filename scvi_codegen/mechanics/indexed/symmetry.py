@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import TypeAlias
 
 from sympy import Add, Expr, S, Symbol
 
@@ -16,11 +16,11 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
-from scvi_codegen.indices import Access, Array, Place
+from scvi_codegen.indices import Access, Array, IndexedMap, Place
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["IndexedMap", "momentum_maps"]
+__all__ = ["momentum_maps"]
 
 SAMPLES = 4
 """Points where an identity is tried in 60 digits; one that fails at random points would have to vanish at each."""
@@ -28,24 +28,6 @@ VANISHES = 1e-40
 """Beside the sum of the sizes of the terms."""
 MOST_TURNED = 3
 """Components of places in space."""
-
-
-@dataclass(frozen=True, slots=True)
-class IndexedMap:
-    """The momentum of a shift along a component of an array (of all of it: ``None``), or that of a turn of two."""
-
-    array: str
-    component: int | None
-    other: int | None = None
-
-    @property
-    def name(self) -> str:
-        """In words."""
-        if self.component is None:
-            return f"momentum of {self.array}"
-        if self.other is None:
-            return f"momentum of {self.array}[.., {self.component}]"
-        return f"angular momentum of {self.array}[.., {self.component}], {self.array}[.., {self.other}]"
 
 
 def momentum_maps(system: IndexedSystem) -> tuple[IndexedMap, ...]:
@@ -59,6 +41,8 @@ def _maps(system: IndexedSystem, array: Array) -> Iterator[IndexedMap]:
     for component in components:
         if all(_vanishes(*_shift(system, term, array, component)) for term in system.potentials):
             yield IndexedMap(array.name, component)
+    if system.momenta and all(_vanishes(*_phase(system, term, array)) for term in system.potentials):
+        yield IndexedMap(array.name, None, phase=True)
     if not last.name and last.number <= MOST_TURNED:
         for a in range(last.number):
             for b in range(a + 1, last.number):
@@ -88,16 +72,43 @@ def _shift(
 def _turn(
     system: IndexedSystem, term: IndexedTerm, array: Array, plane: tuple[int, int]
 ) -> tuple[list[Expr], list[Symbol]]:
-    """Parts of sum x_a dl/dx_b - x_b dl/dx_a."""
+    """Parts of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
+    (a, b), arrays = plane, [array, *_conjugate(system, array)]
+    pairs = [
+        ((each, _whole(to)), (each, _whole(by)), sign) for each in arrays for to, by, sign in ((b, a, 1), (a, b, -1))
+    ]
+    return _moved(system, term, pairs)
+
+
+def _phase(system: IndexedSystem, term: IndexedTerm, array: Array) -> tuple[list[Expr], list[Symbol]]:
+    """Parts of sum p dl/dq - q dl/dp."""
+    (momenta,) = _conjugate(system, array)
+    return _moved(system, term, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
+
+
+def _conjugate(system: IndexedSystem, array: Array) -> tuple[Array, ...]:
+    return system.momenta and (system.momenta[system.coordinates.index(array)],)
+
+
+Entry: TypeAlias = tuple[Array, Place | None]
+"""Of an array those with a last place, or all."""
+
+
+def _moved(
+    system: IndexedSystem, term: IndexedTerm, pairs: Sequence[tuple[Entry, Entry, int]]
+) -> tuple[list[Expr], list[Symbol]]:
+    """Parts of what changes where entries of the first kind move by those of the second at the same places."""
     parts: list[Expr] = []
     known = _symbols(system, term)
-    for (a, b), sign in ((plane, S.One), (plane[::-1], S.NegativeOne)):
-        moved = [(slot, access) for slot, access in term.slots if _component(access, array, b)]
+    for (array, last), (other, by), sign in pairs:
+        moved = [(slot, access) for slot, access in term.slots if access.array == array]
+        moved = [(slot, access) for slot, access in moved if last is None or access.places[-1] == last]
         slopes = gradient(term.formula, [slot for slot, _ in moved])
-        for place, (_, access) in enumerate(moved):
-            partner = symbol(str(Access(array=array, places=(*access.places[:-1], _whole(a)))))
+        for number, (_, access) in enumerate(moved):
+            places = access.places if by is None else (*access.places[:-1], by)
+            partner = symbol(str(Access(array=other, places=places)))
             known += [] if partner in known else [partner]
-            parts.append(sign * partner * slopes.get(place, S.Zero))
+            parts.append(sign * partner * slopes.get(number, S.Zero))
     return parts, known
 
 

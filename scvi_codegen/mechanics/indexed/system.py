@@ -45,16 +45,18 @@ class IndexedSystem:
     Attributes:
         name: what the system is called.
         coordinates: arrays of coordinates; that of the velocities of ``q`` is called ``q_dot``.
+        momenta: of a Hamiltonian, arrays parallel to these; of a Lagrangian none.
         time: the symbol ``t``.
         parameters, defaults: numbers that stay adjustable, and their default values.
         fields: arrays of parameters, whose values, one an element, are given with each run.
         field_defaults: the value of all their elements where none are given.
         tables: arrays of places, ``bonds[B, 2]``, given with each run.
-        terms: of the Lagrangian.
+        terms: of the Lagrangian or the Hamiltonian.
     """
 
     name: str
     coordinates: tuple[Array, ...]
+    momenta: tuple[Array, ...]
     time: Symbol
     parameters: tuple[Symbol, ...]
     defaults: tuple[float, ...]
@@ -67,9 +69,9 @@ class IndexedSystem:
         self._check_names()
         for term in self.terms:
             if problem := unsupported_part(term.formula):
-                raise SystemDefinitionError(f"in the Lagrangian of '{self.name}': {problem}")
+                raise SystemDefinitionError(f"in the {self._function} of '{self.name}': {problem}")
             _check_form(term, self._velocities, self.time)
-        for array in self.coordinates:
+        for array in () if self.momenta else self.coordinates:
             if not any(mass.access.array == array for mass in self.masses):
                 raise SystemDefinitionError(
                     f"no term has {array.name}{DOT}: give '{array.name}' a kinetic energy, as "
@@ -77,22 +79,35 @@ class IndexedSystem:
                 )
 
     @classmethod
-    @takes(SystemDefinitionError, name=TEXT, coordinates=TEXTS, lagrangian=TEXT, parameters=MAPPING, tables=TEXTS)
+    @takes(
+        SystemDefinitionError,
+        name=TEXT,
+        coordinates=TEXTS,
+        lagrangian=TEXT,
+        hamiltonian=TEXT,
+        momenta=TEXTS,
+        parameters=MAPPING,
+        tables=TEXTS,
+    )
     def from_text(
         cls,
         *,
         name: str,
         coordinates: Sequence[str],
-        lagrangian: str,
+        lagrangian: str | None = None,
+        hamiltonian: str | None = None,
+        momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         tables: Sequence[str] = (),
     ) -> IndexedSystem:
-        """Read L from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
+        """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
 
         Args:
             name: what the system is called.
             coordinates: declarations, as ``["q[N]"]`` or ``["r[N, 3]"]``; sizes are names or whole numbers.
             lagrangian: the formula; the velocity of ``q[i]`` is written ``q_dot[i]``, time ``t``.
+            hamiltonian: in its place H, in coordinates and momenta, of any form.
+            momenta: of H, declarations as of the coordinates; by default ``["p_q[N]"]``.
             parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
                 an array, one an element, are given with each run.
             tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``.
@@ -107,22 +122,26 @@ class IndexedSystem:
         chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
         arrays = tuple(map(parse_array, coordinates))
+        conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
         places = tuple(map(parse_array, tables))
         values = {key: number(key, value) for key, value in (parameters or {}).items()}
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
-        velocities = [Array(array.name + DOT, array.axes) for array in arrays]
+        velocities = () if conjugate else tuple(Array(array.name + DOT, array.axes) for array in arrays)
+        text = lagrangian if hamiltonian is None else hamiltonian
+        assert text is not None
         known = {key: symbol(key) for key in (*scalars, TIME)}
         return cls(
             name=name,
             coordinates=arrays,
+            momenta=conjugate,
             time=symbol(TIME),
             parameters=tuple(known[key] for key in scalars),
             defaults=tuple(scalars.values()),
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
             tables=places,
-            terms=parse_indexed(lagrangian, (*arrays, *velocities, *fields.values()), known, places),
+            terms=parse_indexed(text, (*arrays, *conjugate, *velocities, *fields.values()), known, places),
         )
 
     @classmethod
@@ -160,21 +179,27 @@ class IndexedSystem:
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """Coordinates, fields, tables."""
-        return (*self.coordinates, *self.fields, *self.tables)
+        """Coordinates, momenta, fields, tables."""
+        return (*self.state, *self.fields, *self.tables)
+
+    @property
+    def state(self) -> tuple[Array, ...]:
+        """Coordinates, and the momenta of a Hamiltonian."""
+        return (*self.coordinates, *self.momenta)
 
     @property
     def masses(self) -> tuple[MassTerm, ...]:
-        """Second derivatives of L by velocities."""
+        """Second derivatives of L by velocities; none of a Hamiltonian."""
         return tuple(chain(*(_masses(term, self._velocities) for term in self.terms)))
 
     @property
     def potentials(self) -> tuple[IndexedTerm, ...]:
-        """Terms of L without velocities: -V."""
+        """Terms of L without velocities, -V; those of -H."""
         found = []
         for term in self.terms:
             at_rest = term.formula.xreplace(dict.fromkeys(_velocity_slots(term, self._velocities), S.Zero))
-            if at_rest.free_symbols & {slot for slot, access in term.slots if access.array in self.coordinates}:
+            at_rest = -at_rest if self.momenta else at_rest
+            if at_rest.free_symbols & {slot for slot, access in term.slots if access.array in self.state}:
                 slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
                 found.append(replace(term, formula=at_rest, slots=slots))
         return tuple(found)
@@ -186,22 +211,28 @@ class IndexedSystem:
 
     def key(self) -> tuple[str, ...]:
         """All that tells this system from others."""
-        return (self.name, str(self), repr((self.tables, self.fields, self.parameters, self.defaults)))
+        arrays = (self.momenta, self.tables, self.fields)
+        return (self.name, str(self), repr((arrays, self.parameters, self.defaults)))
 
     def __str__(self) -> str:
-        arguments = ", ".join(map(str, self.coordinates))
-        return f"{self.name}: L({arguments}) = {' + '.join(map(str, self.terms))}"
+        arguments = ", ".join(map(str, self.state))
+        return f"{self.name}: {self._function[0]}({arguments}) = {' + '.join(map(str, self.terms))}"
+
+    @property
+    def _function(self) -> str:
+        return "Hamiltonian" if self.momenta else "Lagrangian"
 
     @property
     def _velocities(self) -> dict[str, Array]:
         """The array of coordinates by the name of its velocities."""
-        return {array.name + DOT: array for array in self.coordinates}
+        return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
 
     def _check_names(self) -> None:
-        check_names([array.name for array in self.coordinates], [each.name for each in self.parameters])
-        names = [array.name for array in self.arrays] + [each.name for each in self.parameters]
-        for name in names:
-            if names.count(name) > 1 or name in self.sizes:
+        names = ([each.name for each in group] for group in (self.coordinates, self.parameters, self.momenta))
+        check_names(*names)
+        known = [array.name for array in self.arrays] + [each.name for each in self.parameters]
+        for name in known:
+            if known.count(name) > 1 or name in self.sizes:
                 raise SystemDefinitionError(f"'{name}' is the name of two things: rename one")
         for table in self.tables:
             if len(table.axes) != 2 or not table.axes[0].name or table.axes[1].name:
@@ -211,6 +242,27 @@ class IndexedSystem:
         for array in self.coordinates:
             if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                 raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
+
+
+def _momenta(
+    coordinates: Sequence[Array], names: Sequence[str] | None, lagrangian: str | None, hamiltonian: str | None
+) -> tuple[Array, ...]:
+    """The arrays of momenta of a Hamiltonian."""
+    if (lagrangian is None) == (hamiltonian is None):
+        raise SystemDefinitionError("give a lagrangian or a hamiltonian, one of them")
+    if hamiltonian is None:
+        if names is not None:
+            raise SystemDefinitionError("a Lagrangian has velocities, q_dot[i]: momenta are those of a hamiltonian")
+        return ()
+    if names is None:
+        return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
+    given = tuple(map(parse_array, names))
+    if [array.axes for array in given] != [array.axes for array in coordinates]:
+        shown = ", ".join(map(str, coordinates))
+        raise SystemDefinitionError(
+            f"momenta are arrays like those of the coordinates, {shown}, not {', '.join(names)}"
+        )
+    return given
 
 
 def _masses(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:

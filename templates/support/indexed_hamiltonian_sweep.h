@@ -1,0 +1,121 @@
+/* A step of any number of coordinates by sweeps, for any Hamiltonian: positions and momenta y at the points follow
+ * their rates there until they rest. Before it: points.h, contraction.h, the tables, forces, which gives the slopes G at
+ * X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand behind positions. */
+
+/* The parts of work: y at the points, and slopes there in this step, the last and the one before. */
+typedef struct {
+  lanes *X, *G, *last, *before;
+} parts_of_work;
+
+static parts_of_work divide(const run_memory *run, long long n)
+{
+  lanes *work = (lanes *)run->work, *slopes_of[3];
+  parts_of_work parts;
+  for (int k = 0; k < 3; k++)
+    slopes_of[(k + run->turn) % 3] = work + (k + 1) * 2 * n;
+  parts.X = work;
+  parts.G = slopes_of[0], parts.last = slopes_of[1], parts.before = slopes_of[2];
+  return parts;
+}
+
+/* Slopes continued from former steps. */
+static void continue_slopes(const run_memory *run, const parts_of_work *parts, long long n)
+{
+  for (long long i = 0; i < 2 * n; i++)
+    parts->G[i] = run->guess == 1
+        ? lanes_apply(LAST_ALONE, &parts->last[i])
+        : lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]);
+}
+
+/* n places of y from `first` on by their rates, of which a table and weights make increments; returned is the sum of
+ * the squares of what that changes, over that of their sizes if these are not absolute. */
+static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, lanes weights,
+    long long first, long long n, int absolute)
+{
+  lanes total = lanes_of(0.0);
+  double size = 0.0;
+  for (long long i = first; i < first + n; i++) {
+    const lanes scaled = weights * rates[i - first], increment = lanes_apply(table, &scaled);
+    const lanes y = run->q[i] + (run->carry_q[i] + increment), moved = y - X[i];
+    const lane_view end = {increment};
+    const double of_one = fabs(run->q[i]) + fabs(end.lane[LANES - 1]);
+    total += moved * moved;
+    size += of_one * of_one;
+    X[i] = y;
+  }
+  return absolute || size == 0.0 ? lanes_total(total) + 0.0 * size : lanes_total(total) / size;
+}
+
+/* Whether all slopes are finite. */
+static int finite_slopes(const lanes *G, long long n)
+{
+  lanes faults = lanes_of(0.0);
+  for (long long i = 0; i < 2 * n; i++)
+    faults += 0.0 * G[i];
+  return lanes_total(faults) == 0.0;
+}
+
+/* What the highest coefficient of the velocities at the points moves a coordinate by, squared, over what they bend it
+ * by: the largest of these, everything as a part of the largest coordinate. */
+static double unresolved(const run_memory *run, const lanes *velocity, long long n)
+{
+  double largest = DBL_MIN, least = 0.0;
+  for (long long i = 0; i < n; i++)
+    largest = larger(largest, fabs(run->q[i]));
+  for (long long i = 0; i < n; i++) {
+    const lane_view rate = {velocity[i]};
+    const double size = fabs(run->q[i]) + largest;
+    const double ends = fabs(rate.lane[KEPT - 1] - rate.lane[0]) + fabs(rate.lane[KEPT / 2] - rate.lane[0]);
+    const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
+    const double top = RESOLVED * run->h * lanes_total(HIGHEST * velocity[i]);
+    least = larger(least, top * top / (bend * size));
+  }
+  return least;
+}
+
+/* The end of the step, of n places from `first` on. */
+static void move(run_memory *run, const lanes *rates, lanes end, lanes weights, long long first, long long n)
+{
+  for (long long i = first; i < first + n; i++)
+    add_compensated(&run->q[i], &run->carry_q[i], lanes_total(end * (weights * rates[i - first])), 0.0);
+}
+
+static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+    solver_report *report)
+{
+  const parts_of_work parts = divide(run, n);
+  const lanes t = run->t + run->h * ABSCISSA[0];
+  const lanes by_velocity = run->h * POSITION_WEIGHT[0], by_force = run->h * MOMENTUM_WEIGHT[0];
+  double first = 0.0, last = INFINITY, error;
+  int status = 0;
+  if (run->guess > 0)
+    continue_slopes(run, &parts, n);
+  else
+    memset(parts.G, 0, sizeof(lanes) * 2 * (size_t)n);
+  for (int k = 0; status == 0; k++) {
+    double change = improve(run, parts.X, parts.G + n, POSITION, by_velocity, 0, n, options->absolute);
+    change += improve(run, parts.X, parts.G, MOMENTUM, by_force, n, n, options->absolute);
+    forces(given, parts.X, t, parts.G, 2 * n);
+    if (k == 0)
+      continue; /* nothing to compare with */
+    status = sweep_status(change, last, options, k - 1);
+    first = k == 1 ? change : first;
+    last = change;
+    report->iterations++;
+  }
+  report->change = sqrt(last);
+  if (status < 0)
+    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  if (!finite_slopes(parts.G, n))
+    return NOT_FINITE;
+  error = unresolved(run, parts.G + n, n);
+  if (run->error == run->error && !(error <= run->error)) {
+    run->error = error;
+    run->error_t = run->t;
+  }
+  move(run, parts.G + n, POINT_END_POSITION[0], by_velocity, 0, n);
+  move(run, parts.G, POINT_END_MOMENTUM[0], by_force, n, n);
+  run->guess = run->guess > 0 && first < GOOD_GUESS ? 2 : 1;
+  run->turn = (run->turn + 1) % 3;
+  return OK;
+}
