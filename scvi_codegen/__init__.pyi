@@ -90,8 +90,8 @@ from scvi_codegen.runtime.fitting import Fit as Fit
 from scvi_codegen.runtime.fitting import fit as fit
 from scvi_codegen.runtime.gradients import Gradient as Gradient
 from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
-from scvi_codegen.runtime.periodic import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.periodic import periodic_orbit as periodic_orbit
+from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.run import Run as Run
 from scvi_codegen.runtime.stepper import Stepper as Stepper
 from scvi_codegen.runtime.trajectory import Trajectory as Trajectory

@@ -304,7 +304,7 @@ def describe(
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
         has_fallback=borrows or (program.newton and program.sweep is not None),
-        momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
+        momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         monitor="" if monitor is None else str(monitor),
         exchange_names=program.exchanges,
         constraints=program.constraints.formulas if program.constraints else (),

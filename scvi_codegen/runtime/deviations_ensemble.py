@@ -45,6 +45,7 @@ class DeviationsEnsemble:
         parameters: EnsembleParameters,
         options: SolverOptions | None,
     ) -> None:
+        stepper.check_steps_of_h("a motion of an ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.every = steps if every is None else checked_count(every, "every", least=1)

@@ -178,7 +178,7 @@ class Ensembles(ConstrainedStates):
             from there on, or from up to a thousand steps before, and says why in ``status``.
 
         Raises:
-            MethodError: in transformed time.
+            MethodError: in transformed time, and where a monitor chooses the steps.
             StateError: on wrong shapes, names or numbers.
         """
         p = momenta_of_each(self, q, p, velocity, t, parameters)

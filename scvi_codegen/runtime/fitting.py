@@ -19,7 +19,7 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.runtime.driven import checked_inputs
 from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
-from scvi_codegen.runtime.measurements import Measurements, state_names
+from scvi_codegen.runtime.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Fit", "fit"]
@@ -37,7 +37,9 @@ class Fit:
     Attributes:
         names: of the k unknowns: parameters, then coordinates and momenta of the initial state.
         values: (k,) of the unknowns.
-        covariance: (k, k) of their errors, to first order.
+        covariance: (k, k) of their errors, to first order, those at bounds taken as known, with not numbers in their
+            place; none are numbers where there are no more measurements than unknowns and no noise is given.
+        at_bounds: names of the unknowns that a bound holds, not the measurements.
         parameters: of the motion, all of them by name; q, p: (m,) its initial state.
         t: (n,) times of the measurements, the initial state being that at ``start``.
         observed: names of the c quantities measured.
@@ -49,6 +51,7 @@ class Fit:
     names: tuple[str, ...]
     values: Array
     covariance: Array
+    at_bounds: tuple[str, ...]
     parameters: dict[str, float]
     q: Array
     p: Array
@@ -69,7 +72,7 @@ class Fit:
         width = max(map(len, self.names))
         errors = self.standard_errors.values()
         lines = [
-            f"{name:{width}} = {value:.8g} +- {error:.2g}"
+            f"{name:{width}} = {value:.8g} " + ("at its bound" if name in self.at_bounds else f"+- {error:.2g}")
             for name, value, error in zip(self.names, self.values, errors, strict=True)
         ]
         return "\n".join(lines)
@@ -124,14 +127,14 @@ def fit(
         deviations: number or (c,), standard deviations of the noise; by default the same for all, and told by what is
             left.
         inputs: as of :meth:`Stepper.drive`.
-        bounds: (least, greatest) by names of unknowns.
+        bounds: (least, greatest) by names of unknowns, infinite where there is none.
 
     Returns:
         A :class:`Fit`.
 
     Raises:
         FitError: where the measurements do not tell an unknown, or no least squares are found.
-        MethodError: with constraints, and in transformed time.
+        MethodError: with constraints, in transformed time, and where a monitor chooses the steps.
         StateError: on wrong shapes, names or numbers.
         StepFailedError: if a step fails on the way.
     """
@@ -152,8 +155,9 @@ def fit(
     )
     if not found.success:
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
-    _check_told(model.names, found.jac)
-    return model.fit(found.x, found.nfev, known_noise=deviations is not None)
+    held = found.active_mask != 0
+    _check_told([name for name, at in zip(model.names, held, strict=True) if not at], found.jac[:, ~held])
+    return model.fit(found.x, held, found.nfev, known_noise=deviations is not None)
 
 
 @dataclass(eq=False)
@@ -187,7 +191,7 @@ class _Model:
         """From what users give."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
         own = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
-        wanted = own if unknown is None else list(unknown)
+        wanted = tuple(own) if unknown is None else distinct(unknown, "unknown")
         for name in wanted:
             if name not in own:
                 raise StateError(f"there is no parameter '{name}' to find{closest(name, own)}")
@@ -218,7 +222,11 @@ class _Model:
             if name not in self.names:
                 raise StateError(f"'{name}' is not among the unknowns, so has no bounds{closest(name, self.names)}")
             pair, k = real_array(ends, f"the bounds of {name}"), self.names.index(name)
-            if pair.shape != (2,) or not pair[0] < self.guess[k] < pair[1]:
+            if pair.shape != (2,) or np.isnan(pair).any():
+                raise StateError(
+                    f"the bounds of {name} are (least, greatest), infinite where there is none, not {ends}"
+                )
+            if not pair[0] < self.guess[k] < pair[1]:
                 raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
             low[k], high[k] = pair
         return low, high
@@ -249,18 +257,21 @@ class _Model:
             self.found = scaled[measurements.used], (slopes / measurements.deviations[:, np.newaxis])[measurements.used]
         return self.found
 
-    def fit(self, x: Array, evaluations: int, *, known_noise: bool) -> Fit:
-        """What was found."""
+    def fit(self, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
+        """What was found; ``held``: (k,) by a bound."""
         measurements, values = self.measurements, self._all(x)
         m = measurements.stepper.dimension
         scaled, slopes = self._evaluated(x)
-        free = len(scaled) - len(x)
+        free = len(scaled) - int((~held).sum())
         noise = 1.0 if known_noise else float(np.sqrt(scaled @ scaled / free)) if free else np.nan
-        inverse = np.linalg.pinv(slopes)
+        inverse = np.linalg.pinv(slopes[:, ~held])
+        covariance = np.full((len(x), len(x)), np.nan)
+        covariance[np.ix_(~held, ~held)] = noise**2 * inverse @ inverse.T
         return Fit(
             names=self.names,
             values=np.array(x),
-            covariance=noise**2 * inverse @ inverse.T,
+            covariance=covariance,
+            at_bounds=tuple(name for name, at in zip(self.names, held, strict=True) if at),
             parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=True)),
             q=values[:m],
             p=values[m : 2 * m],
@@ -280,6 +291,8 @@ def _of_inputs(stepper: Stepper) -> set[str]:
 
 def _check_told(names: Sequence[str], slopes: Array) -> None:
     """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is."""
+    if not names:
+        return
     sizes = np.sqrt((slopes**2).sum(axis=0))
     if nothing := np.flatnonzero(sizes <= SAME * sizes.max(initial=0.0)).tolist():
         raise FitError(

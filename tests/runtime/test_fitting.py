@@ -158,12 +158,46 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to find"),
         ({"bounds": {"k": (0, 1)}}, "'k' is not among the unknowns"),
         ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
+        ({"bounds": {"delta": (None, 1.0)}}, "the bounds of delta are .least, greatest., infinite where there is none"),
+        ({"unknown": ["alpha", "alpha"]}, "unknown names 'alpha' twice"),
+        ({"observed": ["x", "x"]}, "observed names 'x' twice"),
+        ({"deviations": np.inf}, "deviations are a positive number"),
         ({"h": 0.0}, "the step h is 0"),
     ],
 )
 def test_what_is_wrong_is_named(options, message):
     with pytest.raises(StateError, match=message):
         fit(oscillator(), TIMES, recorded()[0], **(GUESS | {"unknown": SOME} | options))
+
+
+def test_what_is_measured_is_finite_or_missing():
+    values = recorded()[0].copy()
+    values[3] = np.inf
+    with pytest.raises(StateError, match="a value in measured is infinite"):
+        fit(oscillator(), TIMES, values, unknown=SOME, **GUESS)
+
+
+def test_a_measurement_at_the_start_tells_the_state_alone():
+    """No step is taken: the state is what was measured, and parameters are not told."""
+    known = {"q": [0.7], "p": [0.2], "h": 0.1}
+    with pytest.raises(FitError, match="do not tell delta: they do not depend on it"):
+        fit(oscillator(), [0.0], [0.5], unknown=["delta"], state=False, **known)
+    found = fit(oscillator(), [0.0], [[0.5, 0.4]], observed=["x", "p_x"], unknown=[], **known)
+    assert_allclose(found.values, [0.5, 0.4], rtol=1e-12)
+
+
+def test_what_a_bound_holds_has_no_error_and_the_others_that_of_a_known_one():
+    """As if it were no unknown: nothing else is known of their errors to first order."""
+    bound = {"alpha": (-0.95, 0.0)}
+    found = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME, bounds=bound, **GUESS)
+    assert found.at_bounds == ("alpha",)
+    assert "alpha = -0.95 at its bound" in str(found)
+    assert np.isnan(found.standard_errors["alpha"])
+    known = GUESS | {"parameters": GUESS["parameters"] | {"alpha": -0.95}}
+    other = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME[1:], **known)
+    assert other.at_bounds == ()
+    for name, error in other.standard_errors.items():
+        assert found.standard_errors[name] == pytest.approx(error, rel=1e-3)
 
 
 def test_times_ascend_and_constraints_are_not_fitted():
