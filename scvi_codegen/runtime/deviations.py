@@ -41,6 +41,12 @@ class Deviations:
     mean_rates: Array
     status: NDArray[np.str_] | None = None
 
+    @classmethod
+    def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> Deviations:
+        """From (n,) times and (4, n, .., k) lengths, stretches, rates and mean rates."""
+        lengths, stretches, rates, mean_rates = found
+        return cls(t=t, lengths=lengths, stretches=stretches, rates=rates, mean_rates=mean_rates, status=status)
+
     def lyapunov_exponents(self) -> Array:
         """(n, k) the k largest exponents of the time until each state, descending; not numbers at the first.
 
