@@ -1,6 +1,7 @@
 """Indicators of chaos over many initial states: small changes carried along each motion, over threads.
 
-States and derivatives are told by the same steps in C, from piece to piece; of a motion nothing is kept but what the
+Where a text has changes beside the motions these go in vector lanes; else, and where a step in lanes fails, states and
+derivatives of each are told by the same steps in C, from piece to piece. Of a motion nothing is kept but what the
 indicators need, so that a million initial states are a question of time, not of memory.
 """
 

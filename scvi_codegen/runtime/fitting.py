@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import FitError, StateError, closest
+from scvi_codegen.errors import FitError, StateError, StepFailedError, closest
 from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
@@ -136,7 +136,7 @@ def fit(
         FitError: where the measurements do not tell an unknown, or no least squares are found.
         MethodError: with constraints, in transformed time, and where a monitor chooses the steps.
         StateError: on wrong shapes, names or numbers.
-        StepFailedError: if a step fails on the way.
+        StepFailedError: if a step of the first guess fails.
     """
     from scipy.optimize import least_squares  # here: slow to import
 
@@ -232,8 +232,13 @@ class _Model:
         return low, high
 
     def residuals(self, x: Array) -> Array:
-        """Of all measurements, in standard deviations."""
-        return self._evaluated(x)[0]
+        """Of all measurements, in standard deviations; infinite where a motion fails, from which SciPy turns back."""
+        try:
+            return self._evaluated(x)[0]
+        except StepFailedError:
+            if self.at is None:
+                raise
+            return np.full(int(self.measurements.used.sum()), np.inf)
 
     def slopes(self, x: Array) -> Array:
         """(measurements, k) of the same."""

@@ -10,7 +10,16 @@ from samples import QUICK_FLAGS, linkage
 from scipy.integrate import solve_ivp
 from scipy.optimize import curve_fit
 
-from scvi_codegen import SVI, FitError, LagrangianSystem, MethodError, StateError, compile_stepper, fit
+from scvi_codegen import (
+    SVI,
+    FitError,
+    LagrangianSystem,
+    MethodError,
+    StateError,
+    StepFailedError,
+    compile_stepper,
+    fit,
+)
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
 NOISE = 0.01
@@ -168,6 +177,19 @@ def test_two_measurements_do_not_tell_five_unknowns():
 def test_what_is_wrong_is_named(options, message):
     with pytest.raises(StateError, match=message):
         fit(oscillator(), TIMES, recorded()[0], **(GUESS | {"unknown": SOME} | options))
+
+
+def test_a_guess_beyond_which_motions_fail_is_a_guess():
+    """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
+    soft = LagrangianSystem.from_text(
+        name="soft", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 + x**4/4", parameters={"a": 1.0}
+    )
+    stepper = compile_stepper(soft, SVI(4), flags=QUICK_FLAGS)
+    run = stepper.integrate([0.9], [0.0], h=0.1, steps=100)
+    found = fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})
+    assert_allclose(found.values, [1.0, 0.9, 0.0], atol=1e-9)
+    with pytest.raises(StepFailedError):
+        fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
 
 
 def test_what_is_measured_is_finite_or_missing():
