@@ -34,6 +34,8 @@ SEED = 1892
 """Of the directions to begin with: in general position, the same in every run."""
 NOTHING = 1e-8
 """Beside the largest singular value of a derivative: what constraints leave of the directions they forbid."""
+OFF = 1e-6
+"""Beside their length: how far directions may be off those that constraints allow."""
 
 Stretch = tuple[Starts, NDArray[np.intp]]
 """Steps that follow each other, and (steps + 1,) the number of the kept state at each of their ends, -1 where none."""
@@ -70,14 +72,17 @@ class Changes:
 
     def at(self, q: Array, p: Array, h: float, t: float, parameters: Array, options: SolverOptions | None) -> Array:
         """Those of a motion from (q, p) by a first step of h."""
-        if self.directions is not None:
-            return self.directions
+        given = self.directions
         if not self.stepper.interface.constraints:
-            return _frame(self.stepper.dimension)[:, : self.count]
+            return _frame(self.stepper.dimension)[:, : self.count] if given is None else given
         before = self.stepper.step(q, p, -h, t, parameters, options=options)
         ends = self.stepper.jacobian(*before, h, t - h, parameters, options=options)
         allowed, sizes, _ = np.linalg.svd(ends)
         frame = allowed[:, sizes > NOTHING * sizes[0]]
+        if given is not None:
+            if np.abs(given - frame @ (frame.T @ given)).max() > OFF:
+                raise StateError("directions change a state to one that the constraints do not allow")
+            return given
         if self.count is not None and self.count > frame.shape[1]:
             raise StateError(f"constraints leave {frame.shape[1]} independent changes of the state, not {self.count}")
         mixed, _ = np.linalg.qr(np.random.default_rng(SEED).normal(size=2 * frame.shape[1:]))

@@ -173,6 +173,9 @@ def test_constraints_leave_fewer_changes():
     assert run.megno()[-1] == pytest.approx(2.0, abs=0.3)
     with pytest.raises(StateError, match="constraints leave 2 independent changes of the state, not 3"):
         run.deviations(3)
+    assert run.deviations(directions=[0.0, 1.0, 0.0, 0.0]).lengths.shape == (4001, 1)
+    with pytest.raises(StateError, match="one that the constraints do not allow"):
+        run.deviations(directions=[0.0, 0.0, 1.0, 0.0])
 
 
 def test_ensembles_are_the_same_as_runs(galaxy):
