@@ -20,11 +20,9 @@ from scvi_codegen.runtime.driven import Input, parameters_of
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.linearised import Starts
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.times import steps_within
 
 __all__ = ["Measurements", "distinct", "state_names"]
-
-WHOLE = 1e-9
-"""Of a step: what rounding may leave of a span."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +79,7 @@ class Measurements:
         first = float(times[0]) if start is None else checked_number(start, "the time start")
         if first > times[0]:
             raise StateError(f"the initial state, at t = {first:g}, is that before the first measurement")
-        pieces, places = _steps(first, times, abs(checked_step(h)), inputs)
+        pieces, places = _steps(first, times, checked_step(h), inputs)
         columns = np.array([_column(stepper, name) for name in names])
         sizes = np.broadcast_to(sizes, (len(names),)).copy()
         return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, places)
@@ -119,7 +117,7 @@ def _steps(
     breaks = np.unique(breaks[(breaks > start) & (breaks < t[-1])])
     nodes = np.unique(np.concatenate([[start], t, breaks]))
     spans = np.diff(nodes)
-    counts = np.maximum(1, np.ceil(spans / h - WHOLE)).astype(np.intp)
+    counts = steps_within(spans, h)
     ends = np.concatenate([[0], np.cumsum(counts)])
     within = np.arange(ends[-1]) - np.repeat(ends[:-1], counts)
     lengths = np.repeat(spans / counts, counts)

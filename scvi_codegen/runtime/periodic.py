@@ -9,7 +9,6 @@ of for what does not matter. What a motion keeps returns by itself: that much of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from scvi_codegen.runtime.linearised import Starts
 from scvi_codegen.runtime.measurements import state_names
 from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.times import times_after
+from scvi_codegen.runtime.times import steps_within, times_after
 
 __all__ = ["periodic_orbit"]
 
@@ -46,8 +45,6 @@ WORSE = 10.0
 """Than before: what a defect may become on the way."""
 RESTING = 1e-6
 """Beside the size of the state: how far a motion goes in a period that goes nowhere."""
-WHOLE = 1e-9
-"""Of a step: what rounding may leave of a period."""
 
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper), hold=NAMES, fixed_period=SWITCH)
@@ -165,9 +162,7 @@ class _OrbitSearch:
         return cls(
             stepper=stepper,
             period=period,
-            steps=checked_count(
-                steps if h is None else math.ceil(period / abs(checked_step(h)) - WHOLE), "steps", least=1
-            ),
+            steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
             free=np.array([k for k, name in enumerate(names) if name not in held], dtype=np.intp),
             energy=None if energy is None else checked_number(energy, "the energy"),
             gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
