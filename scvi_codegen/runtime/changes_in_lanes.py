@@ -47,7 +47,7 @@ def in_lanes(
         heed: called before each piece, may raise.
 
     Returns:
-        (4, n, K, k) what :class:`Growth` found, and (K,) whether all steps of a motion were taken.
+        (5, n, K, k) what :class:`Growth` found, and (K,) whether all steps of a motion were taken.
     """
     motions = _Motions(binding, q, p, parameters, changes.shape[1], t=float(t[0]), h=h, options=options)
     frame, triangle = (np.broadcast_to(part, (len(q), *part.shape)) for part in np.linalg.qr(changes))

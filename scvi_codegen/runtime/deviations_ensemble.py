@@ -23,6 +23,7 @@ from scvi_codegen.runtime.changes_in_lanes import MOTIONS, in_lanes
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import OK
+from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.spreading import Changes, ahead
@@ -61,7 +62,7 @@ class DeviationsEnsemble:
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
         self.changes = Changes.checked(stepper, count, directions)
         self.status = np.full(len(self.q), OK, dtype="<U16")
-        self.found = np.full((4, len(self.t[:: self.every]), len(self.q), self._width()), np.nan)
+        self.found = np.full((len(SERIES), len(self.t[:: self.every]), len(self.q), self._width()), np.nan)
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> Deviations:
         """Follow all motions; ``progress`` is called with the number of those done, and may raise to stop them.

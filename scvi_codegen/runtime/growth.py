@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["Growth", "apart", "triangles"]
+__all__ = ["SERIES", "Growth", "apart", "triangles"]
+
+SERIES = ("lengths", "greatest", "stretches", "rates", "mean_rates")
+"""What is told at each time that is kept, as :class:`~scvi_codegen.runtime.deviations.Deviations` describes it."""
 
 APART = 1e3
 """How much longer one change may grow than another within a piece: what it costs of their digits."""
@@ -24,16 +27,15 @@ class Growth:
         stretches: (k,) or (K, k) logarithms of the diagonal of R at the start, lengths being 1.
 
     Attributes:
-        found: (4, n, k) or (4, n, K, k) lengths, stretches, rates and mean rates at these times; not numbers where
-            nothing was reached.
+        found: (5, n, k) or (5, n, K, k) :data:`SERIES` at these times; not numbers where nothing was reached.
     """
 
     def __init__(self, t: Array, stretches: Array) -> None:
         self.start, nothing = float(t[0]), np.zeros_like(stretches)
-        self.lengths, self.stretches = nothing, stretches
-        self.moments = self.rates = self.areas = nothing
-        self.found = np.full((4, len(t), *stretches.shape), np.nan)
-        self.found[:, 0] = [nothing, stretches, nothing, nothing]
+        self.stretches = stretches
+        self.lengths = self.greatest = self.moments = self.rates = self.areas = nothing
+        self.found = np.full((len(SERIES), len(t), *stretches.shape), np.nan)
+        self.found[:, 0] = [nothing, nothing, stretches, nothing, nothing]
 
     def add(self, t: Array, numbers: NDArray[np.intp], grown: Array, stretched: Array) -> None:
         """Steps that follow each other; the moment of each is taken at its middle.
@@ -46,6 +48,7 @@ class Growth:
         """
         times = np.abs(t - self.start).reshape(-1, *[1] * self.lengths.ndim)
         lengths = self.lengths + grown
+        greatest = np.maximum(np.maximum.accumulate(lengths, axis=0), self.greatest)
         steps = np.diff(lengths, axis=0, prepend=self.lengths[np.newaxis])
         moments = self.moments + np.cumsum((times[1:] + times[:-1]) / 2 * steps, axis=0)
         rates = 2.0 * moments / times[1:]
@@ -56,11 +59,12 @@ class Growth:
         kept = np.flatnonzero(numbers >= 0)
         self.found[:, numbers[kept]] = [
             lengths[kept],
+            greatest[kept],
             self.stretches + stretched[kept],
             rates[kept],
             areas[kept] / times[kept + 1],
         ]
-        self.lengths, self.stretches = lengths[-1], self.stretches + stretched[-1]
+        self.lengths, self.greatest, self.stretches = lengths[-1], greatest[-1], self.stretches + stretched[-1]
         self.moments, self.rates, self.areas = moments[-1], rates[-1], areas[-1]
 
 

@@ -19,6 +19,7 @@ from scvi_codegen import (
     problem,
 )
 from scvi_codegen.runtime.changes_in_lanes import MOTIONS
+from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.spreading import Changes
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
@@ -138,10 +139,21 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
 def test_states_left_out_change_nothing(galaxy):
     whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
     some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, every=50)
-    for name in ("lengths", "stretches", "rates", "mean_rates"):
+    for name in SERIES:
         assert_allclose(getattr(some.deviations(), name), getattr(whole.deviations(), name)[::50], rtol=1e-9, atol=1e-9)
     back = galaxy.integrate(whole.q[-1], whole.p[-1], h=-0.2, steps=600)
     assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
+
+
+def test_a_length_is_greatest_wherever_it_was(galaxy):
+    """Between states that are kept, too: of a regular motion, whose changes come and go."""
+    run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])
+    greatest = run.deviations(1).lengths.max()
+    assert run.deviations(1).lengths[-1, 0] < greatest - 0.01
+    some = galaxy.integrate(*REGULAR, h=0.2, steps=60, every=60).deviations(1)
+    assert some.fli()[-1] == pytest.approx(greatest, abs=1e-12)
+    many = galaxy.deviations_ensemble(*start, h=0.2, steps=60, count=1)
+    assert many.fli()[-1, 0] == pytest.approx(greatest, abs=1e-12)
 
 
 def test_friction_moves_the_middle_of_the_spectrum():
@@ -209,7 +221,7 @@ def by_derivatives(stepper):
 
 
 def same(found, other, within):
-    for name in ("lengths", "stretches", "rates", "mean_rates"):
+    for name in SERIES:
         assert_allclose(getattr(found, name), getattr(other, name), atol=within)
     assert_array_equal(found.status, other.status)
 
