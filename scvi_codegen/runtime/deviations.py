@@ -68,7 +68,7 @@ class Deviations:
         return mean
 
     def fli(self) -> Array:
-        """(n,) the fast Lyapunov indicator: the logarithm of the greatest length any change had after a step until then.
+        """(n,) the fast Lyapunov indicator: the logarithm of the greatest length of any change until then.
 
         It grows as log t for regular motions, as lambda t for chaotic ones: Froeschle, Lega & Gonczi, Celest. Mech.
         Dyn. Astron. 67 (1997) 41; Froeschle & Lega, ibid. 78 (2000) 167.
