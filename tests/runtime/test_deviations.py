@@ -15,6 +15,7 @@ from scvi_codegen import (
     LagrangianSystem,
     SpectralCollocation,
     StateError,
+    StepFailedError,
     compile_stepper,
     problem,
 )
@@ -282,6 +283,20 @@ def test_a_motion_that_leaves_its_lane_is_followed_alone():
     assert 2 < sum(found.status == "ok") < 15
     assert done[-1] == 20
     same(found, alone.deviations_ensemble(*start, **options), 1e-12)
+
+
+def test_steps_that_are_no_motion_are_refused_as_by_runs():
+    """Kepler's problem, e = 0.9, by steps too long for the pericentre: another solution is found."""
+    kepler = compile_stepper(problem("kepler").system, SVI(4))
+    q, p = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
+    with pytest.raises(StepFailedError, match="solved by what is no motion") as failed:
+        kepler.integrate(q, p, h=0.4, steps=40)
+    before = failed.value.trajectory
+    with pytest.raises(StepFailedError, match="solved by what is no motion"):
+        kepler.jacobian(before.q[-1], before.p[-1], 0.4)
+    found = kepler.deviations_ensemble([q], [p], h=0.4, steps=40, count=1)
+    assert list(found.status) == ["strayed"]
+    assert np.isnan(found.megno()[-1]).all()
 
 
 def test_more_motions_than_go_along_together_are_told_apart(galaxy):
