@@ -6,14 +6,16 @@ times, and what is minimised is a smooth function of the unknowns whose slopes a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import FitError, StateError, StepFailedError, closest
+from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest
 from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
@@ -26,6 +28,10 @@ __all__ = ["Fit", "fit"]
 
 SAME = 1e-10
 """Beside slopes of size 1: what is smaller tells nothing but rounding."""
+NEARER = 4
+"""Iterations of Gauss and Newton from what was found by steps half as long."""
+NOTICED = 1e-6
+"""Beside the largest unknown: by how much steps half as long may move one of which nothing is said."""
 SHARE = 0.1
 """Of a direction that changes nothing: an unknown with less of it is not named."""
 
@@ -130,7 +136,8 @@ def fit(
         bounds: (least, greatest) by names of unknowns, infinite where there is none.
 
     Returns:
-        A :class:`Fit`.
+        A :class:`Fit`. An :class:`~scvi_codegen.AccuracyWarning` says where steps of h, not the measurements, tell an
+        unknown: where half as long ones would move it by more than its standard error.
 
     Raises:
         FitError: where the measurements do not tell an unknown, or no least squares are found.
@@ -157,7 +164,10 @@ def fit(
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
     held = found.active_mask != 0
     _check_told([name for name, at in zip(model.names, held, strict=True) if not at], found.jac[:, ~held])
-    return model.fit(found.x, held, found.nfev, known_noise=deviations is not None)
+    fitted = model.fit(found.x, held, found.nfev, known_noise=deviations is not None)
+    if told := model.told_by_steps(fitted, ~held):
+        warnings.warn(told, AccuracyWarning, stacklevel=3)
+    return fitted
 
 
 @dataclass(eq=False)
@@ -288,6 +298,29 @@ class _Model:
             deviations=noise * measurements.deviations,
             evaluations=evaluations,
         )
+
+    def told_by_steps(self, fitted: Fit, free: NDArray[np.bool_]) -> str:
+        """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
+
+        What moves by less than a millionth of the largest unknown is left alone: data without noise have no errors.
+        """
+        finer = replace(self, measurements=self.measurements.halved(), known=self._all(fitted.values), at=None)
+        errors, found = np.sqrt(np.diag(fitted.covariance)), fitted.values.copy()
+        noticed = np.maximum(errors, NOTICED * np.abs(found).max(initial=0.0))
+        with suppress(StepFailedError):
+            for _ in range(NEARER):
+                scaled, slopes = finer._evaluated(found)
+                found[free] -= np.linalg.pinv(slopes[:, free]) @ scaled
+                moved = np.abs(found - fitted.values)[free]
+                if not (moved > noticed[free]).any():
+                    return ""
+            ratios = moved / errors[free]
+            name = [name for name, at in zip(self.names, free, strict=True) if at][int(np.argmax(ratios))]
+            return (
+                f"h is too long for this fit: with steps half as long {name} is {ratios.max():.1f} standard errors "
+                "away. Take a shorter h, or a method of higher order"
+            )
+        return ""
 
 
 def _of_inputs(stepper: Stepper) -> set[str]:

@@ -12,6 +12,7 @@ from scipy.optimize import curve_fit
 
 from scvi_codegen import (
     SVI,
+    AccuracyWarning,
     FitError,
     LagrangianSystem,
     MethodError,
@@ -177,6 +178,24 @@ def test_two_measurements_do_not_tell_five_unknowns():
 def test_what_is_wrong_is_named(options, message):
     with pytest.raises(StateError, match=message):
         fit(oscillator(), TIMES, recorded()[0], **(GUESS | {"unknown": SOME} | options))
+
+
+def test_steps_that_tell_an_unknown_are_too_long():
+    """Of second order, by long steps: what is found is off by twelve of the errors claimed, and said to be."""
+    soft = LagrangianSystem.from_text(
+        name="hard",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - a*x**2/2 - b*x**4/4",
+        parameters={"a": 1.0, "b": 1.0},
+    )
+    times = np.linspace(0.0, 20.0, 101)
+    exact = compile_stepper(soft, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], h=0.1, steps=200, every=2)
+    noisy = exact.q[:, 0] + 1e-3 * np.random.default_rng(0).normal(size=101)
+    coarse, given = compile_stepper(soft, SVI(1), flags=QUICK_FLAGS), {"q": [0.9], "p": [0.1]}
+    with pytest.warns(AccuracyWarning, match=r"h is too long for this fit: .* b is \S+ standard errors away"):
+        found = fit(coarse, times, noisy, h=0.2, **given)
+    assert abs(found.parameters["b"] - 1.0) > 10.0 * found.standard_errors["b"]
+    assert abs(fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
 
 
 def test_a_guess_beyond_which_motions_fail_is_a_guess():
