@@ -37,10 +37,13 @@ from scvi_codegen.files.cache import clear_cache as clear_cache
 from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
 from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
 from scvi_codegen.frameworks.jax import jax_flow as jax_flow
+from scvi_codegen.indexed_compiler import compile_indexed as compile_indexed
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
+from scvi_codegen.mechanics.indexed.expansion import expand_sums as expand_sums
+from scvi_codegen.mechanics.indexed.system import IndexedSystem as IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry as check_symmetry
@@ -89,6 +92,9 @@ from scvi_codegen.runtime.events import Event as Event
 from scvi_codegen.runtime.fitting import Fit as Fit
 from scvi_codegen.runtime.fitting import fit as fit
 from scvi_codegen.runtime.gradients import Gradient as Gradient
+from scvi_codegen.runtime.indexed_run import IndexedRun as IndexedRun
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper as IndexedStepper
+from scvi_codegen.runtime.indexed_stepper import IndexedTrajectory as IndexedTrajectory
 from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
 from scvi_codegen.runtime.periodic import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit as PeriodicOrbit

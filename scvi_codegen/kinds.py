@@ -22,6 +22,7 @@ __all__ = [
     "CANVAS",
     "FORMULAS",
     "FUNCTION",
+    "MAPPED",
     "MAPPING",
     "NAMES",
     "NUMBERS",
@@ -76,7 +77,8 @@ MAPPING = Kind(
     lambda value: isinstance(value, Mapping) and all(isinstance(name, str) for name in value),
 )
 NUMBERS = Kind("a list of numbers", lambda value: _is_sequence(value) or isinstance(value, np.ndarray))
-FORMULAS = Kind("a list of formulas", _is_sequence)
+MAPPED = of("a mapping, as {x: 2.0}", Mapping)
+FORMULAS = Kind("a list of formulas", lambda value: _is_sequence(value) or hasattr(value, "shape"))
 FUNCTION = Kind("a function", callable)
 CANVAS = Kind("Matplotlib axes", lambda value: hasattr(value, "plot") and hasattr(value, "figure"))
 

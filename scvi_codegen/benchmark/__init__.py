@@ -16,6 +16,7 @@
     start_up      from text to the first step
     compile_times the same for larger systems (in compile_systems), by what takes the time
     mechanisms    from SymPy's bodies and loads to a motion, beside lambdify and PyDy (in multibody)
+    sums          sums over indices at equal error, beside C by hand (lattices.c), SciPy and REBOUND; and how time grows
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation we know of, which are named; no step or tolerance chosen with the answer known, but whole curves.
@@ -45,6 +46,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.start_up import run_start_up
+from scvi_codegen.benchmark.sums import run_growth, run_sums
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 
@@ -64,6 +66,8 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "start-up": run_start_up,
     "compile": run_compile_times,
     "mechanisms": run_mechanisms,
+    "sums": run_sums,
+    "growth": run_growth,
 }
 """All that can be measured: name on the command line -> function that does it."""
 

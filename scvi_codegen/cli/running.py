@@ -94,6 +94,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             pieces.append(work.stretch(steps))
             if work.failure is not None or work.stopped:
                 break
+    pieces = pieces or [run.record(0)]
     trajectory = DrivenTrajectory(tuple(pieces)) if model.system.inputs else pieces[0]
     return RunOutcome(
         trajectory=trajectory,
@@ -241,9 +242,8 @@ def of_length(h: float | None, run: Run) -> str:
 
 def _speed(outcome: RunOutcome, every: int) -> str:
     text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
-    watched = (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
-    if every > 1 and outcome.run.stepper.interface.inputs:  # states at breakpoints, too
-        return text
+    driven = bool(outcome.run.stepper.interface.inputs)  # states at breakpoints and at the end are kept, too
+    watched = outcome.run.steps if driven else (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
     if not watched:
         return text
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"

@@ -79,18 +79,18 @@ def exact_discrete_lagrangian(
     or from the trajectory that leaves q0 with the velocity ``guess``.
 
     Args:
-        system: any regular Lagrangian.
+        system: any regular Lagrangian without forces and constraints.
         q0, q1: m positions each. Floats stand for their exact binary values; strings such as ``"0.1"``, integers,
             fractions, mpmath and SymPy numbers are taken to 60 digits.
         h: step, negative to go back.
         t: time at the start.
-        parameters: by name (others keep their defaults) or all in order.
+        parameters: by name (others keep their defaults) or all in order; of an input its coefficients.
         digits: asked for, 1 to 50.
         guess: m velocities at the start, near those of the solution wanted.
 
     Raises:
-        StateError: on numbers that are none, wrong shapes or names; if no solution is found; if q1 is conjugate to q0,
-            where the solution is not unique.
+        StateError: on numbers that are none, wrong shapes or names, for inputs that are not given, and for systems with
+            forces or constraints; if no solution is found; if q1 is conjugate to q0, where it is not unique.
     """
     if system.forces:
         raise StateError(f"forces act on '{system.name}': there is no action whose slopes the momenta are")
@@ -129,13 +129,14 @@ def exact_map(
     """Follow the exact trajectory from (q0, p0) at t to t + h: the map that L_d^E generates by (5).
 
     Args:
-        system: any regular Lagrangian.
+        system: any regular Lagrangian without constraints; forces may act.
         q0, p0: m positions and m momenta.
         h, t, parameters, digits: as in :func:`exact_discrete_lagrangian`.
 
     Raises:
-        StateError: on numbers that are none, wrong shapes or names; if the trajectory does not exist up to t + h, or is
-            too far from smooth to be followed in 16 pieces.
+        StateError: on numbers that are none, wrong shapes or names, for inputs that are not given, and for systems with
+            constraints; if the trajectory does not exist up to t + h, or is too far from smooth to be followed in 16
+            pieces.
     """
     problem = _Problem(system, h, t, parameters, digits)
     start, momenta = problem.vector(q0, "q0"), problem.vector(p0, "p0")
@@ -160,6 +161,8 @@ class _Problem:
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
         if self.h == 0:
             raise StateError("the step h is 0")
+        if system.constraints:
+            raise StateError(f"constraints hold '{system.name}': exact steps are those of motions without any")
         self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 
     def vector(self, values: Sequence[Any], name: str) -> Array:
@@ -217,6 +220,9 @@ def _parameter_values(system: LagrangianSystem, parameters: Values) -> dict[str,
     names = [parameter.name for parameter in system.parameters]
     if parameters is None or isinstance(parameters, Mapping):
         given = dict(zip(names, system.defaults, strict=True)) | dict(parameters or {})
+        for name in system.inputs:
+            if f"{name}_0" not in (parameters or {}):
+                raise StateError(f"the input {name} is not given: parameters={{'{name}_0': ...}} holds it")
     elif len(parameters) == len(names):
         given = dict(zip(names, parameters, strict=True))
     else:

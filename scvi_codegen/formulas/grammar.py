@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import NamedTuple, NoReturn
+from typing import ClassVar, NamedTuple, NoReturn
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
@@ -33,7 +33,7 @@ from scvi_codegen.formulas.canonical import (
 )
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 
-__all__ = ["parse_expression"]
+__all__ = ["Parser", "Token", "parse_expression", "parsed"]
 
 MAX_CHARACTERS = 400_000
 """Reading takes time in proportion to the length times the depth of brackets: fifty atoms in a gas are 212 000 long."""
@@ -61,7 +61,9 @@ _HINTS = {
 }
 
 
-class _Token(NamedTuple):
+class Token(NamedTuple):
+    """A number, a name, an operator or the end."""
+
     kind: str
     text: str
     column: int
@@ -84,11 +86,12 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
     >>> parse_expression("0.5*x**2 - cos(2*x)/3", {"x": x})
     x**2/2 - cos(2*x)/3
     """
-    if len(text) > MAX_CHARACTERS:
-        raise ExpressionError(
-            f"a formula of {len(text)} characters is too long: the limit is {MAX_CHARACTERS}", text, 0
-        )
-    parser = _Parser(text, symbols)
+    return parsed(Parser(text, symbols))
+
+
+def parsed(parser: Parser) -> Expr:
+    """What a parser reads, with an :class:`ExpressionError` for whatever it cannot."""
+    text = parser.text
     try:
         return parser.parse()
     except ExpressionError:
@@ -107,33 +110,43 @@ def _vanishes(part: Expr) -> bool:
     return bool(part.is_number and part.is_zero)
 
 
-def _tokens(text: str) -> list[_Token]:
+def _tokens(text: str, pattern: re.Pattern[str]) -> list[Token]:
+    if len(text) > MAX_CHARACTERS:
+        message = f"a formula of {len(text)} characters is too long: the limit is {MAX_CHARACTERS}"
+        raise ExpressionError(message, text, 0)
     tokens, position = [], _SPACE.match(text).end()  # type: ignore[union-attr]  # the pattern matches nothing, too
     while position < len(text):
-        match = _TOKEN.match(text, position)
+        match = pattern.match(text, position)
         if match is None:
             character = text[position]
             hint = _HINTS.get(character, "names are made of the letters a-z, A-Z, digits and underscores")
             raise ExpressionError(f"unexpected character {character!r}: {hint}", text, position)
-        tokens.append(_Token(str(match.lastgroup), match.group(), position))
+        tokens.append(Token(str(match.lastgroup), match.group(), position))
         position = _SPACE.match(text, match.end()).end()  # type: ignore[union-attr]  # as above
-    tokens.append(_Token("end", "", len(text.rstrip())))
+    tokens.append(Token("end", "", len(text.rstrip())))
     return tokens
 
 
-class _Parser:
-    """Recursive descent over the tokens; sums and products of any length are loops, only brackets recurse."""
+class Parser:
+    """Recursive descent over the tokens; sums and products of any length are loops, only brackets recurse.
+
+    A grammar with more kinds of atoms is a subclass, with a pattern of its tokens and an own :meth:`name`.
+    """
+
+    pattern: ClassVar[re.Pattern[str]] = _TOKEN
 
     def __init__(self, text: str, symbols: Mapping[str, Symbol]) -> None:
         self.text, self.symbols = text, symbols
-        self.tokens = _tokens(text)
+        self.tokens = _tokens(text, self.pattern)
         self.position = self.depth = 0
 
     @property
     def column(self) -> int:
+        """Where the next token stands."""
         return self.tokens[self.position].column
 
     def parse(self) -> Expr:
+        """The whole text."""
         result = self.sum()
         if self.tokens[self.position].kind != "end":
             self.refuse_leftover()
@@ -144,9 +157,11 @@ class _Parser:
         return result
 
     def refuse(self, message: str, column: int) -> NoReturn:
+        """Raise an error at a column."""
         raise ExpressionError(message, self.text, column)
 
     def refuse_leftover(self) -> NoReturn:
+        """Raise one at a token that fits nowhere."""
         kind, text, column = self.tokens[self.position]
         if kind == "operator" and text == "**":
             self.refuse("a tower of powers is ambiguous: write (x**y)**z or x**(y**z)", column)
@@ -157,7 +172,8 @@ class _Parser:
         what = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
         self.refuse(f"an operator is missing before '{text}': {what}", column)
 
-    def accept(self, *operators: str) -> _Token | None:
+    def accept(self, *operators: str) -> Token | None:
+        """The next token if it is one of these operators."""
         token = self.tokens[self.position]
         if token.kind != "operator" or token.text not in operators:
             return None
@@ -165,16 +181,19 @@ class _Parser:
         return token
 
     def close(self) -> None:
+        """The bracket that closes."""
         if self.accept(")") is None:
             self.refuse_leftover()
         self.depth -= 1
 
     def open(self, column: int) -> None:
+        """One level of brackets more."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
             self.refuse(f"brackets are nested deeper than {MAX_DEPTH}", column)
 
     def sum(self) -> Expr:
+        """``product (("+" | "-") product)*``."""
         column, terms = self.column, [self.product(negative=False)]
         while token := self.accept("+", "-"):
             terms.append(self.product(negative=token.text == "-"))
@@ -190,11 +209,13 @@ class _Parser:
         return Add(*(Mul(coefficient, rest) for rest, coefficient in coefficients.items()))
 
     def bounded(self, number: Expr, column: int) -> Expr:
+        """The number, unless it is too long."""
         if bits(number) > MAX_BITS:
             self.refuse(f"a constant grows beyond {MAX_BITS} bits here, more than any C double can hold", column)
         return number
 
     def product(self, *, negative: bool) -> Expr:
+        """``signed (("*" | "/") signed)*``."""
         column, coefficient, factors = self.column, S.NegativeOne if negative else S.One, []
         inverse = False
         while True:
@@ -216,15 +237,18 @@ class _Parser:
         return result
 
     def sign(self) -> Expr:
+        """The product of all signs here."""
         sign = S.One
         while token := self.accept("+", "-"):
             sign = -sign if token.text == "-" else sign
         return sign
 
     def signed(self) -> tuple[Expr, Expr]:
+        """Sign and power."""
         return self.sign(), self.power()
 
     def power(self) -> Expr:
+        """``atom ["**" exponent]``."""
         column, base = self.column, self.atom()
         operator = self.accept("**")
         if operator is None:
@@ -249,6 +273,7 @@ class _Parser:
         return result
 
     def atom(self) -> Expr:
+        """A number, a name, a call or a bracket."""
         kind, text, column = self.tokens[self.position]
         if kind == "end":
             self.refuse(
@@ -267,6 +292,7 @@ class _Parser:
         return result
 
     def number(self, text: str, column: int) -> Expr:
+        """The exact value of a number."""
         following = self.tokens[self.position]
         if following.kind == "name" and following.text in ("j", "J") and following.column == column + len(text):
             self.refuse("complex numbers are not part of the grammar", column)
@@ -280,6 +306,7 @@ class _Parser:
         return self.bounded(value, column)
 
     def name(self, name: str, column: int) -> Expr:
+        """The symbol, or the value, of a name."""
         if name in FUNCTIONS:
             return self.call(name, column)
         if self.tokens[self.position][:2] == ("operator", "("):
@@ -292,6 +319,7 @@ class _Parser:
         return value
 
     def call(self, name: str, column: int) -> Expr:
+        """A function of its arguments."""
         opening = self.accept("(")
         if opening is None:
             self.refuse(f"'{name}' is a function: write {name}(...)", column)

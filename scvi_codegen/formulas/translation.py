@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -12,7 +13,24 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import evaluated
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
-__all__ = ["Translation"]
+__all__ = ["Translation", "given_expression"]
+
+
+def given_expression(value: Any, what: str) -> Expr:
+    """A SymPy expression, or a number as one.
+
+    Raises:
+        SystemDefinitionError: for anything else; text would be read in names of SymPy's, where E is 2.718..
+    """
+    try:
+        expression = sympy.sympify(value, strict=True)
+    except sympy.SympifyError:
+        expression = value
+    if not isinstance(expression, Expr) or expression.is_Matrix:
+        raise SystemDefinitionError(
+            f"the {what} is a {type(value).__name__}, not a SymPy expression (text goes to from_text)"
+        )
+    return expression
 
 
 class Translation:
@@ -71,8 +89,8 @@ class Translation:
         if leftover:
             raise SystemDefinitionError(
                 f"'{leftover[0]}' in the {what} is neither a coordinate nor the velocity of one: list it among the "
-                "coordinates, or write a given function of time with the functions of the grammar (accelerations and "
-                "other higher derivatives are not supported)"
+                "coordinates, or among the inputs if it is data, or write it with the functions of the grammar "
+                "(accelerations and other higher derivatives are not supported)"
             )
         return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.ir.constraints import Constraints
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.constraints import along_motion, constraint_rates, constraint_slopes, positions_held
@@ -18,7 +17,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
         return None
     slopes, rates = constraint_slopes(system), constraint_rates(system)
     return Constraints(
-        formulas=tuple(map(format_expression, system.constraints)),
+        formulas=tuple(map(system.text_of, system.constraints)),
         kernel=system_kernel(
             system,
             "constraints",

@@ -77,8 +77,8 @@ def lower(
     polynomial = method.exactness.curve != 0
     return Program(
         prefix=prefix,
-        title=_comment(f"{system.name}: {method.title}"),
-        notes=_notes(method, system),
+        title=comment_text(f"{system.name}: {method.title}"),
+        notes=notes_of(method, system),
         coordinate_names=tuple(q.name for q in system.coordinates),
         parameter_names=tuple(parameter.name for parameter in system.parameters),
         parameter_defaults=system.defaults,
@@ -101,7 +101,9 @@ def lower(
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(
-            MomentumMap(name=_comment(each.name), formula=_comment(each.formula), exact=method.exactness.keeps(each))
+            MomentumMap(
+                name=comment_text(each.name), formula=comment_text(each.formula), exact=method.exactness.keeps(each)
+            )
             for each in symmetries
         ),
         momentum_kernel=_momentum_kernel(system, symmetries),
@@ -218,13 +220,13 @@ def _meetings(families: Sequence[Family]) -> list[tuple[int, int]]:
     return [pair for family in families for block in family.blocks for pair in block.entries]
 
 
-def _comment(text: str) -> str:
+def comment_text(text: str) -> str:
     """One printable line that neither ends nor begins a C comment."""
     line = "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
     return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")
 
 
-def _notes(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
+def notes_of(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
     order = "no order claimed" if method.order is None else f"order {method.order}"
     return (
         order,

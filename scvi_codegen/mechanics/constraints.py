@@ -21,7 +21,6 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.formulas.tape import Tape
-from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.mechanics.regularity import row_rank, sample_points
 
 if TYPE_CHECKING:
@@ -42,10 +41,11 @@ __all__ = [
 
 
 def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
-    """The g of a list of formulas; what is written ``left = right`` is left - right."""
+    """The g of a list of formulas; of an equation, ``left = right`` or SymPy's ``Eq``, left - right."""
     found = []
     for formula in given or ():
-        sides = formula.split("=") if isinstance(formula, str) else [formula]
+        equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
+        sides = formula.split("=") if isinstance(formula, str) else equation
         if len(sides) > 2:
             raise SystemDefinitionError(f"the constraint '{formula}' has more than one '='")
         found.append(read(sides[0]) - read(sides[1]) if len(sides) == 2 else read(formula))
@@ -54,7 +54,7 @@ def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> 
 
 def check_constraints(system: MechanicalSystem) -> None:
     """Raise :class:`SystemDefinitionError` for constraints of nothing, that depend on others, or bend velocities."""
-    names = [format_expression(g) for g in system.constraints]
+    names = list(map(system.text_of, system.constraints))
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
             raise SystemDefinitionError(f"there is no coordinate in the constraint '{name}'")

@@ -21,10 +21,10 @@ from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.tape import evaluate
-from scvi_codegen.formulas.translation import Translation
-from scvi_codegen.kinds import MAPPING, NAMES, TEXT, of, takes
+from scvi_codegen.formulas.translation import Translation, given_expression
+from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, of, takes
 from scvi_codegen.mechanics.forces import forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
+from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -104,7 +104,7 @@ class HamiltonianSystem(MechanicalSystem):
         -p**2/2 + p*q_dot + cos(q)
         """
         names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
-        values = {**(parameters or {}), **input_parameters(inputs)}
+        values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs), names)
         symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values, *inputs]}
         variables = tuple(symbols[given] for given in coordinates)
@@ -126,6 +126,15 @@ class HamiltonianSystem(MechanicalSystem):
         )
 
     @classmethod
+    @takes(
+        SystemDefinitionError,
+        name=TEXT,
+        coordinates=FORMULAS,
+        momenta=FORMULAS,
+        parameters=MAPPED,
+        forces=MAPPED,
+        inputs=FORMULAS,
+    )
     def from_sympy(
         cls,
         *,
@@ -152,15 +161,18 @@ class HamiltonianSystem(MechanicalSystem):
             forces: expression by coordinate, in coordinates, momenta and time.
             inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
-        if not isinstance(hamiltonian, Expr):
-            raise SystemDefinitionError(
-                f"the Hamiltonian is a {type(hamiltonian).__name__}, not a SymPy expression (text goes to from_text)"
-            )
+        hamiltonian = given_expression(hamiltonian, "Hamiltonian")
+        acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
         own = tuple(given_name(each) for each in inputs)
-        given = named_parameters(parameters) | input_parameters(own)
-        beside = tuple(sympy.sympify(f) for f in (forces or {}).values())
+        given = with_inputs(named_parameters(parameters), own)
         translation = Translation(
-            hamiltonian, coordinates, beside, momenta=momenta, time=time, parameters=tuple(given), inputs=own
+            hamiltonian,
+            coordinates,
+            tuple(acting.values()),
+            momenta=momenta,
+            time=time,
+            parameters=tuple(given),
+            inputs=own,
         )
         driven = input_formulas(own, symbol(TIME))
         return cls(
@@ -173,8 +185,8 @@ class HamiltonianSystem(MechanicalSystem):
             hamiltonian=translation.apply(hamiltonian, "Hamiltonian").xreplace(driven),
             forces=forces_by_coordinate(
                 translation.coordinates,
-                {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
-                lambda given: translation.apply(sympy.sympify(given), "forces").xreplace(driven),
+                {translation.rules.get(q, q): f for q, f in acting.items()},
+                lambda given: translation.apply(given, "forces").xreplace(driven),
             ),
             inputs=own,
         )

@@ -14,9 +14,10 @@ from collections.abc import Mapping, Sequence
 
 from sympy import Basic, Expr, Integer, Symbol
 
+from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import check_name, symbol
 
-__all__ = ["PARTS", "input_formulas", "input_parameters", "inputs_by_name"]
+__all__ = ["PARTS", "input_formulas", "input_parameters", "inputs_by_name", "with_inputs"]
 
 PARTS = ("0", "1", "2", "3", "t")
 """Of an input: coefficients by power, and the breakpoint that they count from."""
@@ -27,6 +28,21 @@ def input_parameters(inputs: Sequence[str]) -> dict[str, float]:
     for name in inputs:
         check_name(name)
     return {f"{name}_{part}": 0.0 for name in inputs for part in PARTS}
+
+
+def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[str, float]:
+    """Default values of parameters, and of those that inputs are made of.
+
+    Raises:
+        SystemDefinitionError: for a parameter that is called as a part of an input.
+    """
+    parts = input_parameters(inputs)
+    for name in parameters:
+        if name in parts:
+            raise SystemDefinitionError(
+                f"'{name}' is the name of both parameter '{name}' and a part of the input '{name[:-2]}': rename one"
+            )
+    return {**parameters, **parts}
 
 
 def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]:

@@ -12,11 +12,11 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
-from scvi_codegen.formulas.translation import Translation
-from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, Kind, takes
+from scvi_codegen.formulas.translation import Translation, given_expression
+from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, Kind, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, input_parameters
+from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LagrangianSystem"]
 
+LAGRANGES_METHOD = Kind("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
 KANES_METHOD = Kind("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
 BODIES = Kind("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
@@ -114,7 +115,7 @@ class LagrangianSystem(MechanicalSystem):
         >>> oscillator.lagrangian, oscillator.forces
         (-k*x**2/2 + m*x_dot**2/2, (-c*x_dot + cos(t),))
         """
-        values = {**(parameters or {}), **input_parameters(inputs)}
+        values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs))
         velocities = [coordinate + DOT for coordinate in coordinates]
         names = [*coordinates, *velocities, TIME, *values, *inputs]
@@ -138,6 +139,16 @@ class LagrangianSystem(MechanicalSystem):
         )
 
     @classmethod
+    @takes(
+        SystemDefinitionError,
+        name=TEXT,
+        coordinates=FORMULAS,
+        velocities=FORMULAS,
+        parameters=MAPPED,
+        forces=MAPPED,
+        constraints=FORMULAS,
+        inputs=FORMULAS,
+    )
     def from_sympy(
         cls,
         *,
@@ -167,24 +178,23 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by symbol, by name, or by a function of time that stays constant.
             forces: expression by coordinate, as the coordinate is given or by its name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
-            constraints: expressions in coordinates, time and, linearly, velocities that stay 0.
+            constraints: expressions in coordinates, time and, linearly, velocities that stay 0, or equations ``Eq``.
             inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
-        if not isinstance(lagrangian, Expr):
-            raise SystemDefinitionError(
-                f"the Lagrangian is a {type(lagrangian).__name__}, not a SymPy expression (text goes to from_text)"
-            )
+        lagrangian = given_expression(lagrangian, "Lagrangian")
+        acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        friction = None if dissipation is None else given_expression(dissipation, "dissipation")
+        bound = constraints_of(constraints, lambda g: given_expression(g, "constraint"))
         own = tuple(given_name(each) for each in inputs)
-        given = named_parameters(parameters) | input_parameters(own)
-        bound = tuple(sympy.sympify(g) for g in constraints)
-        beside = (*(sympy.sympify(f) for f in (*(forces or {}).values(), dissipation or 0)), *bound)
+        given = with_inputs(named_parameters(parameters), own)
+        beside = (*acting.values(), *(() if friction is None else (friction,)), *bound)
         translation = Translation(
             lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given), inputs=own
         )
         driven = input_formulas(own, symbol(TIME))
 
-        def read(given: Any, what: str = "Lagrangian") -> Expr:
-            return translation.apply(sympy.sympify(given), what).xreplace(driven)
+        def read(given: Expr, what: str = "Lagrangian") -> Expr:
+            return translation.apply(given, what).xreplace(driven)
 
         return cls(
             name=name,
@@ -195,8 +205,8 @@ class LagrangianSystem(MechanicalSystem):
             lagrangian=read(lagrangian),
             forces=_forces(
                 translation.coordinates,
-                {translation.rules.get(q, q): f for q, f in (forces or {}).items()},
-                dissipation,
+                {translation.rules.get(q, q): f for q, f in acting.items()},
+                friction,
                 lambda given: read(given, "forces"),
             ),
             constraints=constraints_of(bound, lambda given: read(given, "constraints")),
@@ -204,6 +214,7 @@ class LagrangianSystem(MechanicalSystem):
         )
 
     @classmethod
+    @takes(SystemDefinitionError, method=LAGRANGES_METHOD)
     def from_lagranges_method(
         cls,
         method: LagrangesMethod,

@@ -218,9 +218,10 @@ class MechanicalSystem(ABC):
                 )
         if self.time.name != TIME:
             raise SystemDefinitionError(f"time is called '{TIME}', not '{self.time}': build systems with from_sympy")
-        check_names(
-            *([given.name for given in group] for group in (self.coordinates, self.parameters, self.auxiliaries))
+        coordinates, parameters, momenta = (
+            [given.name for given in group] for group in (self.coordinates, self.parameters, self.auxiliaries)
         )
+        check_names(coordinates, [*parameters, *self.inputs], momenta)
         if len(self.defaults) != len(self.parameters):
             raise SystemDefinitionError(
                 f"{len(self.parameters)} parameters, but {len(self.defaults)} default values: give one each"

@@ -34,7 +34,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.models.csv_tables import parse_table
-from scvi_codegen.models.model import Model
+from scvi_codegen.models.model import Model, real
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.stepper import Stepper
@@ -168,19 +168,13 @@ def _axis(value: Any, where: str) -> Array:
     return np.array([real(item, where) for item in values])
 
 
-def real(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ModelFileError(f"{where} must be a finite number, not {value!r}")
-    return float(value)
-
-
 def _read_table(text: str, check: Check) -> dict[str, Array]:
     return parse_table(text, check).columns
 
 
 def _check_names(model: Model, names: Sequence[str]) -> None:
     coordinates = [coordinate.name for coordinate in model.system.coordinates]
-    parameters = [symbol.name for symbol in model.system.parameters]
+    parameters = list(model.parameters)
     velocities, momenta = [f"{name}_dot" for name in coordinates], [f"p_{name}" for name in coordinates]
     known = [*coordinates, *velocities, *momenta, *parameters]
     for name in names:

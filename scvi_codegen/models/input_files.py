@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import ModelFileError
+from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.models.csv_tables import CsvTable, parse_table
 from scvi_codegen.models.input_tables import InputTable
 from scvi_codegen.models.model import real
+from scvi_codegen.native.arguments import real_array
 
 __all__ = ["read_input"]
 
@@ -111,8 +112,8 @@ def _read_npz(path: Path) -> CsvTable:
     """Its arrays of one axis as columns."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            columns = {name: np.asarray(arrays[name], dtype=float) for name in arrays}
-    except (zipfile.BadZipFile, ValueError, TypeError) as error:
+            columns = {name: real_array(arrays[name], name) for name in arrays}
+    except (zipfile.BadZipFile, StateError, ValueError, TypeError) as error:
         raise ModelFileError(f"it holds no arrays of numbers: {error}") from error
     count = columns[TIME].size if TIME in columns else 0
     return CsvTable({name: values for name, values in columns.items() if values.shape == (count,)}, ())

@@ -10,7 +10,7 @@ import numpy as np
 from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.text import ExampleInput
-from scvi_codegen.runtime.driven import POWERS, input_of, parameters_at
+from scvi_codegen.runtime.driven import POWERS, entered, input_of, parameters_at
 
 __all__ = ["InputTable", "checked_tables", "tables_of_example"]
 
@@ -47,13 +47,13 @@ def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[s
 
 
 def tables_of_example(
-    system: MechanicalSystem, inputs: Mapping[str, InputTable], t: float
+    system: MechanicalSystem, inputs: Mapping[str, InputTable], span: tuple[float, float]
 ) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
-    """Inputs as C takes them, all or none, and all parameters at t."""
+    """Inputs as C takes them, all or none, and all parameters where a run over that span of time begins."""
     data = {name: input_of(name, tuple(inputs[name])) for name in system.inputs if inputs}
     tables = tuple(
         ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))
         for name, each in data.items()
     )
     names = [parameter.name for parameter in system.parameters]
-    return tables, tuple(parameters_at(names, np.array(system.defaults), data, t).tolist())
+    return tables, tuple(parameters_at(names, np.array(system.defaults), data, entered(*span)).tolist())

@@ -175,7 +175,11 @@ class Model:
 
     def parameters_at_start(self, stepper: Stepper) -> Mapping[str, float] | Array:
         """What the parameters are, those of inputs too where these are given."""
-        return self._driven(stepper)[1](self.t) if self.inputs else self.parameters
+        if not self.inputs:
+            return self.parameters
+        from scvi_codegen.runtime.driven import entered
+
+        return self._driven(stepper)[1](entered(self.t, self.end))
 
     def stretches(self, run: Run) -> Iterator[int | None]:
         """Has a run of this model ready for each stretch from breakpoint to breakpoint of its inputs, or for all of it.

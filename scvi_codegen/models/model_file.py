@@ -253,7 +253,7 @@ def _check_complete(document: Document) -> None:
 def _check_used(document: Document, parameters: Section) -> None:
     """Refuse a parameter laid over a system that knows none of that name."""
     section = document["system"]
-    formulas = [section.get(key, "") for key in FORMULAS]
+    formulas = [section.get(key, "") for key in (*FORMULAS, "monitor")]
     formula = " ".join(map(str, (*formulas, *document.get("forces", {}).values())))
     for name in parameters:
         if name not in re.findall(r"\w+", formula):

@@ -206,7 +206,7 @@ def _example(model: Model, *, controlled: bool) -> ExampleRun:
     if model.h is None and not controlled:
         raise MethodError(f"{model.method.name} has no steps that choose their length (tolerance): give a step h")
     given = model.all_inputs() if model.inputs else {}
-    inputs, parameters = tables_of_example(model.system, given, model.t)
+    inputs, parameters = tables_of_example(model.system, given, (model.t, model.end if given else model.t))
     momenta = model.p if model.p is not None else _momenta(model, parameters)
     if clock and model.ends_at_time:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))

@@ -27,6 +27,8 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
         rows = value if isinstance(value, list | tuple) else ()
         if np.ma.is_masked(given) or any(map(np.ma.is_masked, rows)):
             raise StateError(f"{name} has masked entries: fill them, or leave them out")
+        if given.dtype.kind == "O" and any(entry is None for entry in given.flat):
+            raise StateError(f"{name} must be real numbers, not None")
         if given.dtype.kind not in REAL_KINDS and given.size:
             raise StateError(f"{name} must be real numbers, not {given.dtype.name}")
         return np.array(given, dtype=np.float64, order="C", subok=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,11 +60,14 @@ def checked_options(options: SolverOptions | None) -> SolverOptions | None:
     return options
 
 
-def step_failure(status: int, report: Any, *, step: int, h: float, kept: object = None) -> StepFailedError:
-    """The exception for a failed step: which, when, how far the iteration was, what to try; ``kept`` is what it had."""
+def step_failure(
+    status: int, report: Any, *, step: int, h: float, kept: object = None, advice: Mapping[str, str] = ADVICE
+) -> StepFailedError:
+    """The exception for a failed step: which, when, by what h (0: its own), how far, what to try; what it ``kept``."""
     word = STATUS[status]
+    length = f" with h = {h:g}" if h else ""
     message = (
-        f"step {step} at t = {report.t:.17g} with h = {h:g} failed: {word} "
-        f"(last update {report.change:.3g}, {report.iterations} iterations in all); {ADVICE[word]}"
+        f"step {step} at t = {report.t:.17g}{length} failed: {word} "
+        f"(last update {report.change:.3g}, {report.iterations} iterations in all); {advice[word]}"
     )
     return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change, trajectory=kept)

@@ -16,6 +16,8 @@ __all__ = ["TOLERABLE_ERROR", "unwarned", "warn_of_long_steps"]
 TOLERABLE_ERROR: Final = 1e-3
 """Of a step, relative to the state: one that is wrong by more is too long for its motion."""
 
+CONTROLLED: Final = ", or steps that choose their length (t_end= with a tolerance)"
+
 _heard: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
 
 
@@ -42,7 +44,7 @@ def unwarned() -> Iterator[None]:
         _heard.reset(token)
 
 
-def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0) -> None:
+def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = CONTROLLED) -> None:
     """An :class:`AccuracyWarning` of the worst step of a run of h, unless one ``before`` was a reason for it."""
     error = trajectory.step_error
     controlled = trajectory.goal is not None and not trajectory.goal.tau
@@ -50,7 +52,7 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0) -> None:
         return
     warnings.warn(
         f"the step from t = {trajectory.step_error_t:g} with h = {trajectory.h:g} is too long: the relative error of "
-        f"its end is about {error:.1e}; take a shorter h, or steps that choose their length (t_end= with a tolerance)",
+        f"its end is about {error:.1e}; take a shorter h{remedy}",
         AccuracyWarning,
         stacklevel=3,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -10,10 +11,18 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import STATUS
-from scvi_codegen.runtime.inputs import Array, Parameters, checked_parameters, checked_states, checked_vector
+from scvi_codegen.runtime.inputs import (
+    Array,
+    Parameters,
+    checked_parameters,
+    checked_states,
+    checked_vector,
+    inputs_not_given,
+    missing_input,
+)
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["consistent", "constraint_values", "multipliers", "projected"]
+__all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "projected"]
 
 MOST_SHOWN = 4
 TYPED, NEAR = 1e-6, 1e-2
@@ -63,8 +72,11 @@ def consistent(
     """An initial state put on the constraints: silently by what rounding and typing explain, else with a warning.
 
     Raises:
-        StateError: if it is far off.
+        StateError: if it is far off, and where an input that constraints name is not given.
     """
+    for name in inputs_not_given(stepper.interface, parameters):
+        if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
+            raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     q1, p1, moved = projected(stepper, q0, p0, t, parameters)
     if moved <= 64 * np.finfo(float).eps:
@@ -81,6 +93,21 @@ def consistent(
         raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
     warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=4)
     return q1, p1
+
+
+def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
+    """Raise :class:`StateError` where a run at (q, p) is to go on with parameters that put its constraints elsewhere.
+
+    Rates may jump: momenta then do, by an impulse along the slopes of the constraints. Positions cannot.
+    """
+    moved = _relative(projected(stepper, q, p, t, parameters)[0] - q, q)
+    if moved > TYPED:
+        g = constraint_values(stepper, q, p, t, parameters)[0, 0]
+        k = int(np.abs(g).argmax())
+        raise StateError(
+            f"at t = {t:g} the constraint {stepper.constraints[k]} jumps to {g[k]:.3g}, which positions cannot follow: "
+            "inputs and parameters of constraints of positions change without jumps, as 'linear' and 'cubic' inputs do"
+        )
 
 
 def _of_constrained(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:

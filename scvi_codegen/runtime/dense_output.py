@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.clock import states_by_clock
 from scvi_codegen.runtime.goal import Goal
@@ -36,6 +36,7 @@ __all__ = [
     "states_at",
     "times_of_run",
     "whole_steps",
+    "within",
 ]
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
 
 def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array, Array]:
     """The same, and (n,) what steps are made of, tau or t."""
-    times = _within(times, states.t[0], states.t[-1])
+    times = within(times, states.t[0], states.t[-1])
     if states.tau is not None:
         _check_on_grid(states)
         return states_by_clock(states, times)
@@ -141,12 +142,9 @@ def _take_parts(states: KeptStates, t: Array, h: Array, q: Array, p: Array) -> N
 
 def checked_times(t: ArrayLike, name: str) -> Array:
     """Finite times, any shape; a copy."""
-    try:
-        times = np.array(t, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise StateError(f"{name} must be real numbers: {error}") from error
+    times = real_array(t, name)
     if not np.isfinite(times).all():
-        checked_number(float(times[~np.isfinite(times)][0]), f"a time in {name}")
+        checked_number(float(times[~np.isfinite(times)][0]), f"a number in {name}")
     return times
 
 
@@ -157,16 +155,16 @@ def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
         raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
     if (np.diff(times) * (t_end - t) < 0.0).any():
         raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
-    return _within(times, t, t_end)
+    return within(times, t, t_end)
 
 
-def _within(times: Array, first: float, last: float) -> Array:
+def within(times: Array, first: float, last: float) -> Array:
     """The times, those beyond an end by no more than rounding at it."""
     low, high = min(first, last), max(first, last)
     slack = ROUNDINGS * np.finfo(float).eps * max(abs(first), abs(last))
     outside = times[(times < low - slack) | (times > high + slack)]
     if outside.size:
-        raise StateError(f"t = {outside[0]:.17g} is outside of the states, which goes from {first:.17g} to {last:.17g}")
+        raise StateError(f"t = {outside[0]:.17g} is outside of the states, which go from {first:.17g} to {last:.17g}")
     return np.clip(times, low, high)
 
 

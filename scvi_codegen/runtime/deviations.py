@@ -94,7 +94,7 @@ class Deviations:
         return volume
 
     def sali(self) -> Array:
-        """(n,) the smaller alignment index, min(|u + v|, |u - v|) of the first two changes, of length 1.
+        """(n,) the smaller alignment index, the lesser length of u + v and u - v, the first two changes of length 1.
 
         Skokos, J. Phys. A 34 (2001) 10029.
         """

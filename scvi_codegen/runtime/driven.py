@@ -17,7 +17,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.inputs import Array, check_left_to_inputs
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -31,6 +31,7 @@ __all__ = [
     "checked_inputs",
     "drive",
     "end_of",
+    "entered",
     "input_of",
     "later",
     "parameters_at",
@@ -76,8 +77,9 @@ def checked_inputs(
     Raises:
         StateError: for names that are no inputs, inputs that are not given, and data that make no function of time.
     """
-    names = stepper.interface.inputs
-    given = dict(given or {})
+    names, given = stepper.interface.inputs, dict(given or {})
+    if stepper.interface.energy_parameter:
+        raise StateError("what moves in transformed time has no inputs: integrate(..., t_end=...) leads to a time")
     for name in given:
         if name not in names:
             raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
@@ -94,25 +96,43 @@ def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
             f"{name}=(t, values) or scipy.interpolate.CubicSpline(t, values)"
         )
     if hasattr(given, "c") and hasattr(given, "x"):
-        ascending = np.moveaxis(np.array(given.c, dtype=float)[::-1], 1, -1)
-        return _from_pieces(name, np.array(given.x, dtype=float), ascending, trajectories)
+        return _from_pieces(name, *_powers(name, given), trajectories)
     if not isinstance(given, tuple) or len(given) not in (2, 3):
         raise StateError(f"the input {name} is given as (t, values), or (t, values, 'cubic'), not {given!r:.60}")
     t, values = (
         checked_times(part, f"{what} of the input {name}") for part, what in zip(given, ("t", "values"), strict=False)
     )
     kind = given[2] if len(given) == 3 else "linear"
-    if kind not in KINDS:
+    if kind not in list(KINDS):
         raise StateError(f"the input {name} is {' or '.join(KINDS)} between its values, not {kind!r}")
     if t.ndim != 1 or len(t) < 2 or values.shape not in (t.shape, (trajectories, *t.shape)):
         rows = "" if trajectories is None else f", values also for each of {trajectories} trajectories"
         raise StateError(
             f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each{rows}"
         )
+    _check_ascending(name, t)
+    return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
+
+
+def _powers(name: str, given: Any) -> tuple[Array, Array]:
+    """Breakpoints and coefficients, ascending, of a piecewise polynomial of SciPy's; pieces of no length left out."""
+    from scipy.interpolate import PPoly  # here: slow to import
+
+    if not isinstance(given, PPoly):
+        raise StateError(
+            f"the input {name} is a {type(given).__name__}: give a PPoly, as PPoly.from_bernstein_basis of a BPoly"
+        )
+    x, c = (checked_times(given.x, f"x of the input {name}"), checked_times(given.c, f"c of the input {name}"))
+    long = np.diff(x) != 0.0
+    breakpoints = np.append(x[:-1][long], x[-1])
+    _check_ascending(name, breakpoints)
+    return breakpoints, np.moveaxis(c[::-1, long], 1, -1)
+
+
+def _check_ascending(name: str, t: Array) -> None:
     if (late := np.flatnonzero(np.diff(t) <= 0.0)).size:
         k = int(late[0])
         raise StateError(f"the times of the input {name} do not ascend: {t[k + 1]:g} after {t[k]:g}")
-    return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
 
 
 def _constant(t: Array, values: Array) -> Array:
@@ -208,12 +228,13 @@ class Stretch(NamedTuple):
 def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Stretch]:
     """By steps of h, and one that is shorter where a breakpoint or the end comes before theirs."""
     forward, now, found = np.sign(t_end - t), (t, 0.0), []
+    negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in _ends(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])
         if whole := int(np.floor((end - now[0]) / h + NEGLIGIBLE_STEP)):
             found.append(Stretch(whole, h, now, middle))
             now = later(now, h, whole)
-        if forward * (end - now[0]) > NEGLIGIBLE_STEP * abs(h):
+        if forward * (end - now[0]) > negligible:
             found.append(Stretch(1, end - now[0], now, middle))
             now = later(now, end - now[0], 1)
     return found
@@ -230,12 +251,13 @@ def with_end(piece: Trajectory, run: Run) -> Trajectory:
     """A stretch with the state that it ends at, whatever the number of that."""
     if piece.t[-1] == run.t or piece.ended_by is not None:
         return piece
+    iterations, run.iterations = run.iterations, 0
     return replace(
         piece,
         t=np.append(piece.t, run.t),
         q=np.append(piece.q, [run.q], axis=0),
         p=np.append(piece.p, [run.p], axis=0),
-        iterations=np.append(piece.iterations, np.int32(0)),
+        iterations=np.append(piece.iterations, np.int32(iterations)),
         lengths=np.append(piece.lengths, run.h),
     )
 
@@ -271,8 +293,14 @@ def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) ->
     return end
 
 
+def entered(t: float, t_end: float) -> float:
+    """A time in the pieces that a run from t to t_end begins in: going back from a breakpoint those before it."""
+    return float(np.nextafter(t, t_end))
+
+
 def parameters_of(stepper: Integrator, given: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:
     """The values of all parameters at a time, those of inputs by their pieces."""
+    check_left_to_inputs(stepper.interface, given)
     return partial(parameters_at, stepper.parameters, stepper._parameters(given), inputs)
 
 

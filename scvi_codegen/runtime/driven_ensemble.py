@@ -19,7 +19,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.driven import Input, Stretch, checked_inputs, later, parameters_at, planned
+from scvi_codegen.runtime.driven import Input, Stretch, checked_inputs, entered, later, parameters_at, planned
 from scvi_codegen.runtime.ensemble import Change, Ensemble, Portion
 from scvi_codegen.runtime.ensemble_states import (
     EnsembleParameters,
@@ -28,7 +28,7 @@ from scvi_codegen.runtime.ensemble_states import (
     parameters_of_each,
 )
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.inputs import Array, columns_of_inputs
+from scvi_codegen.runtime.inputs import Array, check_left_to_inputs, columns_of_inputs
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["DrivenEnsemble"]
@@ -73,6 +73,7 @@ class DrivenEnsemble(Ensemble):
         p: ArrayLike | None,
         *,
         inputs: Mapping[str, Any],
+        t_end: float,
         velocity: ArrayLike | None = None,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
@@ -83,9 +84,11 @@ class DrivenEnsemble(Ensemble):
             raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
         count = len(checked_ensemble(stepper, q, q)[0])
         data = checked_inputs(stepper, inputs, count)
-        start = parameters_at(stepper.parameters, parameters_of_each(stepper, parameters, count), data, t)
+        check_left_to_inputs(stepper.interface, parameters)
+        own, first = parameters_of_each(stepper, parameters, count), entered(t, t_end)
+        start = parameters_at(stepper.parameters, own, data, first)
         p = momenta_of_each(stepper, q, p, velocity, t, start)
-        return cls(stepper, q, p, data, t=t, parameters=start, **others)
+        return cls(stepper, q, p, data, t=t, t_end=t_end, parameters=start, **others)
 
     def row(self, step: int) -> int:
         """Of the first state kept that comes after ``step``."""

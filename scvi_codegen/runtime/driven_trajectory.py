@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled import to_dataset
 from scvi_codegen.kinds import MAPPING, PATH, takes
-from scvi_codegen.runtime.dense_output import checked_times
+from scvi_codegen.runtime.dense_output import checked_times, within
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.quantities import quantities
@@ -142,7 +142,8 @@ class DrivenTrajectory:
     def at(self, t: ArrayLike) -> tuple[Array, Array]:
         """States between those kept, as of :meth:`Trajectory.at`."""
         times = checked_times(t, "t")
-        flat, m = times.ravel(), self.stepper.dimension
+        first, last = self.pieces[0].t[0], self.pieces[-1].t[-1]
+        flat, m = within(times.ravel(), first, last), self.stepper.dimension
         q, p = np.empty((2, len(flat), m))
         forward = self.pieces[0].forward
         ends = forward * np.array([piece.t[-1] for piece in self.pieces])

@@ -17,6 +17,7 @@ __all__ = [
     "Array",
     "Parameters",
     "check_inputs_given",
+    "check_left_to_inputs",
     "checked_parameters",
     "checked_states",
     "checked_vector",
@@ -94,6 +95,13 @@ def check_inputs_given(interface: Interface, parameters: Any) -> None:
     """Raise :class:`StateError` where a step would take an input for 0 that nobody gave."""
     if missing := inputs_not_given(interface, parameters):
         raise missing_input(missing[0])
+
+
+def check_left_to_inputs(interface: Interface, parameters: Any) -> None:
+    """Raise :class:`StateError` for parameters, given by name, that the data of inputs say."""
+    for k in columns_of_inputs(interface):
+        if isinstance(parameters, Mapping) and (name := interface.parameters[k]) in parameters:
+            raise StateError(f"{name} is a part of the input {name[:-2]}, which is given as data: leave it out")
 
 
 def missing_input(name: str) -> StateError:

@@ -17,7 +17,7 @@ from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import unwarned
-from scvi_codegen.runtime.inputs import Parameters
+from scvi_codegen.runtime.inputs import Parameters, check_inputs_given
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -57,12 +57,13 @@ def longest_step(
         The step, with the sign of the span in transformed time, positive for a monitor.
 
     Raises:
-        StateError: for numbers out of range, and where no step is short enough.
+        StateError: for numbers out of range, inputs that are not given, and where no step is short enough.
         MethodError: for a method whose steps have no estimate of their error.
     """
     length, wanted = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0 or not 0.0 <= wanted < 1.0:
         raise StateError(f"a span of {length:g} with a tolerance of {wanted:g}: the one is not 0, the other in [0, 1)")
+    check_inputs_given(stepper.interface, parameters)
     monitored, end = bool(stepper.interface.monitor), t + length
     start = partial(stepper.start, q, p, t=t, t_end=end if monitored else None, options=options)
     first = abs(length) if monitored else length

@@ -8,9 +8,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
+from scvi_codegen.runtime.constraints import check_reachable
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import (
     Array,
@@ -137,16 +139,18 @@ class Memory:
 
         Args:
             parameters: by name, others staying what they are; or all in order.
+
+        Raises:
+            StateError: for names and numbers that are none, and where constraints of positions would jump.
         """
         interface = self.stepper.interface
-        if parameters is not None:
-            missing = inputs_not_given(interface, parameters)
-            self._awaited = tuple(name for name in self._awaited if name in missing)
+        missing = inputs_not_given(interface, parameters)
         if isinstance(parameters, Mapping):
-            values = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
-            parameters = {**values, **parameters}
+            known = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
+            parameters = {**known, **parameters}
         if parameters is not None:
-            self._parameters = checked_parameters(interface, parameters)
+            self._go_on_with(checked_parameters(interface, parameters))
+            self._awaited = tuple(name for name in self._awaited if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
             self._memory.h, self._memory.guess = h, 0
         if goal is not None:
@@ -157,14 +161,21 @@ class Memory:
 
         >>> run.hold(u=-1.5); run.skip(10)  # doctest: +SKIP
         """
-        names = self.stepper.interface.inputs
+        names, values = self.stepper.interface.inputs, self._parameters.copy()
         for name, value in inputs.items():
             if name not in names:
                 raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
             first = parameter_index(self.stepper.interface, f"{name}_0")
-            self._parameters[first : first + 5] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
+            values[first : first + 5] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
+        self._go_on_with(values)
         if self._awaited:
             self._awaited = tuple(name for name in self._awaited if name not in inputs)
+
+    def _go_on_with(self, values: Array) -> None:
+        """These values of the parameters, unless constraints of positions jump with them."""
+        if self.stepper.interface.constraints:
+            check_reachable(self.stepper, self.q, self.p, self.t, values)
+        self._parameters = values
 
     @property
     def steps(self) -> int:
@@ -202,10 +213,10 @@ class Memory:
         self.stepper.binding.buffer(self._memory)[:] = saved
 
     def skip(self, steps: int) -> None:
-        """Advance by ``steps`` and keep nothing."""
-        nothing = np.empty(0)
-        never = self.steps + steps + 1
-        status, report = self.advance(steps, never, nothing, nothing, nothing, np.empty(0, dtype=np.int32))
+        """Advance by ``steps``, no more than lead to the goal, and keep nothing."""
+        nothing, count = np.empty(0), checked_count(steps, "steps", least=0)
+        never = self.steps + count + 1
+        status, report = self.advance(count, never, nothing, nothing, nothing, np.empty(0, dtype=np.int32))
         if status:
             raise step_failure(status, report, step=self.steps, h=self.h)
 
@@ -248,6 +259,15 @@ class Memory:
             binding.workspace(),
         )
         return status, report
+
+    @property
+    def iterations(self) -> int:
+        """Since the last state that was kept; the next one has these, too."""
+        return int(self._memory.iterations)
+
+    @iterations.setter
+    def iterations(self, count: int) -> None:
+        self._memory.iterations = count
 
     @property
     def arrived(self) -> bool:

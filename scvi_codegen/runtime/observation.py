@@ -86,7 +86,10 @@ class Observation:
                 progress(done)
             elapsed = max(time.perf_counter() - began, 1e-6)
             portion = max(1, min(most, 2 * size, int(size * SLICE_SECONDS / elapsed)))
-        return self.trajectory()
+        found = self.trajectory()
+        if self.times is None and not self.ended:
+            self.run.iterations = self.iterations - int(found.iterations.sum())
+        return found
 
     def _portion(self, size: int) -> None:
         """A portion of the run, its events and what is kept of it; a step that fails after a terminal event is none."""

@@ -79,7 +79,7 @@ class PeriodicOrbit:
 
     @property
     def reciprocal_error(self) -> float:
-        """How far the sizes of the multipliers are from pairs s, 1/s: the largest |s s' - 1|; of symplectic steps."""
+        """How far sizes of multipliers are from the pairs s, 1/s of symplectic steps: the largest of s s' - 1."""
         sizes = np.abs(self.multipliers)
         return float(np.abs(sizes * sizes[::-1] - 1.0).max())
 

@@ -21,7 +21,7 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, parameters_of
+from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, entered, parameters_of
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensembles import Ensembles
 from scvi_codegen.runtime.events import Event, EventLike
@@ -189,7 +189,7 @@ class Stepper(Ensembles):
         """
         stepper = self if events is None else self.with_events(events)
         data = checked_inputs(self, inputs)
-        end = end_of(t, h, steps, t_end)
+        end = end_of(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         run = stepper.start(
             q,
@@ -199,7 +199,7 @@ class Stepper(Ensembles):
             t=t,
             t_end=end if h is None or self.interface.monitor else None,
             tolerance=tolerance,
-            parameters=values(t),
+            parameters=values(entered(t, end)),
             options=options,
         )
         return drive(run, data, end, every=checked_count(every, "every", least=1), values=values, progress=progress)

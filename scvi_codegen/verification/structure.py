@@ -146,9 +146,9 @@ def _carried_back(subject: Subject, back: State, rounding: Array) -> Array:
 
 def _momentum(subject: Subject, k: int) -> Finding:
     """The k-th momentum map along a run."""
-    given = subject.given
+    given, stepper = subject.given, subject.stepper
     try:
-        run = subject.stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t)
+        run = stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t, parameters=stepper.defaults)
     except StepFailedError as failure:
         run = Trajectory.before(failure)
         if len(run) <= TRIED:

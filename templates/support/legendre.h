@@ -36,6 +36,19 @@ static int transform(real t, const real *q, const real *x, const real *parameter
   return OK;
 }
 
+/* What of a misfit may be rounding: of y, and of the terms with x that cancel others in it, as of a charge at p = 0. */
+static real rounding_of_terms(const real *y, const real *x, const real *slope)
+{
+  real terms[M], largest = 0;
+  for (int i = 0; i < M; i++)
+    terms[i] = MATH(fabs)(y[i]);
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    terms[MASS_ENTRY[e][0]] += MATH(fabs)(slope[e] * x[MASS_ENTRY[e][1]]);
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, terms[i]);
+  return TRANSFORM_ROUNDING * largest;
+}
+
 /* Newton's iteration for y(q, x) = y from the x in u, halving updates that leave the domain or do not bring y nearer.
  * */
 static int invert_from(real t, real *u, const real *y, const real *parameters, real *mass)
@@ -45,17 +58,16 @@ static int invert_from(real t, real *u, const real *y, const real *parameters, r
   transform_and_slopes(t, u, parameters, value, mass);
   misfit = largest_misfit(value, y);
   for (int k = 0; k < MAX_ITERATIONS; k++) {
-    real scale = 1, nearer, start[M], roundoff = 0;
+    real scale = 1, nearer, start[M];
+    const real roundoff = rounding_of_terms(y, u + M, mass + band_size(&shape));
     if (!all_finite(value, M) || !all_finite(mass, (int)band_size(&shape)))
       return NOT_FINITE;
     if (misfit == 0)
       return OK;
     if (!factorise(mass, &shape, pivot))
       return SINGULAR;
-    for (int i = 0; i < M; i++) {
+    for (int i = 0; i < M; i++)
       update[MASS_PLACE[i]] = y[i] - value[i];
-      roundoff = larger(roundoff, TRANSFORM_ROUNDING * MATH(fabs)(y[i]));
-    }
     back_substitute(mass, &shape, pivot, update);
     memcpy(start, u + M, sizeof(real) * M);
     do {

@@ -1,6 +1,7 @@
 """``scvi-codegen run`` of a system with inputs: its tables, its files, what it refuses, and where it stops."""
 
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -65,6 +66,8 @@ def test_a_run_is_that_of_drive_and_its_file_too(model):
     assert Path("run.png").stat().st_size > 1000
     assert "24 steps of 0.1 from t = 0 to t = 2.3" in text  # one more than without a breakpoint within a step
     assert "in the digits that a second run confirms" in text
+    told = [re.search(r"[\d.]+ iterations a step", each)[0] for each in (text, output_of())]
+    assert told[0] == told[1]
 
 
 def test_inputs_of_the_command_line_replace_those_of_the_file(model):
@@ -114,6 +117,12 @@ def test_an_ensemble_of_them(model):
     assert f"it changed by {changes:.3g} at most" in text
     Path("pushed.toml").write_text(MODEL.replace("step = 0.1", "tolerance = 0.0"))
     assert "give a step h" in invoke("--ensemble", "many.csv").stderr
+
+
+def test_no_steps_and_columns_that_inputs_say():
+    assert "0 steps of 0.1 from t = 0 to t = 0; 1 state kept" in output_of("--steps", "0")
+    Path("many.csv").write_text("q,u_0\n0.1,5\n")
+    assert "'u_0' is no coordinate" in invoke("--ensemble", "many.csv").stderr
 
 
 def test_an_input_that_is_not_given():

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import oracle
 import pytest
-from samples import driven_duffing, pumped_cart_pole
+from samples import driven_duffing, linkage, pumped_cart_pole, pushed_pendulum
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.exact.discrete_lagrangian import exact_discrete_lagrangian, exact_map
@@ -184,6 +184,8 @@ def test_equilibrium_stays():
         (lambda: exact_map(KEPLER, [1, 0], [0, 0], 2, digits=5), "take a smaller step"),
         (lambda: exact_map(KEPLER, [0, 0], [0, 1], 2, digits=5), "take a smaller step"),
         (lambda: exact_discrete_lagrangian(RELATIVISTIC, [0], [3], 2, digits=5), "give guess"),
+        (lambda: exact_map(linkage(), [0, 1, 1.9, 1.5], [0] * 4, 1), "constraints hold 'four-bar linkage'"),
+        (lambda: exact_map(pushed_pendulum(), [0], [0], 1, parameters={"u_0": 1}), "the input w is not given"),
         (lambda: exact_discrete_lagrangian(RELATIVISTIC, [0], [0.1], 0.2, guess=[2], digits=5), "give guess"),
     ],
 )

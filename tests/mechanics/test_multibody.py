@@ -205,6 +205,8 @@ def test_masses_that_depend_on_coordinates_and_unknown_velocities_are_refused() 
 
 
 def test_loads_of_lagranges_method_need_a_frame() -> None:
+    with pytest.raises(SystemDefinitionError, match="method must be a LagrangesMethod"):
+        LagrangianSystem.from_lagranges_method(kanes_method(Q1), name="another")
     frame, point = ReferenceFrame("N"), Point("P")
     point.set_vel(frame, Q1.diff(T) * frame.x)
     options = {"forcelist": [(point, -C * Q1.diff(T) * frame.x)]}

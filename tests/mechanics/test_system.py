@@ -282,6 +282,20 @@ def test_refused_expressions(lagrangian: Any, message: str) -> None:
         ((Q1.diff(T) ** 2 - Symbol("q1"), Q1), {}, "different symbols"),
         ((V**2, sympy.Function("x")(X, T)), {}, "not a function of time"),
         ((sympy.Function("t")(T).diff(T) ** 2, sympy.Function("t")(T)), {}, "both"),
+        (
+            (KINETIC, X),
+            {"forces": {X: "E*x"}},
+            "the force on x is a str, not a SymPy expression",
+        ),  # SymPy's E is 2.718..
+        ((KINETIC, X), {"forces": {X: None}}, "the force on x is a NoneType"),
+        ((KINETIC, X), {"forces": [X]}, "forces must be a mapping"),
+        ((KINETIC, X), {"parameters": ["k"]}, "parameters must be a mapping"),
+        ((KINETIC, X), {"dissipation": "x_dot**2"}, "the dissipation is a str"),
+        ((KINETIC, X), {"constraints": X - 1}, "constraints must be a list"),
+        ((KINETIC, X), {"constraints": ["x = 1"]}, "the constraint is a str"),
+        ((KINETIC, X), {"constraints": [X < 1]}, "the constraint is a StrictLessThan"),
+        ((KINETIC, X), {"inputs": Symbol("u")}, "inputs must be a list"),
+        ((KINETIC, X), {"inputs": "uw"}, "inputs must be a list"),
     ],
     ids=str,
 )

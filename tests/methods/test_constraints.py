@@ -205,6 +205,34 @@ def test_parts_of_steps_events_and_chosen_steps():
     assert np.abs(run.events[0].q[:, 0]).max() < 1e-12
 
 
+def test_positions_do_not_follow_constraints_that_jump():
+    """A pendulum whose hook moves by data: a kink is an impulse, the same for all steps, and a jump is refused."""
+    system = LagrangianSystem.from_text(
+        name="hook",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["(x - u)**2 + y**2 = 1"],
+        inputs=["u"],
+    )
+    stepper, times = compile_stepper(system, lobatto(4)), [0.0, 1.0, 2.0]
+    given = {"q": [0.6, -0.8], "velocity": [0.0, 0.0], "t_end": 1.5}
+    ends = [stepper.drive(**given, inputs={"u": (times, [0.0, 0.0, 0.3])}, h=h).q[-1] for h in (0.05, 0.02, None)]
+    assert_allclose(ends[1:], ends[:1] * 2, atol=1e-9)
+    jumping = {"u": (times, [0.0, 0.3, 0.3], "constant")}
+    for h in (0.05, None):
+        with pytest.raises(StateError, match=r"at t = 1 the constraint y\*\*2 \+ \(-u \+ x\)\*\*2 - 1 jumps to -0\.12"):
+            stepper.drive(**given, inputs=jumping, h=h)
+    with pytest.raises(StateError, match=r"at t = 1 the constraint .* jumps"):
+        stepper.drive_ensemble([given["q"]], velocity=[given["velocity"]], inputs=jumping, h=0.05, t_end=1.5)
+    with pytest.raises(StateError, match="the input u is not given"):
+        stepper.start(given["q"], velocity=given["velocity"], h=0.05)
+    run = stepper.start(given["q"], velocity=given["velocity"], h=0.05, parameters={"u_0": 0.0})
+    for go_on in (lambda: run.hold(u=0.3), lambda: run.change(parameters={"u_0": 0.3})):
+        with pytest.raises(StateError, match=r"at t = 0 the constraint .* jumps"):
+            go_on()
+        assert run.parameters[0] == 0.0
+
+
 def test_from_sympy_and_from_lagranges_method():
     x, y = dynamicsymbols("x y")
     t, m, length = dynamicsymbols._t, sympy.Symbol("m"), sympy.Symbol("l")
@@ -216,6 +244,8 @@ def test_from_sympy_and_from_lagranges_method():
         LagrangesMethod(L, [x, y], hol_coneqs=[g]), name="rod", parameters=values
     )
     assert one == other
+    given = {"name": "rod", "lagrangian": L, "coordinates": [x, y], "parameters": values}
+    assert one == LagrangianSystem.from_sympy(**given, constraints=[sympy.Eq(x**2 + y**2, length**2)])
     assert one.constraints == rod().with_parameters(m=2.0).constraints
 
 

@@ -1,6 +1,7 @@
 """Inputs of models: from tables written out or in files, written and read again, and what is said of faulty ones."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,7 +71,10 @@ def test_momenta_are_those_with_the_inputs_at_the_start():
     model = Model(
         system=system, method="svi:2", q=(0.0,), velocity=(3.0,), h=0.1, span=0.5, t=1.0, inputs={"u": ([0, 2], [0, 2])}
     )
-    assert_allclose(model.momenta(compile_stepper(system, model.method)), [6.0])
+    stepper = compile_stepper(system, model.method)
+    assert_allclose(model.momenta(stepper), [6.0])
+    back = replace(model, h=-0.1, inputs={"u": ([0.0, 1.0, 2.0], [1.0, 4.0, 4.0], "constant")})
+    assert_allclose(back.momenta(stepper), [6.0])
 
 
 @pytest.mark.parametrize(
@@ -144,6 +148,7 @@ def test_what_is_said_of_a_faulty_table(file, table, said):
         ({"t": [0.0, 1.0], "u": [0.0, 1.0, 2.0]}, "no column u or value"),
         ({"u": [0.0, 1.0]}, "no column t"),
         ({"t": [0.0, 1.0], "u": ["a", "b"]}, "no arrays of numbers"),
+        ({"t": [0.0, 1.0], "u": [0.0, 1j]}, "u must be real numbers, not complex128"),
     ],
 )
 def test_what_is_said_of_a_faulty_archive(file, arrays, said):

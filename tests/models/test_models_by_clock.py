@@ -46,6 +46,9 @@ def test_a_step_for_another_time_is_not_taken_over(model: sc.Model) -> None:
     text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
     assert parse_model(text, {"system": {"monitor": "frequency"}}).h is None
     assert parse_model(text, BY_CLOCK) == model
+    with_a = text.replace("[parameters]", "[parameters]\na = 1.0")
+    layer = {"system": {"monitor": "1/(a + q1**2)"}, "parameters": {"a": 2.0}}
+    assert parse_model(with_a, layer).parameters["a"] == 2.0
     assert parse_model(dump_model(model)).h == 0.2
     with pytest.raises(ModelFileError, match="not known before"):
         _ = model.step_count

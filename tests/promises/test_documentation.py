@@ -1,6 +1,7 @@
 """The pages of ``docs``: their code runs, links lead somewhere, all that is public is named, and the site builds.
 
-What ``docs/extending.md`` adds is run in ``test_seams.py``.
+What ``docs/extending.md`` adds is run in ``test_seams.py``, what ``docs/frameworks.md`` shows in
+``frameworks/test_page_lines.py``.
 """
 
 from __future__ import annotations
@@ -16,16 +17,21 @@ from typing import Any
 
 import pytest
 from browsing import UNREADABLE, VIEWS, looked_at
-from pages import BLOCK, ROOT, run_page, runnable
+from pages import BLOCK, ROOT, agree, run_command, run_page, runnable
 
 import scvi_codegen
 
 DOCS = ROOT / "docs"
 PAGES = {str(path.relative_to(DOCS)): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))}
-RUN = [name for name, page in PAGES.items() if name != "extending.md" and any(runnable(page))]
+ELSEWHERE = ("extending.md", "frameworks.md")
+RUN = [name for name, page in PAGES.items() if name not in ELSEWHERE and any(runnable(page))]
+MINUTES = "scvi-codegen reproduce all"
+"""Takes minutes of processor time."""
+PICTURE = re.compile(r"!\[[^]]+\]\((\w+\.svg)\)")
+"""One that the code of a page draws."""
 PEERS = ("heyoka", "rebound")
 """Libraries that a page may show beside this one, and without which it is skipped."""
-SHOWN = {"python", "console", "sh", "toml", "c", "julia", "diff"}
+SHOWN = {"python", "text", "console", "sh", "toml", "c", "julia", "diff"}
 """Languages of blocks."""
 
 
@@ -69,6 +75,27 @@ def test_every_page_is_in_a_table_of_contents():
     assert listed == set(PAGES)
 
 
+def test_numbers_that_a_page_prints_agree_with_those_on_it():
+    agree("period 6.325, kept to 3e-14, after 12 steps", "period 6.326, kept to 2e-15, after 12 steps\n")
+
+
+@pytest.mark.parametrize(("said", "printed"), [("1.234", "1.237"), ("12", "13"), ("3e-14", "4e-13"), ("x 1", "y 1")])
+def test_numbers_that_do_not_are_found(said, printed):
+    with pytest.raises(AssertionError, match=r"is said|said\n"):
+        agree(said, printed)
+
+
+def test_pages_of_the_gallery_have_a_light_picture_what_they_print_and_a_source():
+    gallery = {name: page for name, page in PAGES.items() if Path(name).parent.name == "gallery"}
+    index = gallery.pop("gallery/index.md")
+    for name, page in gallery.items():
+        assert f"]({Path(name).name})" in index, name
+        assert [part.kind for part in runnable(page)].count("output") > 0, name
+        assert re.search(r"^Source: ", page, re.MULTILINE), name
+        [picture] = PICTURE.findall(page)
+        assert (DOCS / "gallery" / picture).stat().st_size < 150_000, name
+
+
 @pytest.mark.full
 @pytest.mark.usefixtures("as_users_compile")
 @pytest.mark.parametrize("name", RUN)
@@ -76,7 +103,17 @@ def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
     missing = [peer for peer in PEERS if peer in imported(PAGES[name]) and importlib.util.find_spec(peer) is None]
     if missing:
         pytest.skip(f"{missing[0]} is not installed: pip install 'scvi-codegen[bench]'")
-    run_page(name, list(runnable(PAGES[name])), tmp_path, monkeypatch)
+    parts = [part for part in runnable(PAGES[name]) if not part.text.startswith(MINUTES)]
+    run_page(name, parts, tmp_path, monkeypatch)
+    assert [picture for picture in PICTURE.findall(PAGES[name]) if not (tmp_path / picture).is_file()] == []
+
+
+@pytest.mark.full
+def test_the_paper_is_run_again_as_its_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    [command] = [part.text for part in runnable(PAGES["paper.md"]) if part.text.startswith(MINUTES)]
+    run_command(command)
+    assert (tmp_path / "paper.html").is_file()
 
 
 @pytest.fixture(scope="module")

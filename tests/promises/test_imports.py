@@ -20,13 +20,14 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors version
-    counts kinds
+    counts indices kinds
     tables files
     formulas display ir
     mechanics rendering
     methods native pictures
     lowering exact runtime
     compiler frameworks results
+    indexed_compiler
     derivation models advice verification
     benchmark reproduce
     package distributed __init__
@@ -206,19 +207,26 @@ sc.no_such_name
 """
 
 
-def test_a_type_checker_knows_them_and_the_code_of_the_readme(tmp_path):
+USE = ("systems", "symmetries", "forces", "inputs", "mechanisms", "steps")
+TYPED_PAGES = (*USE, "derivatives", "chaos", "fits", "ensembles", "long_runs")
+
+
+def test_a_type_checker_knows_them_and_the_code_of_the_pages(tmp_path):
     (tmp_path / "typed.py").write_text(TYPED)
-    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    (tmp_path / "readme.py").write_text("\n".join(blocks))
+    files = ["typed.py"]
+    for page in ("README.md", *(f"docs/{name}.md" for name in TYPED_PAGES)):
+        text = (PACKAGE.parent / page).read_text(encoding="utf-8")
+        files.append(f"{Path(page).stem}_page.py")
+        blocks = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        (tmp_path / files[-1]).write_text("\n".join(blocks))
     command = [sys.executable, "-m", "mypy", "--ignore-missing-imports", "--cache-dir", str(tmp_path / "cache")]
-    words = [*command, "typed.py", "readme.py"]
+    words = [*command, *files]
     lines = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout.splitlines()
     assert 'typed.py:3: note: Revealed type is "scvi_codegen.methods.galerkin.SVI"' in lines
     assert any(line.startswith("typed.py:4") and "scvi_codegen.runtime.stepper.Stepper" in line for line in lines)
     assert [line for line in lines if "error" in line] == [
         'typed.py:5: error: Module has no attribute "no_such_name"  [attr-defined]',
-        "Found 1 error in 1 file (checked 2 source files)",
+        f"Found 1 error in 1 file (checked {len(files)} source files)",
     ]
 
 

@@ -4,27 +4,17 @@ import re
 import subprocess
 
 import pytest
-from pages import BLOCK, PROGRAM, ROOT, run_command, run_page, runnable
+from pages import BLOCK, PROGRAM, ROOT, run_page, runnable
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-MINUTES = "scvi-codegen reproduce all"
-"""Takes minutes of processor time."""
 
 
 def test_the_readme_runs_from_top_to_bottom(tmp_path, monkeypatch):
     found = [part for part in runnable(README) if part.kind == "python" or part.text.startswith(PROGRAM)]
     assert {part.kind for part in found} == {"python", "command"}
-    run_page("README.md", [part for part in found if not part.text.startswith(MINUTES)], tmp_path, monkeypatch)
-
-
-@pytest.mark.full
-def test_the_paper_is_run_again_as_the_readme_says(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    [command] = [part.text for part in runnable(README) if part.text.startswith(MINUTES)]
-    run_command(command)
-    assert (tmp_path / "paper.html").is_file()
+    run_page("README.md", found, tmp_path, monkeypatch)
 
 
 def test_the_checks_use_the_commands_of_the_readme():

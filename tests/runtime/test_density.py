@@ -105,6 +105,47 @@ def test_a_run_that_turns_goes_back_on_its_own_steps(system):
     assert np.abs(back.q[::-1] - there.q).max() < 1e-11
 
 
+def off_the_monitor(run):
+    """How far lengths of whole steps are from h = tau g in their middle, of Kepler's orbit, tau = 0.1."""
+    t, lengths = run.t[:-2], run.lengths[:-2]
+    return np.abs(np.abs(lengths) / (0.1 * (run.at(t + lengths / 2)[0] ** 2).sum(axis=1)) - 1.0).max(initial=0.0)
+
+
+def test_steps_that_end_at_a_time_take_the_density_on_by_their_part():
+    """At breakpoints of inputs and where a run goes to and fro; by whole ones it would go on ahead of the motion."""
+    pushed = LagrangianSystem.from_text(
+        name="pushed",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)",
+        forces={"x": "u"},
+        inputs=["u"],
+    )
+    stepper = compile_stepper(pushed, SVI(6), monitor="x**2 + y**2", flags=QUICK_FLAGS)
+    start = {"q": [0.4, 0.0], "velocity": [0.0, 2.0], "h": 0.1}
+    for breakpoints in (2, 101, 401):
+        times = np.linspace(0.0, 40.0, breakpoints)
+        run = stepper.drive(**start, inputs={"u": (times, 0.0 * times)}, t_end=40.0)
+        assert max(map(off_the_monitor, run.pieces)) < 2e-3
+    run = stepper.start(**start, t_end=3.0, parameters={"u_0": 0.0})
+    for t_end in (3.0, -3.0) * 20:
+        run.goal = Goal(t_end=t_end, tau=0.1)
+        piece = run.record()
+    assert off_the_monitor(piece) < 2e-3
+
+
+def test_ways_of_driven_runs():
+    """Both of them by positive steps of tau, which have no number."""
+    system = LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
+    stepper = compile_stepper(system, SVI(2), monitor="1 + x**2", flags=QUICK_FLAGS)
+    given = {"inputs": {"u": ([0.0, 1.0, 2.0], [1.0, 2.0, 2.0], "constant")}, "h": 0.1}
+    there = stepper.drive([0.0], [0.0], **given, t_end=2.0)
+    assert there.q[-1, 0] == pytest.approx(2.5, abs=1e-14)
+    back = stepper.drive(there.q[-1], there.p[-1], **given, t=2.0, t_end=0.0)
+    assert np.abs([back.q[-1], back.p[-1]]).max() < 1e-14
+    with pytest.raises(StateError, match="have no number: give t_end"):
+        stepper.drive([0.0], [0.0], **given, steps=10)
+
+
 def test_invariants_are_kept_for_long():
     run = kepler(SVI(2)).integrate(*START, h=0.1, t_end=500 * PERIOD)
     error = run.energy() / run.energy()[0] - 1.0

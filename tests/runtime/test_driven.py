@@ -9,7 +9,7 @@ import sympy
 from numpy.testing import assert_allclose
 from samples import pushed_pendulum
 from scipy.integrate import solve_ivp
-from scipy.interpolate import Akima1DInterpolator, CubicSpline
+from scipy.interpolate import Akima1DInterpolator, BPoly, CubicSpline, PPoly, make_interp_spline
 
 from scvi_codegen import (
     SVI,
@@ -23,7 +23,11 @@ from scvi_codegen import (
     compile_stepper,
     hamiltonian_of,
     lagrangian_of,
+    periodic_orbit,
+    problem,
+    reparametrise,
 )
+from scvi_codegen.runtime.longest_step import longest_step
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
@@ -120,7 +124,8 @@ def test_from_sympy_and_what_scipy_gives():
         name="pushed", lagrangian=v**2 / 2, coordinates=[q], forces={"q": u}, inputs=[u]
     )
     stepper = compile_stepper(system, SVI(3))
-    for given in (CubicSpline(KNOTS, VALUES), Akima1DInterpolator(KNOTS, VALUES)):
+    of_knots = PPoly.from_spline(make_interp_spline(KNOTS, VALUES))  # with pieces of no length
+    for given in (CubicSpline(KNOTS, VALUES), Akima1DInterpolator(KNOTS, VALUES), of_knots):
         run = stepper.drive([0.0], [0.0], inputs={"u": given}, h=0.13, t_end=2.6)
         assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), atol=1e-14)
 
@@ -142,7 +147,12 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
     assert (fewer.q == full.q[kept]).all()
     assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
     assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
+    watched = stepper.drive([0.3], [0.1], **given, every=3, events="q")
+    assert (watched.iterations == fewer.iterations).all()
+    assert (np.diff(np.cumsum(full.iterations)[kept]) == fewer.iterations[1:]).all()
     assert len(stepper.drive([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
+    with pytest.raises(StateError, match=r"t = 3 is outside of the states, which go from 0 to 2\."):
+        full.at(3.0)
 
 
 def test_files_hold_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
@@ -194,11 +204,60 @@ def test_momentum_maps_with_inputs():
         ({"u": (KNOTS, [np.nan] * 6), "w": (KNOTS, VALUES)}, "nan"),
         ({"u": (KNOTS[:3], VALUES[:3]), "w": (KNOTS, VALUES)}, "is given from t = 0 to 0.9"),
         ({"u": 3.0, "w": (KNOTS, VALUES)}, r"\(t, values\)"),
+        ({"u": (KNOTS, VALUES, ["cubic"]), "w": (KNOTS, VALUES)}, "constant or linear or cubic"),
+        ({"u": (KNOTS, 1j * VALUES), "w": (KNOTS, VALUES)}, "real numbers, not complex128"),
+        ({"u": BPoly([[1.0], [2.0]], [0.0, 3.0]), "w": (KNOTS, VALUES)}, "from_bernstein_basis"),
+        ({"u": PPoly([[1j]], [0.0, 3.0]), "w": (KNOTS, VALUES)}, "real numbers, not complex128"),
+        ({"u": PPoly([[1.0, 2.0]], [3.0, 1.0, 0.0]), "w": (KNOTS, VALUES)}, "do not ascend: 1 after 3"),
     ],
 )
 def test_what_is_no_input(pendulum, inputs, said):
     with pytest.raises(StateError, match=said):
         compile_stepper(pendulum, SVI(2)).drive([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
+
+
+def test_velocities_at_a_breakpoint_are_those_of_the_pieces_that_follow():
+    """Also on the way back, in the first state of runs of all kinds."""
+    system = LagrangianSystem.from_text(
+        name="drawn", coordinates=["q"], lagrangian="q_dot**2/2 + u*q_dot - q**2/2", inputs=["u"]
+    )
+    stepper, inputs = compile_stepper(system, SVI(3)), {"u": ([0.0, 1.0, 2.0], [5.0, 7.0, 7.0], "constant")}
+    for t_end, u in ((0.0, 5.0), (2.0, 7.0)):
+        for h in (t_end - 1.0, None):
+            run = stepper.drive([0.2], velocity=[0.5], inputs=inputs, h=h, t=1.0, t_end=t_end)
+            assert (run.velocity[0, 0], run.p[0, 0]) == (0.5, 0.5 + u)
+        many = stepper.drive_ensemble([[0.2]], velocity=[[0.5]], inputs=inputs, h=t_end - 1.0, t=1.0, t_end=t_end)
+        assert many.p[0, 0, 0] == 0.5 + u
+
+
+def test_what_inputs_are_made_of_is_no_parameter_beside_them(pendulum):
+    stepper = compile_stepper(pendulum, SVI(2))
+    given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3, "parameters": {"u_0": 3}}
+    with pytest.raises(StateError, match="u_0 is a part of the input u"):
+        stepper.drive([0.3], [0.0], **given)
+    with pytest.raises(StateError, match="u_0 is a part of the input u"):
+        stepper.drive_ensemble([[0.3]], [[0.0]], **given)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "inputs", "said"),
+    [
+        ({"u_0": 5.0}, ["u"], "both parameter 'u_0' and a part of the input 'u'"),
+        ({"u": 5.0}, ["u"], "'u' is listed twice"),
+        ({}, ["u", "u"], "'u' is listed twice"),
+        ({}, ["u", "q_dot"], "the velocity of 'q'"),
+    ],
+)
+def test_names_of_inputs_are_no_others(parameters, inputs, said):
+    given = {"name": "s", "parameters": parameters, "inputs": inputs}
+    v, u = sympy.symbols("q_dot u")
+    for build in (
+        lambda: LagrangianSystem.from_text(coordinates=["q"], lagrangian="q_dot**2/2 + u", **given),
+        lambda: LagrangianSystem.from_sympy(coordinates=[sympy.Symbol("q")], lagrangian=v**2 / 2 + u, **given),
+        lambda: HamiltonianSystem.from_text(coordinates=["q"], hamiltonian="p_q**2/2 + u", **given),
+    ):
+        with pytest.raises(SystemDefinitionError, match=said):
+            build()
 
 
 def test_names_and_runs_without_an_end(pendulum):
@@ -207,6 +266,11 @@ def test_names_and_runs_without_an_end(pendulum):
         stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
     with pytest.raises(StateError, match="no input"):
         stepper.start([0.3], [0.0], h=0.1).hold(v=1.0)
+    with pytest.raises(StateError, match="input u must be real numbers, not None"):
+        stepper.start([0.3], [0.0], h=0.1).hold(u=None)
+    for steps, said in ((-1, "at least 0"), (2.5, "whole number"), ("3", "whole number")):
+        with pytest.raises(StateError, match=f"steps must be .*{said}"):
+            stepper.start([0.3], [0.0], h=0.1, parameters={"u_0": 0.0, "w_0": 0.0}).skip(steps)
     with pytest.raises(SystemDefinitionError, match="q"):
         LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + q", inputs=["q"])
 
@@ -217,6 +281,13 @@ def test_ways_that_lead_nowhere_and_a_run_of_no_time(pendulum):
         stepper.drive([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
     with pytest.raises(StateError, match=r"steps of h = -0.1 do not lead from t = 0 to t_end = 2"):
         stepper.drive([0.3], [0.0], inputs=inputs, h=-0.1, t_end=2.0)
+    assert (
+        stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, 0 * KNOTS)}, h=1e12, t_end=0.2).t[-1]
+        == 0.2
+    )
+    clocked = compile_stepper(reparametrise(problem("kepler").system, "frequency"), SVI(2))
+    with pytest.raises(StateError, match="transformed time has no inputs"):
+        clocked.drive([0.5, 0.0], [0.0, 1.7], inputs={}, h=0.1, t_end=2.0)
     for h in (0.1, None):
         still = stepper.drive([0.3], [0.2], inputs=inputs, h=h, t=1.0, t_end=1.0)
         assert (still.t.tolist(), still.q.tolist(), still.p.tolist()) == ([1.0], [[0.3]], [[0.2]])
@@ -232,6 +303,8 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
         lambda: stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 1.0}),
         lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
+        lambda: periodic_orbit(stepper, *state, period=6.0, steps=20),
+        lambda: longest_step(compile_stepper(pendulum, SVI(2), monitor="1 + q**2"), *state, 1.0),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], t_end=1.0),
     ):
         with pytest.raises(StateError, match=r"the input [uw] is not given"):

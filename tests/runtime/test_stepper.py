@@ -367,6 +367,17 @@ def test_momentum_and_velocity_are_inverse_and_the_oracles(sample, compiled, nam
     assert v == pytest.approx(expected.astype(float), abs=1e-14)
 
 
+def test_there_is_a_velocity_where_momenta_are_small_beside_their_terms(quickly_compiled):
+    """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
+    system = LagrangianSystem.from_text(
+        name="driven pivot", coordinates=["q"], lagrangian="q_dot**2/2 + 5.345*sin(q)*q_dot"
+    )
+    stepper = quickly_compiled(system, SVI(2))
+    q = np.linspace(0.05, 3.0, 500)[:, None]
+    for p in (np.zeros_like(q), -0.0024 * q):
+        assert stepper.velocity(q, p) == pytest.approx(p - 5.345 * np.sin(q), abs=2e-15)
+
+
 def test_there_is_no_velocity_beyond_the_range_of_the_momenta(compiled, sample):
     """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
     stepper = compiled("relativistic-particle", SVI(3))

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from faults import Mutation
 from mutations import MUTATIONS
 from sabotage import certified
-from samples import QUICK_FLAGS
+from samples import QUICK_FLAGS, pushed_pendulum
 
 from scvi_codegen import SVI, Certificate, verify
 from scvi_codegen.cli import main
@@ -108,6 +108,14 @@ def test_a_state_is_found_where_none_is_given() -> None:
     assert certificate.h > 0
     with pytest.raises(StateError, match="both q and p"):
         verify(problem("planar-pendulum").system, Gauss(2), [0.1], flags=QUICK_FLAGS)
+
+
+@pytest.mark.parametrize("method", [SVI(2), Gauss(2)], ids=lambda method: method.name)
+def test_inputs_are_certified_at_small_values(method) -> None:
+    """Nobody gives any: their parts are moved off 0 as all parameters are."""
+    certificate = verify(pushed_pendulum(), method, flags=QUICK_FLAGS)
+    assert certificate.passed, certificate.to_text()
+    assert len(certificate.checks) > 15
 
 
 def test_another_integrator_than_the_one_promised_is_not_certified() -> None:

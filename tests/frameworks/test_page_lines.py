@@ -1,4 +1,4 @@
-"""The README's lines on frameworks print what is known; without a library flows say which extra has it."""
+"""The lines of docs/frameworks.md print what is known; without a library flows say which extra has it."""
 
 import re
 import sys
@@ -12,14 +12,14 @@ from scipy.special import ellipk
 
 from scvi_codegen import SVI, MissingLibraryError, casadi_flow, compile_stepper, jax_flow, problem
 
-README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "frameworks.md").read_text(encoding="utf-8")
 LIBRARIES = {"jax": jax_flow, "casadi": casadi_flow}
 
 
 def printed(library, capfd):
     """The numbers that the block prints last."""
-    [block] = re.findall(rf"^```py\n(import {library}\n.*?)^```$", README, re.MULTILINE | re.DOTALL)
-    exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
+    [block] = re.findall(rf"^```python\n(import {library}\n.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    exec(compile(block, "frameworks.md", "exec"), {"__name__": "page"})
     last = capfd.readouterr().out.splitlines()[-1]
     return [float(number) for number in re.findall(r"-?\d+\.\d+", last)]
 

@@ -1,0 +1,365 @@
+"""Sums over indices: time at equal error beside hand-written C, SciPy and REBOUND; how time grows with their number."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.resources import files
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from scvi_codegen.benchmark.cases import Array
+from scvi_codegen.benchmark.contenders.contenders import OURS
+from scvi_codegen.benchmark.curves import Point, time_at
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods.composition import Composition, kicks_and_drifts
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.accuracy import unwarned
+
+__all__ = ["run_growth", "run_sums"]
+
+ERRORS = (1e-4, 1e-7, 1e-10)
+OWN = "composition"
+METHODS = ("svi:2", "svi:4", "svi:6", "svi:8")
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+DECLARATIONS = (
+    "void leapfrog(int is_field, double *q, double *v, double *work, long n, double strength, double h, long steps, "
+    "const double *kicks, const double *drifts, int leaps);"
+)
+GROWTH = (10**3, 10**4, 10**5, 10**6)
+SEED = 20261121
+
+
+class Lattice(NamedTuple):
+    """A problem: its system and start, how long it runs, steps to try, its accelerations by NumPy.
+
+    ``by_hand``: (is a field, places along an axis, strength) for the C by hand.
+    """
+
+    name: str
+    system: IndexedSystem
+    q: Array
+    v: Array
+    span: float
+    longest: float
+    accelerations: Callable[[Array], Array]
+    by_hand: tuple[int, int, float] | None
+    parameters: Mapping[str, float]
+
+
+def ring(count: int, span: float) -> Lattice:
+    """A Fermi-Pasta-Ulam-Tsingou ring in which all places move."""
+    beta, numbers = 0.25, np.random.default_rng(SEED)
+
+    def accelerations(q: Array) -> Array:
+        d = np.roll(q, -1) - q
+        pull = d + beta * d**3
+        return pull - np.roll(pull, 1)
+
+    return Lattice(
+        name="ring",
+        system=IndexedSystem.from_text(
+            name="ring",
+            coordinates=["q[N]"],
+            parameters={"beta": beta},
+            lagrangian="sum(i in N, q_dot[i]**2/2)"
+            "- sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
+        ),
+        q=np.zeros(count),
+        v=numbers.normal(size=count),
+        span=span,
+        longest=0.4,
+        accelerations=accelerations,
+        by_hand=(0, count, beta),
+        parameters={},
+    )
+
+
+def field(side: int, span: float) -> Lattice:
+    """Sine-Gordon on a torus, a smooth bump."""
+    dx = 0.1
+    x = dx * (np.arange(side) - side // 2)
+    bump = 2.0 * np.exp(-(x[:, np.newaxis] ** 2 + x**2) / 4.0)
+
+    def accelerations(u: Array) -> Array:
+        around = sum(np.roll(u, shift, axis) for shift in (1, -1) for axis in (0, 1))
+        found: Array = (around - 4.0 * u) / dx**2 - np.sin(u)
+        return found
+
+    return Lattice(
+        name="field",
+        system=IndexedSystem.from_text(
+            name="field",
+            coordinates=["u[NX, NY]"],
+            parameters={"w": 1 / dx**2},
+            lagrangian="sum(i in NX periodic, j in NY periodic, u_dot[i, j]**2/2"
+            "- w*((u[i+1, j] - u[i, j])**2 + (u[i, j+1] - u[i, j])**2)/2 + cos(u[i, j]))",
+        ),
+        q=bump,
+        v=np.zeros((side, side)),
+        span=span,
+        longest=0.06,
+        accelerations=accelerations,
+        by_hand=(1, side, 1 / dx**2),
+        parameters={},
+    )
+
+
+def bodies(count: int, span: float) -> Lattice:
+    """Gravity, softened, of a cluster."""
+    softening, numbers = 0.1, np.random.default_rng(SEED)
+
+    def accelerations(r: Array) -> Array:
+        d = r[np.newaxis] - r[:, np.newaxis]
+        cube = (np.sum(d**2, axis=-1) + softening**2) ** -1.5
+        found: Array = np.einsum("ij,ijk->ik", cube, d) / count
+        return found
+
+    return Lattice(
+        name="bodies",
+        system=IndexedSystem.from_text(
+            name="bodies",
+            coordinates=["r[N, 3]"],
+            parameters={"m": 1, "e": softening},
+            lagrangian="m*sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)"
+            "+ m**2*sum(i < j in N, 1/sqrt(sum(a in 3, (r[i, a] - r[j, a])**2) + e**2))",
+        ),
+        q=numbers.normal(size=(count, 3)),
+        v=0.4 * numbers.normal(size=(count, 3)),
+        span=span,
+        longest=0.25,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={"m": 1 / count},
+    )
+
+
+def lattices(plan: Plan) -> tuple[Lattice, ...]:
+    """All problems, or small ones."""
+    if plan.quick:
+        return (ring(64, 2.0), field(16, 0.5), bodies(8, 1.0))
+    return (ring(1000, 20.0), ring(100_000, 2.0), field(256, 2.0), bodies(256, 2.0))
+
+
+@unwarned()
+def run_sums(plan: Plan, say: Say) -> ResultTable:
+    """Times of every contender at equal error."""
+    rows: list[dict[str, Any]] = []
+    for each in lattices(plan):
+        say(f"sums: {each.name} of {each.q.size} coordinates")
+        reference, doubt = _reference(each, plan)
+        curves = {name: _curve(settings, reference, plan) for name, settings in _contenders(each, plan).items()}
+        rows += [_row(each, error, curves, doubt) for error in ERRORS]
+    names = (OWN, "leapfrog", "order_8", "DOP853", "IAS15", "REBOUND_leapfrog")
+    return ResultTable(
+        name="sums",
+        title="time at equal error, and how many times as long others take",
+        columns={"problem": "", "coordinates": "d", "error": ".0e", "ours_ms": ".2f", "by": ""}
+        | dict.fromkeys(names, ".2f")
+        | {"doubt": ".0e"},
+        rows=tuple(rows),
+        remarks=(
+            "ours: the fastest of SVI(2), (4), (6), (8); composition: ours of order 8; leapfrog, order 8: C by hand,",
+            "the second the same composition; below 1 another is faster than the first. Error: root mean square of",
+            "positions over that of the positions at the end; doubt: how far apart SVI(10), by which it is measured,",
+            "and a composition of order 10 are.",
+        ),
+    )
+
+
+def _row(each: Lattice, error: float, curves: Mapping[str, list[Point]], doubt: float) -> dict[str, Any]:
+    times = {name: time_at(points, error) for name, points in curves.items()}
+    own = {name: seconds for name in METHODS if (seconds := times.get(name)) is not None}
+    found: dict[str, Any] = {"problem": each.name, "coordinates": each.q.size, "error": error, "doubt": doubt}
+    if not own:
+        return found
+    best = min(own, key=own.__getitem__)
+    ratios = {name: seconds / own[best] for name, seconds in times.items() if name not in METHODS and seconds}
+    return found | {"ours_ms": 1e3 * own[best], "by": best} | ratios
+
+
+def _reference(each: Lattice, plan: Plan) -> tuple[Array, float]:
+    """The end by SVI(10), and how far from it a composition of order 10 ends."""
+    own = _ours(each, "svi:10", _count(each, each.longest / 8))()
+    other = _ours(each, Composition(10), _count(each, each.longest / 32))()
+    return own, _error(other, own)
+
+
+def _curve(settings: Sequence[Callable[[], Array]], reference: Array, plan: Plan) -> list[Point]:
+    points = []
+    for setting in settings:
+        seconds = []
+        for _ in range(plan.rounds):
+            began = time.process_time()
+            end = setting()
+            seconds.append(time.process_time() - began)
+            if seconds[0] > 1.0:
+                break
+        points.append(Point(seconds=min(seconds), error=_error(end, reference)))
+    return points
+
+
+def _error(end: Array, reference: Array) -> float:
+    return float(np.sqrt(np.mean((end - reference) ** 2) / np.mean(reference**2)))
+
+
+def _count(each: Lattice, h: float) -> int:
+    return max(1, round(each.span / h))
+
+
+def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]]]:
+    """Settings by name."""
+    found = {
+        method: [_ours(each, method, _count(each, each.longest / 2**k)) for k in range(7 - int(method[-1]) // 2)]
+        for method in METHODS
+    }
+    found[OWN] = [_ours(each, Composition(8), _count(each, each.longest / 2**k)) for k in range(6)]
+    if each.by_hand:
+        found["leapfrog"] = [_by_hand(each, 2, _count(each, each.longest / 2**k)) for k in range(1, 13)]
+        found["order_8"] = [_by_hand(each, 8, _count(each, each.longest / 2**k)) for k in range(6)]
+    found["DOP853"] = [_dop853(each, tolerance) for tolerance in TOLERANCES]
+    if each.name == "bodies" and "rebound" in plan.peers and find_spec("rebound"):
+        found["REBOUND_leapfrog"] = [
+            _rebound(each, "leapfrog", _count(each, each.longest / 2**k)) for k in range(2, 12)
+        ]
+        found["IAS15"] = [_rebound(each, "ias15", None)]
+    return found
+
+
+def _ours(each: Lattice, method: Any, steps: int) -> Callable[[], Array]:
+    stepper, name = compile_indexed(each.system, method), each.system.coordinates[0].name
+
+    def run() -> Array:
+        found = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
+        found.advance(steps)
+        return found.q[name]
+
+    return run
+
+
+def _by_hand(each: Lattice, order: int, steps: int) -> Callable[[], Array]:
+    assert each.by_hand is not None
+    flags = (*building.TUNED_FLAGS, "-ffast-math")
+    library = building.load(_by_hand_source(), flags=flags)
+    kicks, drifts = (np.array([float(x) for x in row]) for row in kicks_and_drifts(Composition(order)))
+    is_field, count, strength = each.by_hand
+
+    def run() -> Array:
+        q, v = each.q.reshape(-1).copy(), each.v.reshape(-1).copy()
+        arrays = [library.ffi.from_buffer("double[]", array) for array in (q, v, np.empty(q.size), kicks, drifts)]
+        state, tables = arrays[:3], arrays[3:]
+        library.lib.leapfrog(is_field, *state, count, strength, each.span / steps, steps, *tables, len(kicks))
+        return q.reshape(each.q.shape)
+
+    return run
+
+
+def _by_hand_source() -> Source:
+    code = files("scvi_codegen.benchmark").joinpath("lattices.c").read_text(encoding="utf-8")
+    return Source(prefix="lattices", header=f"{DECLARATIONS}\n", code=code, declarations=DECLARATIONS)
+
+
+def _dop853(each: Lattice, tolerance: float) -> Callable[[], Array]:
+    size, shape = each.q.size, each.q.shape
+
+    def slope(t: float, y: Array) -> Array:
+        return np.concatenate([y[size:], each.accelerations(y[:size].reshape(shape)).reshape(-1)])
+
+    def run() -> Array:
+        start = np.concatenate([each.q.reshape(-1), each.v.reshape(-1)])
+        found = solve_ivp(slope, (0.0, each.span), start, method="DOP853", rtol=tolerance, atol=tolerance)
+        end: Array = found.y[:size, -1].reshape(shape)
+        return end
+
+    return run
+
+
+def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], Array]:
+    import rebound
+
+    def run() -> Array:
+        simulation = rebound.Simulation()
+        simulation.softening = float(each.system.defaults[1])
+        for q, v in zip(each.q, each.v, strict=True):
+            simulation.add(m=1 / len(each.q), x=q[0], y=q[1], z=q[2], vx=v[0], vy=v[1], vz=v[2])
+        simulation.integrator = integrator
+        if steps is not None:
+            simulation.dt = each.span / steps
+        simulation.integrate(each.span)
+        return np.array([[p.x, p.y, p.z] for p in simulation.particles])
+
+    return run
+
+
+@unwarned()
+def run_growth(plan: Plan, say: Say) -> ResultTable:
+    """Time to the first step, and time and memory a step, by the number of coordinates."""
+    rows = list(_growth(plan, say))
+    return ResultTable(
+        name="growth",
+        title="one library for any number of coordinates: a ring, h = 0.1, a process each with an empty cache",
+        columns={
+            "by": "",
+            "coordinates": "d",
+            "first_step_s": ".2f",
+            "ns_a_coordinate_and_step": ".1f",
+            "sweeps": ".2f",
+            "gflops": ".2f",
+            "memory_mb": ".0f",
+        },
+        rows=tuple(rows),
+        remarks=("first step: from text; gflops: of the kernel and of the tables, in sweeps; memory: of the process.",),
+    )
+
+
+def _growth(plan: Plan, say: Say) -> Iterator[dict[str, Any]]:
+    for method in ("svi:4", "svi:8", "stoermer-verlet"):
+        for count in GROWTH[: 2 if plan.quick else None]:
+            say(f"growth: {count} coordinates by {method}")
+            with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
+                environment = os.environ | {building.CACHE_VARIABLE: folder}
+                command = [sys.executable, "-m", "scvi_codegen.benchmark.sums", method, str(count)]
+                run = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+            yield {"by": f"{OURS} {method}", "coordinates": count} | _numbers(run.stdout.split())
+
+
+def _numbers(found: Sequence[str]) -> dict[str, float]:
+    names = ("first_step_s", "ns_a_coordinate_and_step", "sweeps", "gflops", "memory_mb")
+    return dict(zip(names, map(float, found), strict=True))
+
+
+def _one_size(method: str, count: int) -> str:
+    """What a fresh process measures."""
+    began = time.perf_counter()
+    each = ring(count, 1.0)
+    run = compile_indexed(each.system, method).start(each.q, velocity=each.v, h=0.1)
+    run.advance(1)
+    first = time.perf_counter() - began
+    run.advance(3)
+    steps, sweeps, best = max(3, 3 * 10**5 // count), run.iterations, float("inf")
+    for _ in range(7):
+        start = time.process_time()
+        run.advance(steps)
+        best = min(best, (time.process_time() - start) / steps)
+    iterations = (run.iterations - sweeps) / (7 * steps)
+    points = int(method.removeprefix("svi:")) if method.startswith("svi") else 1
+    operations = (iterations + 2) * points * (7 + 2 * points) if points > 1 else 9
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    numbers = (first, 1e9 * best / count, iterations, 1e-9 * operations * count / best, memory)
+    return " ".join(map(repr, numbers))
+
+
+if __name__ == "__main__":
+    print(_one_size(sys.argv[1], int(sys.argv[2])))

@@ -1,0 +1,359 @@
+"""Sums over indices read from text: the grammar of formulas with arrays, and with ``sum(loops, formula)``.
+
+    L     = a sum of  [factor "*"] "sum" "(" loop ("," loop)* "," formula ")"  and of formulas without a sum
+    atom  = .. | array "[" place ("," place)* "]"
+
+Loops and places are those of :mod:`scvi_codegen.indices`. A sum within a sum has bounds that are whole
+numbers, and is written out: ``sum(k in 3, r_dot[i, k]**2)``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from sympy import Add, Expr, S, Symbol
+
+from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
+from scvi_codegen.formulas.grammar import Parser, Token, parsed
+from scvi_codegen.formulas.symbols import check_name, symbol
+from scvi_codegen.indices import Access, Array, Loop, Place, Size
+
+__all__ = ["IndexedTerm", "parse_array", "parse_indexed"]
+
+_TOKEN = re.compile(
+    r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
+    r"|(?P<operator>\*\*|\.\.|[-+*/(),\[\]<])",
+    re.ASCII,
+)
+MOST_WRITTEN_OUT = 64
+"""Terms of a sum within a sum."""
+
+Bound: TypeAlias = Loop | int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexedTerm:
+    """A formula summed over loops; every access of an array in it is a symbol named as it is written.
+
+    Attributes:
+        loops: outermost first; none of a formula that stands outside of sums.
+        formula: in the symbols of ``slots`` and what else it was given.
+        slots: symbol and access of each array entry that occurs, in alphabetical order.
+    """
+
+    loops: tuple[Loop, ...]
+    formula: Expr
+    slots: tuple[tuple[Symbol, Access], ...]
+
+    def __str__(self) -> str:
+        if not self.loops:
+            return str(self.formula)
+        named = [loop for loop in self.loops if loop.index not in {other.behind for other in self.loops}]
+        return f"sum({', '.join(map(str, named))}, {self.formula})"
+
+
+def parse_array(text: str) -> Array:
+    """A declaration, ``"q[N]"``.
+
+    Raises:
+        ExpressionError: for other text.
+    """
+    return _Declaration(text, {}).read()
+
+
+def parse_indexed(
+    text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
+) -> tuple[IndexedTerm, ...]:
+    """Read a sum of sums.
+
+    Args:
+        text: the formula.
+        arrays: those whose entries it may use: coordinates, their velocities, parameters.
+        symbols: what else it may use.
+        tables: arrays of places.
+
+    Returns:
+        Its terms, those over the same loops as one.
+
+    Raises:
+        ExpressionError: for anything outside the grammar, and for an index that leaves its array.
+
+    >>> q = parse_array("q[N]")
+    >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
+    ['sum(i in 0..N-2, -k*(q[i+1] - q[i])**2)']
+    """
+    parser = _IndexedParser(text, symbols, arrays, tables)
+    whole = parsed(parser)
+    by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
+    for placeholder, (loops, formula, column) in parser.sums.items():
+        factor = whole.diff(placeholder)
+        if factor.free_symbols & (set(parser.sums) | set(parser.accesses)):
+            message = "a sum may be multiplied by numbers and parameters only: write factors that vary inside of it"
+            raise ExpressionError(message, text, column)
+        by_loops.setdefault(loops, []).append(factor * formula)
+    by_loops.setdefault((), []).append(whole.xreplace(dict.fromkeys(parser.sums, S.Zero)))
+    terms = [(loops, Add(*formulas)) for loops, formulas in by_loops.items()]
+    return tuple(_term(loops, formula, parser.accesses) for loops, formula in terms if formula != 0)
+
+
+def _term(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
+    found = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
+    return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in found))
+
+
+class _Indices(Parser):
+    """What declarations and sums have in common: brackets, sizes, whole numbers."""
+
+    pattern = _TOKEN
+
+    def peek(self, ahead: int = 0) -> Token:
+        return self.tokens[min(self.position + ahead, len(self.tokens) - 1)]
+
+    def expect(self, *texts: str) -> Token:
+        token = self.peek()
+        if token.text not in texts:
+            found = f"not '{token.text}'" if token.text else "but the formula ends"
+            self.refuse(f"{' or '.join(repr(text) for text in texts)} is expected here, {found}", token.column)
+        self.position += 1
+        return token
+
+    def take_name(self, what: str) -> Token:
+        token = self.peek()
+        if token.kind != "name":
+            self.refuse(f"{what} is expected here, not '{token.text}'", token.column)
+        self.position += 1
+        return token
+
+    def whole_number(self) -> int:
+        token = self.peek()
+        if not token.text.isdigit() or len(token.text) > 9:
+            self.refuse(f"a whole number is expected here, not '{token.text}'", token.column)
+        self.position += 1
+        return int(token.text)
+
+    def offset(self) -> int:
+        """``(+|-) whole number``, as often as there are such."""
+        total = 0
+        while sign := self.accept("+", "-"):
+            total += self.whole_number() * (-1 if sign.text == "-" else 1)
+        return total
+
+    def size(self) -> Size:
+        """A name, a whole number, or both."""
+        if self.peek().kind == "name":
+            name = self.take_name("a size").text
+            return Size(name, self.offset())
+        start = -self.whole_number() if self.accept("-") else self.whole_number()
+        return Size("", start + self.offset())
+
+
+class _Declaration(_Indices):
+    def read(self) -> Array:
+        name = self.take_name("the name of an array")
+        check_name(name.text)
+        self.expect("[")
+        axes = [self.axis()]
+        while self.accept(","):
+            axes.append(self.axis())
+        self.expect("]")
+        if self.peek().kind != "end":
+            self.refuse("a declaration ends with its brackets, as q[N]", self.column)
+        return Array(name.text, tuple(axes))
+
+    def axis(self) -> Size:
+        column, size = self.column, self.size()
+        if size.name and size.number:
+            self.refuse("an axis is a name or a whole number, as q[N] or r[N, 3]", column)
+        if not size.name and size.number < 1:
+            self.refuse("an axis has at least one place", column)
+        if size.name:
+            check_name(size.name)
+        return size
+
+
+class _IndexedParser(_Indices):
+    def __init__(
+        self, text: str, symbols: Mapping[str, Symbol], arrays: Sequence[Array], tables: Sequence[Array]
+    ) -> None:
+        super().__init__(text, symbols)
+        self.arrays, self.tables = ({each.name: each for each in group} for group in (arrays, tables))
+        self.sizes = {name for array in (*arrays, *tables) for name in array.names}
+        self.bound: dict[str, Bound] = {}
+        self.accesses: dict[Symbol, Access] = {}
+        self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
+
+    def name(self, name: str, column: int) -> Expr:
+        if name == "sum" and self.peek().text == "(":
+            return self.summed(column)
+        if name in self.arrays:
+            return self.entry(self.arrays[name], column)
+        if name in self.tables:
+            self.refuse(f"'{name}' is a table, whose entries are places: q[{name}[.., 0]]", column)
+        if self.peek().text == "[":
+            known = ", ".join(map(str, self.arrays.values())) or "none"
+            self.refuse(f"'{name}' is no array{closest(name, self.arrays)} Arrays: {known}", column)
+        if name in self.bound or name in self.sizes:
+            what = "an index" if name in self.bound else "a size"
+            self.refuse(f"'{name}' is {what}, which stands in brackets and bounds only: make it a parameter", column)
+        return super().name(name, column)
+
+    def summed(self, column: int) -> Expr:
+        """``sum(loops, formula)``, with ``sum`` read."""
+        self.open(column)
+        self.expect("(")
+        loops = self.loop()
+        while True:
+            self.expect(",")
+            if self.peek(1).text not in ("in", "<"):
+                break
+            loops += self.loop()
+        inner = any(isinstance(bound, Loop) for bound in self.bound.values())
+        if inner or all(not loop.first.name and not loop.end.name for loop in loops):
+            return self.written_out(loops, column)
+        self.bound |= {loop.index: loop for loop in loops}
+        formula = self.sum()
+        self.end_of_sum(loops)
+        placeholder = symbol(f"sum {len(self.sums)}")
+        self.sums[placeholder] = (tuple(loops), formula, column)
+        return placeholder
+
+    def end_of_sum(self, loops: Sequence[Loop]) -> None:
+        for loop in loops:
+            del self.bound[loop.index]
+        self.close()
+
+    def written_out(self, loops: Sequence[Loop], column: int) -> Expr:
+        """A sum whose bounds are whole numbers: the formula is read once for each."""
+        if any(loop.first.name or loop.end.name for loop in loops):
+            message = (
+                "a sum within a sum has bounds that are whole numbers; write sum(i in N, j in N, ..) for a double sum"
+            )
+            self.refuse(message, column)
+        rows: list[dict[str, int]] = [{}]
+        for loop in loops:
+            rows = [
+                {**row, loop.index: k}
+                for row in rows
+                for k in range(row[loop.behind] + 1 if loop.behind else loop.first.number, loop.end.number)
+            ]
+        if not 0 < len(rows) <= MOST_WRITTEN_OUT:
+            self.refuse(f"a sum over whole numbers has 1 to {MOST_WRITTEN_OUT} terms, not {len(rows)}", column)
+        start, formulas = self.position, []
+        for row in rows:
+            self.position = start
+            self.bound |= row
+            formulas.append(self.sum())
+        self.end_of_sum(loops)
+        return Add(*formulas)
+
+    def loop(self) -> list[Loop]:
+        first = self.take_name("an index")
+        pair = self.take_name("an index") if self.accept("<") else None
+        for token in (first, *([pair] if pair else [])):
+            self.check_index(token)
+        self.expect("in")
+        column, size = self.column, self.size()
+        span = (size, self.size() + 1) if self.accept("..") else (Size("", 0), size)
+        for bound in span:
+            if bound.name and bound.name not in self.sizes:
+                known = ", ".join(sorted(self.sizes)) or "none"
+                self.refuse(
+                    f"'{bound.name}' is the size of no array{closest(bound.name, self.sizes)} Sizes: {known}", column
+                )
+        periodic = self.peek().text == "periodic"
+        self.position += periodic
+        if pair is None:
+            return [Loop(index=first.text, first=span[0], end=span[1], periodic=periodic)]
+        if span[0] != Size("", 0) or periodic:
+            self.refuse(f"pairs are taken from a whole axis, as {first.text} < {pair.text} in N", column)
+        outer = Loop(index=first.text, first=span[0], end=span[1])
+        return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text)]
+
+    def check_index(self, token: Token) -> None:
+        try:
+            check_name(token.text)
+        except SystemDefinitionError as error:
+            self.refuse(str(error), token.column)
+        if token.text in self.bound:
+            self.refuse(f"the index '{token.text}' is used by a sum around this one: choose another", token.column)
+        if any(token.text in names for names in (self.arrays, self.tables, self.symbols, self.sizes)):
+            self.refuse(f"'{token.text}' has a meaning: choose another index", token.column)
+
+    def entry(self, array: Array, column: int) -> Expr:
+        """``[places]``, with the name of the array read."""
+        if self.peek().text != "[":
+            self.refuse(f"'{array.name}' is an array: write {array}", column)
+        places = self.brackets(array, column)
+        access = Access(array=array, places=places)
+        slot = symbol(str(access))
+        self.accesses[slot] = access
+        return slot
+
+    def brackets(self, array: Array, column: int) -> tuple[Place, ...]:
+        self.expect("[")
+        places = [self.place()]
+        while self.accept(","):
+            places.append(self.place())
+        self.expect("]")
+        if len(places) != len(array.axes):
+            self.refuse(f"'{array}' has {len(array.axes)} axes, not {len(places)}", column)
+        for place, axis in zip(places, array.axes, strict=True):
+            if problem := self.leaves(place, axis):
+                self.refuse(f"{Access(array=array, places=tuple(places))}: {problem}", column)
+        return tuple(places)
+
+    def place(self) -> Place:
+        token = self.peek()
+        if token.kind != "name":
+            return Place(base=self.size())
+        if token.text in self.tables:
+            return self.entry_of_table()
+        if token.text in self.sizes:
+            return Place(base=self.size())
+        bound = self.bound.get(token.text)
+        if bound is None:
+            known = ", ".join(self.bound) or "none here"
+            message = f"'{token.text}' is no index{closest(token.text, self.bound)} Indices: {known}. A place is"
+            self.refuse(f"{message} a whole number, N-1, i, i+1 or an entry of a table, bonds[b, 0]", token.column)
+        self.position += 1
+        if isinstance(bound, int):
+            return Place(base=Size("", bound + self.offset()))
+        return Place(index=token.text, base=Size("", self.offset()))
+
+    def entry_of_table(self) -> Place:
+        token = self.take_name("a table")
+        table = self.tables[token.text]
+        row, *columns = self.brackets(table, token.column)
+        plain = row.index and not row.table and not row.base.number
+        if not plain or len(columns) != 1 or columns[0].index or columns[0].base.name:
+            self.refuse("a table is accessed by an index and a whole number, as bonds[b, 0]", token.column)
+        return Place(index=row.index, table=table.name, column=columns[0].base.number)
+
+    def leaves(self, place: Place, axis: Size) -> str:
+        """Why a place is not on an axis; nothing where it is, or where that depends on sizes with other names."""
+        base = place.base
+        if place.table:
+            return ""
+        if not place.index:
+            below = base.number < 0 and not base.name
+            above = base.name == axis.name and base.number >= axis.number
+            return f"{base} is not on an axis of {axis}" if below or above else ""
+        loop = self.bound[place.index]
+        assert isinstance(loop, Loop)
+        if loop.periodic:
+            whole = loop.is_whole and loop.end == axis
+            return "" if whole else f"'{loop}' is no index of a periodic axis of {axis}"
+        last = loop.end + -1
+        remedy = f"or write '{loop.index} in {axis} periodic'"
+        if not loop.first.name and (first := loop.first.number + base.number) < 0:
+            begin = loop.first + -first
+            return (
+                f"{place} is {first} at {loop.index} = {loop.first}: begin at {loop.index} in {begin}..{last}, {remedy}"
+            )
+        if loop.end.name == axis.name and (beyond := loop.end.number + base.number - axis.number) > 0:
+            span, leaves = f"{loop.first}..{last + -beyond}", last + base.number
+            return f"{place} is {leaves} at {loop.index} = {last}: end at {loop.index} in {span}, {remedy}"
+        return ""

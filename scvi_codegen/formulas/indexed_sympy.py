@@ -1,0 +1,80 @@
+"""SymPy's ``Sum`` and ``Indexed`` as text of the grammar of sums over indices.
+
+SymPy itself is asked for nothing: its derivatives of sums over indices are wrong in places (bound letters that occur
+twice, functions of indices), so a sum is read term by term, as it stands.
+
+    Sum(f, (i, 0, N - 1))                           sum(i in 0..N-1, f)
+    Sum(f, (i, 0, N - 1)) with q[Mod(i + 1, N)]     sum(i in N periodic, f)
+    Sum(f, (j, i + 1, N - 1), (i, 0, N - 2))        sum(i < j in N, f)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sympy import Expr, Idx, Indexed, Mod, Sum, Symbol, Tuple
+from sympy.printing.str import StrPrinter
+
+from scvi_codegen.errors import SystemDefinitionError
+
+__all__ = ["indexed_text"]
+
+
+def indexed_text(expression: Expr) -> str:
+    """The text of a sum of sums.
+
+    Raises:
+        SystemDefinitionError: for limits that are none of the above.
+
+    >>> from sympy import IndexedBase, symbols
+    >>> q, (i, N) = IndexedBase("q"), symbols("i N", integer=True)
+    >>> indexed_text(-Sum((q[Mod(i + 1, N)] - q[i]) ** 2 / 2, (i, 0, N - 1)))
+    '-sum(i in N periodic, (q[i + 1] - q[i])**2/2)'
+    """
+    return str(_Printer({"full_prec": False}).doprint(expression))
+
+
+class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
+    def _print_Sum(self, expression: Sum) -> str:
+        wrapped = {index for index, _ in map(_wrapped, expression.function.atoms(Mod))}
+        loops = ", ".join(_loops(expression.limits, wrapped))
+        return f"sum({loops}, {self._print(expression.function)})"
+
+    def _print_Indexed(self, expression: Indexed) -> str:
+        return f"{expression.base.label}[{', '.join(map(self._print, expression.indices))}]"
+
+    def _print_Idx(self, expression: Idx) -> str:
+        return str(expression.label)
+
+    def _print_Mod(self, expression: Mod) -> str:
+        _wrapped(expression)
+        return str(self._print(expression.args[0]))
+
+
+def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
+    """The index of a place on a ring, and the length of the ring."""
+    place, length = expression.args
+    indices = [each for each in place.free_symbols if each not in length.free_symbols]
+    if len(indices) != 1 or not (place - indices[0]).is_Integer:
+        raise SystemDefinitionError(f"{expression} is no place on a ring: write Mod(i + 1, N)")
+    return indices[0], length
+
+
+def _loops(limits: Sequence[Tuple], wrapped: set[Symbol]) -> list[str]:
+    """The loops of a sum, outermost first; an index that begins behind another is the second of a pair."""
+    if any(len(limit) != 3 for limit in limits):
+        raise SystemDefinitionError(f"a sum has an index and two bounds, as (i, 0, N - 1), not {limits}")
+    spans = {index: (first, last) for index, first, last in reversed(limits)}
+    pairs = {outer: inner for inner, (first, _) in spans.items() for outer in spans if first - outer == 1}
+    loops = []
+    for index, (first, last) in spans.items():
+        if index in pairs:
+            length = spans[pairs[index]][1] + 1
+            if first != 0 or last - length not in (-1, -2):
+                raise SystemDefinitionError(f"pairs are taken from a whole axis, ({index}, 0, N - 2), not {limits}")
+            loops.append(f"{index} < {pairs[index]} in {length}")
+        elif index in wrapped:
+            loops.append(f"{index} in {last + 1} periodic" if first == 0 else f"{index} in {first}..{last} periodic")
+        elif index not in pairs.values():
+            loops.append(f"{index} in {first}..{last}")
+    return loops

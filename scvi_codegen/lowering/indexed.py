@@ -1,0 +1,123 @@
+"""A Lagrangian of sums over indices and a method to a program: kernels of terms, tables of one coordinate.
+
+Where masses are constant the tables of a method are the same for every coordinate (they depend on none), so those of a
+system of one coordinate serve all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+from sympy import Expr, S, Symbol
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.indices import Access
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.indexed import IndexedProgram, IndexedSweep, LoopedKernel
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.sweeps import SeparableSweep
+from scvi_codegen.lowering.program import comment_text, notes_of
+from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.mechanics.indexed.system import IndexedSystem, MassTerm
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.methods.method import Method
+
+__all__ = ["lower_indexed", "one_coordinate"]
+
+
+def one_coordinate(name: str = "one") -> LagrangianSystem:
+    """A system of the same form: what a method's tables are taken from."""
+    return LagrangianSystem.from_text(name=name, coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+
+
+def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> IndexedProgram:
+    """The program of a system by a method.
+
+    Raises:
+        MethodError: for a method that solves its equations neither explicitly nor by sweeps over positions.
+    """
+    one = one_coordinate(system.name)
+    splitting = splitting_of(one, method)
+    forces = tuple(_force(system, term, number) for number, term in enumerate(system.potentials))
+    sweep = None if splitting else _sweep(one, method, forces)
+    return IndexedProgram(
+        prefix=prefix,
+        title=comment_text(f"{system.name}: {method.title}"),
+        notes=notes_of(method, one),
+        order=method.order or 2,
+        sizes=system.sizes,
+        coordinates=system.coordinates,
+        fields=system.fields,
+        tables=system.tables,
+        parameter_names=tuple(parameter.name for parameter in system.parameters),
+        parameter_defaults=system.defaults,
+        forces=forces,
+        masses=tuple(_mass(system, term, number) for number, term in enumerate(system.masses)),
+        sweep=sweep,
+        splitting=splitting,
+    )
+
+
+def _sweep(one: LagrangianSystem, method: Method, forces: Sequence[LoopedKernel]) -> IndexedSweep:
+    found = sweep_of(one, discretise(one, method))
+    if not isinstance(found, SeparableSweep):
+        raise MethodError(
+            f"{method.name} has no sweeps over positions: for sums over indices take an SVI, an SC, a Runge-Kutta "
+            "method of at most 32 points, Stoermer-Verlet or a composition"
+        )
+    own = {field.name: getattr(found, field.name) for field in fields(found)}
+    return IndexedSweep(**own, terms=tuple(each.kernel for each in forces))
+
+
+def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:
+    arrays = dict(term.slots)
+    u = [slot for slot, access in term.slots if access.array in system.coordinates]
+    slopes = gradient(term.formula, u)
+    values = [slopes.get(place, S.Zero) for place in range(len(u))]
+    looped = LoopedKernel(
+        text=comment_text(str(term)),
+        loops=term.loops,
+        slots=tuple(arrays[slot] for slot in u),
+        given=_given(term.slots, u),
+        kernel=_kernel(system, f"force_{number}", values, term.slots, u, "Derivatives by its coordinates."),
+    )
+    scalar = _kernel(system, f"term_{number}", [term.formula], term.slots, u, "The term.")
+    return replace(looped, scalar=scalar)
+
+
+def _mass(system: IndexedSystem, term: MassTerm, number: int) -> LoopedKernel:
+    return LoopedKernel(
+        text=comment_text(f"mass of {term.access}"),
+        loops=term.loops,
+        slots=(term.access,),
+        given=_given(term.slots, ()),
+        kernel=_kernel(system, f"mass_{number}", [term.formula], term.slots, (), "A mass."),
+    )
+
+
+def _given(slots: Sequence[tuple[Symbol, Access]], u: Sequence[Symbol]) -> tuple[Access, ...]:
+    return tuple(access for slot, access in slots if slot not in u)
+
+
+def _kernel(
+    system: IndexedSystem,
+    name: str,
+    values: Sequence[Expr],
+    slots: Sequence[tuple[Symbol, Access]],
+    u: Sequence[Symbol],
+    purpose: str,
+) -> Kernel:
+    kernel = lower_kernel(
+        name,
+        arguments=tuple(u),
+        time=system.time,
+        parameters=(*system.parameters, *(slot for slot, _ in slots if slot not in u)),
+        values=tuple(values),
+        slopes=(),
+    )
+    return replace(kernel, purpose=purpose)

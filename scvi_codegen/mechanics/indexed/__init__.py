@@ -1,0 +1,1 @@
+"""Systems of any number of coordinates: sums of few kinds of terms over indices."""

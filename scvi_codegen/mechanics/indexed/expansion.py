@@ -1,0 +1,141 @@
+"""Sums over indices written out, for sizes that are known: a system of so many named coordinates.
+
+What small systems have, and sums over indices do not have yet (Newton's iteration, certificates, the derivation page,
+ensembles, derivatives), is there for the expanded system; and an integrator of the sums can be held against that of
+the expanded system, which was derived on another way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sympy import Add, Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.symbols import DOT, number, symbol
+from scvi_codegen.indices import Access, Array, Loop, Place
+from scvi_codegen.kinds import MAPPING, takes
+from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+
+__all__ = ["expand_sums"]
+
+Elements = Mapping[str, int]
+Tables = Mapping[str, NDArray[np.int64]]
+
+
+@takes(SystemDefinitionError, system=INDEXED, sizes=MAPPING, tables=MAPPING, parameters=MAPPING)
+def expand_sums(
+    system: IndexedSystem,
+    sizes: Mapping[str, int],
+    *,
+    tables: Mapping[str, ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
+) -> LagrangianSystem:
+    """The system of the coordinates q_0, q_1, .. (r_0_0, r_0_1, ..), an array's last axis running fastest.
+
+    Args:
+        system: what is written out.
+        sizes: value of every size.
+        tables: (rows, columns) places by name.
+        parameters: numbers and arrays by name, others keep their defaults; entries of arrays become parameters k_0, ..
+
+    Raises:
+        SystemDefinitionError: for names and shapes that do not fit, and for an index that leaves its array.
+
+    >>> chain = IndexedSystem.from_text(
+    ...     name="chain", coordinates=["q[N]"],
+    ...     lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2)")
+    >>> expand_sums(chain, {"N": 2}).lagrangian
+    q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
+    """
+    given, places = dict(parameters or {}), {name: np.asarray(table) for name, table in (tables or {}).items()}
+    for known, named, what in (
+        (system.sizes, sizes, "size"),
+        ([table.name for table in system.tables], places, "table"),
+    ):
+        if set(known) != set(named):
+            raise SystemDefinitionError(f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give each")
+    fields = {
+        array.name: _filled(array, given.pop(array.name, default), sizes)
+        for array, default in zip(system.fields, system.field_defaults, strict=True)
+    }
+    names = {array.name: _names(array, sizes) for array in (*system.coordinates, *system.fields)}
+    values = {
+        str(name): float(value)
+        for array in system.fields
+        for name, value in zip(names[array.name].flat, fields[array.name].flat, strict=True)
+    }
+    numbers = {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
+    for name, value in given.items():
+        if name not in numbers:
+            raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
+        numbers[name] = number(name, value)
+    summands: list[Expr] = []
+    for term in system.terms:
+        for at in _elements(term.loops, sizes):
+            rule = {slot: _entry(access, at, term.loops, sizes, places, names) for slot, access in term.slots}
+            summands.append(term.formula.xreplace(rule))
+    coordinates = [symbol(str(name)) for array in system.coordinates for name in names[array.name].flat]
+    return LagrangianSystem(
+        name=system.name,
+        coordinates=tuple(coordinates),
+        time=system.time,
+        parameters=tuple(map(symbol, [*numbers, *values])),
+        defaults=(*numbers.values(), *values.values()),
+        lagrangian=Add(*summands),
+    )
+
+
+def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
+    shape = array.shape(sizes)
+    flat = ["_".join([array.name, *map(str, place)]) for place in np.ndindex(*shape)]
+    return np.array(flat, dtype=np.str_).reshape(shape)
+
+
+def _filled(array: Array, value: ArrayLike, sizes: Mapping[str, int]) -> NDArray[np.float64]:
+    try:
+        return np.broadcast_to(np.asarray(value, dtype=np.float64), array.shape(sizes))
+    except ValueError as error:
+        raise SystemDefinitionError(f"'{array.name}' has the shape {np.shape(value)}, not that of {array}") from error
+
+
+def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Elements]:
+    """The values of all indices."""
+    if not loops:
+        yield {}
+        return
+    last = loops[-1]
+    for outer in _elements(loops[:-1], sizes):
+        first = outer[last.behind] + 1 if last.behind else last.first.at(sizes)
+        for k in range(first, last.end.at(sizes)):
+            yield {**outer, last.index: k}
+
+
+def _entry(
+    access: Access,
+    at: Elements,
+    loops: Sequence[Loop],
+    sizes: Mapping[str, int],
+    tables: Tables,
+    names: Mapping[str, NDArray[np.str_]],
+) -> Symbol:
+    periods = {loop.index: loop.end.at(sizes) for loop in loops if loop.periodic}
+    places = tuple(_place(place, at, periods, sizes, tables) for place in access.places)
+    if any(not 0 <= place < length for place, length in zip(places, access.array.shape(sizes), strict=True)):
+        raise SystemDefinitionError(f"{access} is at {list(places)}, outside of {access.array}, at {dict(at)}")
+    name = access.array.name
+    if name in names:
+        return symbol(str(names[name][places]))
+    return symbol(str(names[name.removesuffix(DOT)][places]) + DOT)
+
+
+def _place(place: Place, at: Elements, periods: Mapping[str, int], sizes: Mapping[str, int], tables: Tables) -> int:
+    if place.table:
+        return int(tables[place.table][at[place.index], place.column])
+    if not place.index:
+        return place.base.at(sizes)
+    k = at[place.index] + place.base.number
+    return k % periods[place.index] if place.index in periods else k

@@ -1,0 +1,248 @@
+"""A Lagrangian that is a sum over indices of few kinds of terms: lattices, fields, molecules, cloth, N bodies.
+
+    L = sum_f sum_(e in loops of f) l_f(entries of arrays at e, parameters, t)
+
+What is derived of it is derived of the kernels l_f, so neither the time to compile nor the length of the code depends
+on how many coordinates there are; how many is said by the arrays that a run starts from. Kinetic energy is a sum of
+m v**2/2, m constant but possibly different from place to place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import sympy
+from sympy import Expr, S, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.indexed_sympy import indexed_text
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
+from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.kinds import MAPPING, TEXT, TEXTS, of, takes
+
+__all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MassTerm:
+    """A mass, added up over loops: m of ``formula * v**2/2`` at the coordinate ``access``."""
+
+    loops: tuple[Loop, ...]
+    access: Access
+    formula: Expr
+    slots: tuple[tuple[Symbol, Access], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexedSystem:
+    """A Lagrangian of sums over indices, checked on construction: :meth:`from_text`, :meth:`from_sympy`.
+
+    Attributes:
+        name: what the system is called.
+        coordinates: arrays of coordinates; that of the velocities of ``q`` is called ``q_dot``.
+        time: the symbol ``t``.
+        parameters, defaults: numbers that stay adjustable, and their default values.
+        fields: arrays of parameters, whose values, one an element, are given with each run.
+        field_defaults: the value of all their elements where none are given.
+        tables: arrays of places, ``bonds[B, 2]``, given with each run.
+        terms: of the Lagrangian.
+    """
+
+    name: str
+    coordinates: tuple[Array, ...]
+    time: Symbol
+    parameters: tuple[Symbol, ...]
+    defaults: tuple[float, ...]
+    fields: tuple[Array, ...]
+    field_defaults: tuple[float, ...]
+    tables: tuple[Array, ...]
+    terms: tuple[IndexedTerm, ...]
+
+    def __post_init__(self) -> None:
+        self._check_names()
+        for term in self.terms:
+            if problem := unsupported_part(term.formula):
+                raise SystemDefinitionError(f"in the Lagrangian of '{self.name}': {problem}")
+            _check_form(term, self._velocities, self.time)
+        for array in self.coordinates:
+            if not any(mass.access.array == array for mass in self.masses):
+                raise SystemDefinitionError(
+                    f"no term has {array.name}{DOT}: give '{array.name}' a kinetic energy, as "
+                    f"sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)"
+                )
+
+    @classmethod
+    @takes(SystemDefinitionError, name=TEXT, coordinates=TEXTS, lagrangian=TEXT, parameters=MAPPING, tables=TEXTS)
+    def from_text(
+        cls,
+        *,
+        name: str,
+        coordinates: Sequence[str],
+        lagrangian: str,
+        parameters: Mapping[str, float] | None = None,
+        tables: Sequence[str] = (),
+    ) -> IndexedSystem:
+        """Read L from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
+
+        Args:
+            name: what the system is called.
+            coordinates: declarations, as ``["q[N]"]`` or ``["r[N, 3]"]``; sizes are names or whole numbers.
+            lagrangian: the formula; the velocity of ``q[i]`` is written ``q_dot[i]``, time ``t``.
+            parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
+                an array, one an element, are given with each run.
+            tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``.
+
+        Raises:
+            SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
+
+        >>> chain = IndexedSystem.from_text(
+        ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
+        ...     lagrangian="sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)")
+        >>> print(chain)
+        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
+        """
+        arrays = tuple(map(parse_array, coordinates))
+        places = tuple(map(parse_array, tables))
+        values = {key: number(key, value) for key, value in (parameters or {}).items()}
+        fields = {key: parse_array(key) for key in values if "[" in key}
+        scalars = {key: value for key, value in values.items() if key not in fields}
+        velocities = [Array(array.name + DOT, array.axes) for array in arrays]
+        known = {key: symbol(key) for key in (*scalars, TIME)}
+        return cls(
+            name=name,
+            coordinates=arrays,
+            time=symbol(TIME),
+            parameters=tuple(known[key] for key in scalars),
+            defaults=tuple(scalars.values()),
+            fields=tuple(fields.values()),
+            field_defaults=tuple(values[key] for key in fields),
+            tables=places,
+            terms=parse_indexed(lagrangian, (*arrays, *velocities, *fields.values()), known, places),
+        )
+
+    @classmethod
+    @takes(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TEXTS)
+    def from_sympy(
+        cls,
+        *,
+        name: str,
+        coordinates: Sequence[str],
+        lagrangian: Expr,
+        parameters: Mapping[str, float] | None = None,
+        tables: Sequence[str] = (),
+    ) -> IndexedSystem:
+        """Take L from a SymPy expression of ``Sum`` and ``Indexed``; the rest as of :meth:`from_text`.
+
+        A place on a ring is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``, an entry of a table is
+        ``q[bonds[b, 0]]``, the velocity of ``q[i]`` is that of ``IndexedBase("q_dot")``.
+
+        >>> from sympy import IndexedBase, Sum, symbols
+        >>> q, v, (i, N) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i N", integer=True)
+        >>> kinetic, springs = Sum(v[i] ** 2 / 2, (i, 0, N - 1)), Sum((q[i + 1] - q[i]) ** 2 / 2, (i, 0, N - 2))
+        >>> print(IndexedSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs))
+        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in 0..N-2, -(q[i+1] - q[i])**2/2)
+        """
+        if not isinstance(lagrangian, Expr):
+            what = type(lagrangian).__name__
+            raise SystemDefinitionError(f"the Lagrangian is a {what}, not a SymPy expression (text goes to from_text)")
+        text = indexed_text(lagrangian)
+        return cls.from_text(name=name, coordinates=coordinates, lagrangian=text, parameters=parameters, tables=tables)
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """Names of the sizes, in the order in which arrays declare them."""
+        return tuple(dict.fromkeys(chain(*(array.names for array in self.arrays))))
+
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """Coordinates, fields, tables."""
+        return (*self.coordinates, *self.fields, *self.tables)
+
+    @property
+    def masses(self) -> tuple[MassTerm, ...]:
+        """Second derivatives of L by velocities."""
+        return tuple(chain(*(_masses(term, self._velocities) for term in self.terms)))
+
+    @property
+    def potentials(self) -> tuple[IndexedTerm, ...]:
+        """Terms of L without velocities: -V."""
+        found = []
+        for term in self.terms:
+            at_rest = term.formula.xreplace(dict.fromkeys(_velocity_slots(term, self._velocities), S.Zero))
+            if at_rest.free_symbols & {slot for slot, access in term.slots if access.array in self.coordinates}:
+                slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
+                found.append(replace(term, formula=at_rest, slots=slots))
+        return tuple(found)
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether time occurs: energy is then not conserved."""
+        return any(self.time in term.formula.free_symbols for term in self.terms)
+
+    def key(self) -> tuple[str, ...]:
+        """All that tells this system from others."""
+        return (self.name, str(self), repr((self.tables, self.fields, self.parameters, self.defaults)))
+
+    def __str__(self) -> str:
+        arguments = ", ".join(map(str, self.coordinates))
+        return f"{self.name}: L({arguments}) = {' + '.join(map(str, self.terms))}"
+
+    @property
+    def _velocities(self) -> dict[str, Array]:
+        """The array of coordinates by the name of its velocities."""
+        return {array.name + DOT: array for array in self.coordinates}
+
+    def _check_names(self) -> None:
+        check_names([array.name for array in self.coordinates], [each.name for each in self.parameters])
+        names = [array.name for array in self.arrays] + [each.name for each in self.parameters]
+        for name in names:
+            if names.count(name) > 1 or name in self.sizes:
+                raise SystemDefinitionError(f"'{name}' is the name of two things: rename one")
+        for table in self.tables:
+            if len(table.axes) != 2 or not table.axes[0].name or table.axes[1].name:
+                raise SystemDefinitionError(
+                    f"a table has a size and a whole number of columns, as bonds[B, 2]: {table}"
+                )
+        for array in self.coordinates:
+            if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
+                raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
+
+
+def _masses(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
+    """Those of the velocities of a term."""
+    known, found = dict(term.slots), []
+    for v in _velocity_slots(term, velocities):
+        mass = term.formula.diff(v, 2)
+        slots = tuple(pair for pair in term.slots if pair[0] in mass.free_symbols)
+        access = replace(known[v], array=velocities[known[v].array.name])
+        found.append(MassTerm(loops=term.loops, access=access, formula=mass, slots=slots))
+    return tuple(found)
+
+
+def _velocity_slots(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
+    return tuple(slot for slot, access in term.slots if access.array.name in velocities)
+
+
+def _check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol) -> None:
+    """Raise :class:`SystemDefinitionError` unless velocities occur as m v**2/2 with a constant m."""
+    coordinates = set(velocities.values())
+    varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
+    slots = _velocity_slots(term, velocities)
+    slopes = gradient(term.formula, slots)
+    for place, v in enumerate(slots):
+        slope = slopes.get(place, S.Zero)
+        mass = slope.diff(v)
+        if mass.free_symbols & (varies | {time}) or sympy.expand(slope - mass * v) != 0:
+            raise SystemDefinitionError(
+                f"in '{term}' the derivative by {v} is {slope}: a Lagrangian of sums over indices has velocities as "
+                "m*v**2/2 alone, with a constant mass m"
+            )
+
+
+INDEXED = of("an IndexedSystem", IndexedSystem)
+"""For :func:`~scvi_codegen.kinds.takes`."""

@@ -1,0 +1,186 @@
+"""What a caller must know of an integrator of sums over indices, and the arrays of a run held against it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError, closest
+from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.native.arguments import checked_number, real_array
+
+__all__ = [
+    "IndexedInterface",
+    "Numbers",
+    "check_accesses",
+    "field_values",
+    "number_values",
+    "read_state",
+    "read_tables",
+]
+
+Numbers = NDArray[np.float64]
+Places = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexedInterface:
+    """Names and shapes.
+
+    Attributes:
+        prefix: beginning of every exported C name.
+        title, system, method: in words.
+        sizes: names of sizes, in the order of the C struct.
+        coordinates, fields, tables: arrays in that order.
+        parameters, defaults: numbers.
+        field_defaults: what fields are filled with unless they are given.
+        maps: (name, array, component, other component) of each momentum map.
+        accesses: every access of an array, with the loops around it.
+        depends_on_time: whether energy is not conserved.
+        work: numbers a coordinate.
+    """
+
+    prefix: str
+    title: str
+    system: str
+    method: str
+    sizes: tuple[str, ...]
+    coordinates: tuple[Array, ...]
+    fields: tuple[Array, ...]
+    tables: tuple[Array, ...]
+    parameters: tuple[str, ...]
+    defaults: tuple[float, ...]
+    field_defaults: tuple[float, ...]
+    maps: tuple[tuple[str, str, int | None, int | None], ...]
+    accesses: tuple[tuple[Access, tuple[Loop, ...]], ...]
+    depends_on_time: bool
+    work: int
+
+
+def read_state(
+    interface: IndexedInterface, given: ArrayLike | Mapping[str, ArrayLike], what: str
+) -> dict[str, Numbers]:
+    """Arrays of coordinates (or of velocities, momenta) by name, from a mapping, or the only one as such.
+
+    Raises:
+        StateError: for names, numbers of axes and numbers that do not fit.
+    """
+    names = [array.name for array in interface.coordinates]
+    if not isinstance(given, Mapping):
+        if len(names) > 1:
+            raise StateError(f"{what} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
+        given = {names[0]: given}
+    _check_named(given, names, what, whole=True)
+    return {array.name: _of_axes(array, real_array(given[array.name], what), what) for array in interface.coordinates}
+
+
+def number_values(interface: IndexedInterface, given: Mapping[str, ArrayLike]) -> list[float]:
+    """The numbers among the parameters, in order."""
+    known = dict(zip(interface.parameters, interface.defaults, strict=True))
+    _check_named(given, [*known, *(field.name for field in interface.fields)], "parameters", whole=False)
+    return [checked_number(given.get(name, value), name) for name, value in known.items()]
+
+
+def field_values(
+    interface: IndexedInterface, given: Mapping[str, ArrayLike], sizes: Mapping[str, int]
+) -> dict[str, Numbers]:
+    """The arrays among the parameters by name, in full; a number fills one."""
+    found = {}
+    for array, default in zip(interface.fields, interface.field_defaults, strict=True):
+        values = real_array(given.get(array.name, default), array.name)
+        _check_finite(values, array.name)
+        shape = array.shape(sizes)
+        try:
+            found[array.name] = np.ascontiguousarray(np.broadcast_to(values, shape))
+        except ValueError as error:
+            message = f"'{array.name}' has the shape {values.shape}; {array} is {_text(shape)} here"
+            raise StateError(message) from error
+    return found
+
+
+def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | None) -> dict[str, Places]:
+    """The tables by name."""
+    _check_named(given or {}, [table.name for table in interface.tables], "tables", whole=True)
+    found = {}
+    for table in interface.tables:
+        values = np.asarray((given or {})[table.name])
+        if values.size and values.dtype.kind not in "iu":
+            raise StateError(f"the table '{table.name}' must be whole numbers, not {values.dtype.name}")
+        if values.ndim != 2 or values.shape[1] != table.axes[1].number:
+            raise StateError(f"the table '{table.name}' has the shape {values.shape}, not that of {table}")
+        if values.size and not 0 <= values.min() <= values.max() < 2**31:
+            raise StateError(f"the table '{table.name}' has places from {values.min()} to {values.max()}")
+        found[table.name] = np.ascontiguousarray(values, dtype=np.int32)
+    return found
+
+
+def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[str]) -> dict[str, int]:
+    """The value of every size, from the shapes of arrays.
+
+    Raises:
+        StateError: where two arrays say different things, and where none says any.
+    """
+    found: dict[str, tuple[int, Array]] = {}
+    for array, shape in arrays:
+        for axis, length in zip(array.axes, shape, strict=True):
+            known, other = found.setdefault(axis.name, (length, array)) if axis.name else (axis.number, array)
+            if known != length:
+                raise StateError(f"{axis} is {length} in {array} and {known} in {other}")
+    for name in names:
+        if name not in found:
+            raise StateError(f"nothing says how large {name} is: give the arrays that have it")
+    return {name: length for name, (length, _) in found.items()}
+
+
+def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables: Mapping[str, Places]) -> None:
+    """Raise :class:`StateError` where, with these sizes and tables, an access leaves its array."""
+    for access, loops in interface.accesses:
+        spans = {loop.index: loop for loop in loops}
+        if any(loop.end.at(sizes) <= loop.first.at(sizes) for loop in loops):
+            continue  # nothing is summed
+        for place, axis in zip(access.places, access.array.axes, strict=True):
+            length, offset = axis.at(sizes), place.base.number
+            if place.table:
+                column = tables[place.table][:, place.column]
+                low, high = (int(column.min()), int(column.max())) if column.size else (0, 0)
+            elif place.index:
+                loop = spans[place.index]
+                low, high = loop.first.at(sizes) + offset, loop.end.at(sizes) - 1 + offset
+                if loop.periodic:
+                    low, high = (0, length - 1) if abs(offset) <= length else (low, high)
+            else:
+                low = high = place.base.at(sizes)
+            if low < 0 or high >= length:
+                raise StateError(f"{access} goes from {low} to {high}, but {access.array} has {axis} = {length} places")
+
+
+def _of_axes(array: Array, values: Numbers, what: str) -> Numbers:
+    literal = [(k, axis.number) for k, axis in enumerate(array.axes) if not axis.name]
+    if values.ndim != len(array.axes) or any(values.shape[k] != number for k, number in literal):
+        raise StateError(f"{what}: '{array.name}' has the shape {values.shape}, which is not that of {array}")
+    _check_finite(values, f"{what}: '{array.name}'")
+    return values
+
+
+def _check_finite(values: Numbers, what: str) -> None:
+    if not np.all(np.isfinite(values)):
+        place = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
+        raise StateError(f"{what} is not finite at {[int(k) for k in place]}")
+
+
+def _check_named(given: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:
+    for name in given:
+        if name not in names:
+            raise StateError(
+                f"there is no '{name}' among {what}{closest(name, names)} Known: {', '.join(names) or 'none'}"
+            )
+    for name in names:
+        if whole and name not in given:
+            raise StateError(f"'{name}' is missing among {what}")
+
+
+def _text(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape))

@@ -1,0 +1,231 @@
+"""A run over arrays of any size: its memory, steps, energy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.indexed_interface import (
+    IndexedInterface,
+    Numbers,
+    check_accesses,
+    field_values,
+    number_values,
+    read_state,
+    read_tables,
+    sizes_of,
+)
+from scvi_codegen.runtime.portions import SLICE_SECONDS
+
+__all__ = ["IndexedRun"]
+
+ADVICE = {
+    "not converged": "sweeps contract where h times the highest frequency is less than about 2: try a smaller step",
+    "not finite": "the Lagrangian is undefined there, or the step is far too large",
+}
+ALIGNMENT = 64
+"""Bytes: those of the widest vector."""
+
+
+class IndexedRun:
+    """The memory of a run; made by :meth:`IndexedStepper.start`.
+
+    Attributes:
+        iterations: sweeps of all steps yet.
+        sizes: value of each size.
+    """
+
+    def __init__(
+        self,
+        interface: IndexedInterface,
+        binding: Binding,
+        *,
+        q: ArrayLike | Mapping[str, ArrayLike],
+        p: ArrayLike | Mapping[str, ArrayLike] | None,
+        velocity: ArrayLike | Mapping[str, ArrayLike] | None,
+        h: float,
+        t: float,
+        parameters: Mapping[str, ArrayLike] | None,
+        tables: Mapping[str, ArrayLike] | None,
+        options: SolverOptions | None,
+    ) -> None:
+        self.interface, self._binding, self.iterations = interface, binding, 0
+        self._options = binding.options(options)
+        places, state = read_tables(interface, tables), read_state(interface, q, "positions")
+        shapes = [(array, state[array.name].shape) for array in interface.coordinates]
+        shapes += [(table, places[table.name].shape) for table in interface.tables]
+        given = dict(parameters or {})
+        numbers = number_values(interface, given)
+        shapes += [
+            (field, np.shape(given[field.name])) for field in interface.fields if np.ndim(given.get(field.name, 0.0))
+        ]
+        self.sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.sizes)
+        fields = field_values(interface, given, self.sizes)
+        check_accesses(interface, self.sizes, places)
+        self._kept = (places, fields)
+        self._problem = self._new_problem(numbers)
+        self._start(state, self._momenta(p, velocity), checked_step(h), checked_number(t, "t"))
+
+    def _new_problem(self, numbers: list[float]) -> Any:
+        places, fields = self._kept
+        problem = self._binding.new("problem *")
+        for k, name in enumerate(self.interface.sizes):
+            problem.size[k] = self.sizes[name]
+        for k, array in enumerate(self.interface.fields):
+            problem.field[k] = self._binding.pointer(fields[array.name].reshape(-1))
+        for k, table in enumerate(self.interface.tables):
+            problem.table[k] = self._binding.pointer(places[table.name].reshape(-1))
+        for k, value in enumerate(numbers):
+            problem.parameters[k] = value
+        return problem
+
+    def _momenta(self, p: Any, velocity: Any) -> tuple[Any, str]:
+        if p is not None and velocity is not None:
+            raise StateError("give momenta p or the velocity, not both")
+        return (p, "momenta") if velocity is None else (velocity, "velocities")
+
+    def _start(self, state: Mapping[str, Numbers], moving: tuple[Any, str], h: float, t: float) -> None:
+        n = self._binding.function("coordinates")(self._problem)
+        self._numbers = {name: aligned(n) for name in ("q", "p", "carry_q", "carry_p", "inverse_mass")}
+        self._numbers["work"] = aligned(n * self.interface.work)
+        inverse = self._numbers["inverse_mass"]
+        if self._binding.function("inverse_masses")(self._problem, self._pointer("inverse_mass")):
+            place = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
+            raise StateError(f"coordinate {place} of {n} has no positive mass: every one needs a kinetic energy")
+        self._numbers["q"][:] = self._flat(state)
+        given, what = moving
+        if given is not None:
+            values = read_state(self.interface, given, what)
+            for name, array in values.items():
+                if array.shape != state[name].shape:
+                    raise StateError(f"{what}: '{name}' has the shape {array.shape}, positions {state[name].shape}")
+            self._numbers["p"][:] = self._flat(values) if what == "momenta" else self._flat(values) / inverse
+        self._run = self._binding.new("run *")
+        self._run.t, self._run.h = t, h
+        for name in self._numbers:
+            setattr(self._run, name, self._pointer(name))
+
+    def _pointer(self, name: str) -> Any:
+        return self._binding.pointer(self._numbers[name])
+
+    @staticmethod
+    def _flat(state: Mapping[str, Numbers]) -> Numbers:
+        return np.concatenate([array.reshape(-1) for array in state.values()])
+
+    @property
+    def t(self) -> float:
+        """Time."""
+        return float(self._run.t)
+
+    @property
+    def h(self) -> float:
+        """The step."""
+        return float(self._run.h)
+
+    @property
+    def steps(self) -> int:
+        """Steps yet."""
+        return int(self._run.step)
+
+    @property
+    def q(self) -> dict[str, Numbers]:
+        """Positions by the name of their array, copies."""
+        return self._arrays(self._numbers["q"])
+
+    @property
+    def p(self) -> dict[str, Numbers]:
+        """Momenta by the name of the array of their coordinates, copies."""
+        return self._arrays(self._numbers["p"])
+
+    @property
+    def velocity(self) -> dict[str, Numbers]:
+        """Velocities by the name of the array of their coordinates."""
+        return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
+
+    def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
+        found, start = {}, 0
+        for array in self.interface.coordinates:
+            shape = array.shape(self.sizes)
+            size = int(np.prod(shape))
+            found[array.name] = flat[start : start + size].reshape(shape).copy()
+            start += size
+        return found
+
+    @property
+    def energies(self) -> tuple[float, float, float]:
+        """Kinetic and potential energy of the present state, and their sum; added up in twice the precision."""
+        found, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
+        self._binding.function("energies")(self._problem, self.t, *pointers, self._binding.pointer(found))
+        return (float(found[0]), float(found[1]), float(found[2]))
+
+    @property
+    def energy(self) -> float:
+        """Their sum."""
+        return self.energies[2]
+
+    @property
+    def momentum_maps(self) -> Numbers:
+        """What symmetries conserve (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`), (count,)."""
+        q, p = self.q, self.p
+        return np.array([_momentum(q[array], p[array], *components) for _, array, *components in self.interface.maps])
+
+    @property
+    def step_error(self) -> float:
+        """An estimate of the error of the end of the worst step, relative to the largest coordinate."""
+        return float(self._binding.function("step_error")(self._run))
+
+    @property
+    def step_error_t(self) -> float:
+        """When that step began."""
+        return float(self._run.error_t)
+
+    def advance(self, steps: int, *, progress: Callable[[int], None] | None = None) -> None:
+        """So many steps.
+
+        Args:
+            steps: their number.
+            progress: called now and then with the number of steps of the run.
+
+        Raises:
+            StepFailedError: if one fails; the run stands before it.
+        """
+        steps, done, portion = checked_count(steps, "steps", least=0), 0, 1
+        report = self._binding.new("report *")
+        while done < steps:
+            size, began = min(portion, steps - done), time.perf_counter()
+            status = self._binding.function("advance")(self._run, self._problem, size, self._options, report)
+            done += report.steps
+            self.iterations += report.iterations
+            if status:
+                raise step_failure(status, report, step=self.steps, h=self.h, advice=ADVICE)
+            if progress is not None:
+                progress(self.steps)
+            elapsed = max(time.perf_counter() - began, 1e-6)
+            portion = max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed)))
+
+
+def aligned(count: int) -> Numbers:
+    """So many zeros, the first on the boundary of a vector."""
+    try:
+        memory = np.zeros(count + ALIGNMENT // 8)
+    except (MemoryError, ValueError) as error:
+        raise StateError(f"{count} numbers do not fit into the memory") from error
+    start = -memory.ctypes.data % ALIGNMENT // 8
+    return memory[start : start + count]
+
+
+def _momentum(q: Numbers, p: Numbers, component: int | None, other: int | None) -> float:
+    if component is None:
+        return float(np.sum(p))
+    if other is None:
+        return float(np.sum(p[..., component]))
+    return float(np.sum(q[..., component] * p[..., other] - q[..., other] * p[..., component]))

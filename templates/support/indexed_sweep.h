@@ -1,0 +1,175 @@
+/* A step of any number of coordinates by sweeps, for constant diagonal masses and forces of position and time: that of
+ * separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h, contraction.h, the
+ * tables, forces. */
+
+/* The parts of work: positions at the points, and forces there in this step, the last and the one before. */
+typedef struct {
+  lanes *X, *F, *last, *before;
+} parts_of_work;
+
+static parts_of_work divide(const run_memory *run, long long n)
+{
+  lanes *work = (lanes *)run->work, *forces_of[3];
+  parts_of_work parts;
+  for (int k = 0; k < 3; k++)
+    forces_of[(k + run->turn) % 3] = work + (k + 1) * n;
+  parts.X = work;
+  parts.F = forces_of[0], parts.last = forces_of[1], parts.before = forces_of[2];
+  return parts;
+}
+
+/* h^2 = square + square_low. */
+typedef struct {
+  double h, square, square_low;
+} lengths;
+
+static lengths lengths_of(double h)
+{
+  const lengths of = {h, h * h, fma(h, h, -(h * h))};
+  return of;
+}
+
+/* h v of a coordinate in two parts. */
+static inline double drift_of(const run_memory *run, long long i, double *low)
+{
+  const double v = run->inverse_mass[i] * run->p[i], v_low = fma(run->inverse_mass[i], run->p[i], -v);
+  const double drift = run->h * v;
+  *low = fma(run->h, v, -drift) + run->h * (v_low + run->inverse_mass[i] * run->carry_p[i]);
+  return drift;
+}
+
+/* Where the points stand by the forces of former steps, or without any. */
+static void first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+{
+  for (long long i = 0; i < n; i++) {
+    double low;
+    const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
+    lanes x = run->q[i] + DRIFT[0] * drift;
+    if (run->guess == 1)
+      x += unit * lanes_apply(LAST_ALONE, &parts->last[i]);
+    else if (run->guess > 1)
+      x += unit * (lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]));
+    parts->X[i] = x;
+  }
+}
+
+/* The points by the forces; returned is the sum of the squares of what that changes, and added to `size`, if it is not
+ * NULL, that of the sizes of the coordinates. */
+static double improve(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n, double *size)
+{
+  lanes total = lanes_of(0.0);
+  for (long long i = 0; i < n; i++) {
+    double low;
+    const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
+    const lanes x = (run->q[i] + DRIFT[0] * drift) + unit * lanes_apply(PRODUCT, &parts->F[i]);
+    const lanes moved = x - parts->X[i];
+    total += moved * moved;
+    parts->X[i] = x;
+    if (size) {
+      const lane_view force = {parts->F[i]};
+      const double of_one = fabs(run->q[i]) + fabs(drift) + fabs(unit * force.lane[0]);
+      *size += of_one * of_one;
+    }
+  }
+  return lanes_total(total);
+}
+
+/* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
+static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
+{
+  const lanes sum = x + y, part = sum - x;
+  return sum + (((x - (sum - part)) + (y - part)) + rest);
+}
+
+/* The points with all digits of the coefficients. */
+static void last_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+{
+  for (long long i = 0; i < n; i++) {
+    double drift_low;
+    const double drift = drift_of(run, i, &drift_low), inverse = run->inverse_mass[i];
+    const lanes sum = lanes_apply(PRODUCT, &parts->F[i]), low = lanes_apply(PRODUCT_LOW, &parts->F[i]);
+    const lanes rest = run->carry_q[i] + DRIFT[0] * drift_low + DRIFT_LOW[0] * drift;
+    parts->X[i] = sum_of_three(lanes_of(run->q[i]), DRIFT[0] * drift + inverse * (by->square * sum),
+        rest + inverse * (by->square * low + by->square_low * sum));
+  }
+}
+
+/* Whether all forces are finite. */
+static int finite_forces(const lanes *F, long long n)
+{
+  lanes faults = lanes_of(0.0);
+  for (long long i = 0; i < n; i++)
+    faults += 0.0 * F[i];
+  return lanes_total(faults) == 0.0;
+}
+
+/* What the highest coefficient of the forces at the points moves a coordinate by, squared, over what they bend it by:
+ * the largest of these, everything as a part of the largest coordinate. */
+static double unresolved(const run_memory *run, const lanes *F, const lengths *by, long long n)
+{
+  double largest = DBL_MIN, least = 0.0;
+  for (long long i = 0; i < n; i++)
+    largest = larger(largest, fabs(run->q[i]));
+  for (long long i = 0; i < n; i++) {
+    const lane_view force = {F[i]};
+    const double unit = by->square * run->inverse_mass[i], size = fabs(run->q[i]) + largest;
+    const double bend = fabs(unit) * (fabs(force.lane[0]) + fabs(force.lane[KEPT - 1])) + NEGLIGIBLE * size;
+    const double top = RESOLVED * unit * lanes_total(HIGHEST * F[i]);
+    least = larger(least, top * top / (bend * size));
+  }
+  return least;
+}
+
+/* The state at the end of the step. */
+static void move(run_memory *run, const lanes *F, const lengths *by, long long n)
+{
+  const lanes kick = by->h * POINT_END_MOMENTUM[0];
+  const lanes kick_low = fused_weights(by->h, POINT_END_MOMENTUM[0], -kick) + by->h * POINT_END_MOMENTUM_LOW[0];
+  for (long long i = 0; i < n; i++) {
+    double drift_low;
+    const double drift = drift_of(run, i, &drift_low), inverse = run->inverse_mass[i];
+    const double sum = lanes_total(multiply_add(POINT_END_POSITION[0], F[i], POINT_END_POSITION_LOW[0] * F[i]));
+    const double bent = inverse * (by->square * sum), increment = drift + bent, part = increment - drift;
+    const double low = (drift - (increment - part)) + (bent - part) + (drift_low + inverse * (by->square_low * sum));
+    add_compensated(&run->q[i], &run->carry_q[i], increment, low);
+    add_compensated(&run->p[i], &run->carry_p[i], lanes_total(multiply_add(kick, F[i], kick_low * F[i])), 0.0);
+  }
+}
+
+/* Sweeps until the points rest; then once more with all digits of the coefficients, and on to the end of the step. */
+static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+    solver_report *report)
+{
+  const parts_of_work parts = divide(run, n);
+  const lengths by = lengths_of(run->h);
+  const lanes t = run->t + run->h * ABSCISSA[0];
+  double size = 0.0, first = 0.0, last = INFINITY, error;
+  int status = 0;
+  first_positions(run, &parts, &by, n);
+  forces(given, parts.X, t, parts.F, n);
+  for (int k = 0; status == 0; k++) {
+    double change = improve(run, &parts, &by, n, k == 0 ? &size : NULL);
+    change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
+    forces(given, parts.X, t, parts.F, n);
+    status = sweep_status(change, last, options, k);
+    first = k == 0 ? change : first;
+    last = change;
+    report->iterations++;
+  }
+  report->change = sqrt(last);
+  if (status < 0)
+    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  last_positions(run, &parts, &by, n);
+  forces(given, parts.X, t, parts.F, n);
+  if (!finite_forces(parts.F, n))
+    return NOT_FINITE;
+  error = unresolved(run, parts.F, &by, n);
+  if (run->error == run->error && !(error <= run->error)) {
+    run->error = error;
+    run->error_t = run->t;
+  }
+  move(run, parts.F, &by, n);
+  run->guess = run->guess > 0 && first < GOOD_GUESS ? 2 : 1;
+  run->turn = (run->turn + 1) % 3;
+  return OK;
+}

@@ -1,0 +1,90 @@
+"""Sums over indices: what is read, and what is refused with a remedy."""
+
+import pytest
+
+from scvi_codegen.errors import ExpressionError, SystemDefinitionError
+from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.symbols import symbol
+
+ARRAYS = [parse_array(text) for text in ("q[N]", "r[N, 3]", "u[NX, NY]", "k[B]")]
+TABLES = [parse_array("bonds[B, 2]")]
+NAMES = {name: symbol(name) for name in ("c", "t")}
+
+
+def terms(text: str) -> tuple[IndexedTerm, ...]:
+    """What is read."""
+    return parse_indexed(text, ARRAYS, NAMES, TABLES)
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("sum(i in N, q[i]**2)", ["sum(i in N, q[i]**2)"]),
+        ("-c*sum(i in 0..N-2, q[i]*q[i+1])/2", ["sum(i in 0..N-2, -c*q[i+1]*q[i]/2)"]),
+        ("sum(i in N periodic, q[i-2]*q[i])", ["sum(i in N periodic, q[i-2]*q[i])"]),
+        ("sum(i < j in N, cos(q[i] - q[j]))", ["sum(i < j in N, cos(q[i] - q[j]))"]),
+        ("sum(b in B, k[b]*q[bonds[b, 0]])", ["sum(b in B, k[b]*q[bonds[b, 0]])"]),
+        ("sum(i in NX periodic, j in 1..NY-1, u[i+1, j]*u[i, j-1])", None),
+        ("sum(i in N, sum(a in 3, r[i, a]**2))", ["sum(i in N, r[i, 0]**2 + r[i, 1]**2 + r[i, 2]**2)"]),
+        ("sum(i in N, sum(a < b in 3, r[i, a]*r[i, b]))", None),
+        ("sum(i in N, q[i]) + sum(j in N, q[j])", ["sum(i in N, q[i])", "sum(j in N, q[j])"]),
+        ("sum(i in N, q[i]) - sum(i in N, t*q[i]**2)", ["sum(i in N, -q[i]**2*t + q[i])"]),
+        ("q[0]**2 + q[N-1]", ["q[0]**2 + q[N-1]"]),
+        ("sum(a in 0..2, q[a])", ["q[0] + q[1] + q[2]"]),
+    ],
+)
+def test_what_is_written_is_read(text: str, read: list[str] | None) -> None:
+    """Terms over the same loops are one; sums over whole numbers are written out; the text of a term is read again."""
+    found = terms(text)
+    if read is not None:
+        assert [str(term) for term in found] == read
+    again = terms(" + ".join(f"({term})" if not term.loops else str(term) for term in found))
+    assert again == found
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sum(i in N, q[i+1])", "i+1 is N at i = N-1: end at i in 0..N-2, or write 'i in N periodic'"),
+        ("sum(i in N, q[i-1])", "i-1 is -1 at i = 0: begin at i in 1..N-1"),
+        ("sum(i in 0..N, q[i])", "i is N at i = N: end at i in 0..N-1"),
+        ("sum(i in 0..N-2 periodic, q[i])", "is no index of a periodic axis of N"),
+        ("q[N]", "N is not on an axis of N"),
+        ("q[-1]", "-1 is not on an axis of N"),
+        ("sum(i in N, r[i, 3])", "3 is not on an axis of 3"),
+        ("sum(i in N, q[i, 0])", "has 1 axes, not 2"),
+        ("sum(i in M, q[i])", "'M' is the size of no array"),
+        ("sum(i in N, x[i])", "'x' is no array"),
+        ("sum(i in N, q[j])", "'j' is no index"),
+        ("sum(i in N, q)", "'q' is an array: write q[N]"),
+        ("sum(i in N, i*q[i])", "'i' is an index, which stands in brackets"),
+        ("N*sum(i in N, q[i])", "'N' is a size, which stands in brackets"),
+        ("sum(b in B, bonds[b, 0])", "'bonds' is a table"),
+        ("sum(b in B, q[bonds[b, 2]])", "2 is not on an axis of 2"),
+        ("sum(b in B, q[bonds[b+1, 0]])", "b+1 is B at b = B-1"),
+        ("sum(b in 0..B-2, q[bonds[b+1, 0]])", "a table is accessed by an index and a whole number"),
+        ("sum(i in N, sum(i in 3, q[i]))", "the index 'i' is used by a sum around this one"),
+        ("sum(c in N, q[c])", "'c' has a meaning"),
+        ("sum(i in N, q[i])**2", "a sum may be multiplied by numbers and parameters only"),
+        ("sum(i in N, q[i])*sum(i in N, q[i])", "a sum may be multiplied by numbers and parameters only"),
+        ("sum(i in N, sum(j in N, q[j]))", "a sum within a sum has bounds that are whole numbers"),
+        ("sum(i < j in 1..N-1, q[i])", "pairs are taken from a whole axis"),
+        ("sum(a in 100, q[a])", "1 to 64 terms, not 100"),
+        ("sum(i in N q[i])", "',' is expected here"),
+        ("sum(i in N, q[i)", "']' is expected here"),
+        ("sum(i, q[0])", "'in' is expected here"),
+        ("q[1.5]", "a whole number is expected here"),
+    ],
+)
+def test_what_is_refused(text: str, message: str) -> None:
+    """With the column, and what to write."""
+    with pytest.raises(ExpressionError) as caught:
+        terms(text)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["q", "q[]", "q[N", "q[N]x", "q[N+1]", "q[0]", "2[N]", "for[N]", "q[N.5]"])
+def test_declarations_that_are_none(text: str) -> None:
+    """An array has a name and axes."""
+    with pytest.raises(SystemDefinitionError):
+        parse_array(text)

@@ -1,0 +1,154 @@
+"""Systems of sums over indices: their form, their symmetries, and what they are written out."""
+
+import numpy as np
+import pytest
+import sympy
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.indexed.expansion import expand_sums
+from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+
+GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
+DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"
+
+
+def system(coordinates: str, lagrangian: str, **beside: object) -> IndexedSystem:
+    """A system of one array."""
+    return IndexedSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **beside)
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "message"),
+    [
+        ("sum(i in N, q[i]*q_dot[i]**2)", "velocities as m*v**2/2 alone"),
+        ("sum(i in N, t*q_dot[i]**2)", "with a constant mass m"),
+        ("sum(i in N, q_dot[i]**2 + q[i]*q_dot[i])", "velocities as m*v**2/2 alone"),
+        ("sum(i in 0..N-2, q_dot[i]*q_dot[i+1] + q_dot[i]**2)", "velocities as m*v**2/2 alone"),
+        ("sum(i in N, q_dot[i]**4)", "with a constant mass m"),
+        ("sum(i in N, q[i]**2)", "no term has q_dot"),
+        ("sum(i in N, q_dot[i]**2 + sqrt(q[i] - q[i] - 1))", "real"),
+    ],
+)
+def test_velocities_occur_in_one_form(lagrangian: str, message: str) -> None:
+    """Which the error shows."""
+    with pytest.raises(SystemDefinitionError, match=message.replace("*", r"\*")):
+        system("q[N]", lagrangian)
+
+
+@pytest.mark.parametrize(
+    "beside", [{"parameters": {"q": 1}}, {"parameters": {"N": 1}}, {"parameters": {"k[N]": 1, "k": 2}}]
+)
+def test_a_name_means_one_thing(beside: dict[str, dict[str, float]]) -> None:
+    """Arrays, numbers and sizes."""
+    with pytest.raises(SystemDefinitionError):
+        system("q[N]", "sum(i in N, q_dot[i]**2)", **beside)
+
+
+def test_maps_of_bodies_in_space() -> None:
+    """Three shifts and three turns of isolated bodies; a field along z leaves two and one."""
+    pairs = f"sum(i < j in N, m[i]*m[j]/{DISTANCE})"
+    free = system("r[N, 3]", GRAVITY + pairs, parameters={"m[N]": 1})
+    assert [each.name for each in momentum_maps(free)] == [
+        "momentum of r[.., 0]",
+        "momentum of r[.., 1]",
+        "momentum of r[.., 2]",
+        "angular momentum of r[.., 0], r[.., 1]",
+        "angular momentum of r[.., 0], r[.., 2]",
+        "angular momentum of r[.., 1], r[.., 2]",
+    ]
+    falling = system("r[N, 3]", f"{GRAVITY}{pairs} - sum(i in N, m[i]*r[i, 2])", parameters={"m[N]": 1})
+    assert len(momentum_maps(falling)) == 3
+
+
+def test_a_turn_needs_equal_masses() -> None:
+    """Of the two components."""
+    kinetic = "sum(i in N, r_dot[i, 0]**2 + w*r_dot[i, 1]**2)"
+    round_trap = " - sum(i in N, r[i, 0]**2 + r[i, 1]**2)"
+    assert not momentum_maps(system("r[N, 2]", kinetic + round_trap, parameters={"w": 2}))
+    assert momentum_maps(system("r[N, 2]", kinetic.replace("w*", "") + round_trap))
+
+
+def test_a_chain_between_walls_has_no_momentum() -> None:
+    """One of free or joined ends has."""
+    kinetic, springs = "sum(i in N, q_dot[i]**2/2)", " - sum(i in 0..N-2, (q[i+1] - q[i])**4)"
+    assert len(momentum_maps(system("q[N]", kinetic + springs))) == 1
+    assert not momentum_maps(system("q[N]", f"{kinetic}{springs} - q[0]**2 - q[N-1]**2"))
+
+
+def test_what_is_written_out() -> None:
+    """Every element with its own coordinates, parameters and places."""
+    net = IndexedSystem.from_text(
+        name="net",
+        coordinates=["q[N]"],
+        parameters={"k[B]": 1, "c": 2},
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - c*sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)",
+    )
+    found = expand_sums(net, {"N": 3, "B": 2}, tables={"bonds": [[0, 2], [2, 1]]}, parameters={"k": [5, 7], "c": 3})
+    q, v, k = (sympy.symbols(f"{name}_:3{end}", real=True) for name, end in (("q", ""), ("q", "_dot"), ("k", "")))
+    c = sympy.Symbol("c", real=True)
+    springs = k[0] * (q[0] - q[2]) ** 2 + k[1] * (q[2] - q[1]) ** 2
+    assert sympy.expand(found.lagrangian - sum(x**2 for x in v) / 2 + c * springs) == 0
+    assert found.constants == {c: 3.0, k[0]: 5.0, k[1]: 7.0}
+
+
+@pytest.mark.parametrize(
+    ("sizes", "beside", "message"),
+    [
+        ({}, {}, "the sizes of 'chain' are N: give each"),
+        ({"N": 1}, {}, r"q\[1\] is at \[1\], outside of q\[N\]"),
+        ({"N": 3}, {"parameters": {"mu": np.ones(3)}}, "has no parameter 'mu'"),
+        ({"N": 3}, {"parameters": {"m": np.ones(4)}}, r"'m' has the shape \(4,\)"),
+        ({"N": 3}, {"tables": {"x": [[1]]}}, "the tables of 'chain' are none"),
+    ],
+)
+def test_what_cannot_be_written_out(sizes: dict[str, int], beside: dict[str, object], message: str) -> None:
+    """Sizes, tables and parameters are those of the system."""
+    chain = IndexedSystem.from_text(
+        name="chain", coordinates=["q[N]"], parameters={"m[N]": 1}, lagrangian="sum(i in N, m[i]*q_dot[i]**2) - q[1]**2"
+    )
+    with pytest.raises(SystemDefinitionError, match=message):
+        expand_sums(chain, sizes, **beside)
+
+
+def test_sums_of_sympy_are_read() -> None:
+    """Rings, pairs, tables, several indices and decimals, as from text."""
+    q, v, bonds, k = map(sympy.IndexedBase, ("q", "q_dot", "bonds", "k"))
+    i, j, b, N, B = sympy.symbols("i j b N B", integer=True)
+    e = sympy.Symbol("e")
+    pairs = sympy.Sum(1 / sympy.sqrt((q[i] - q[j]) ** 2 + e**2), (j, i + 1, N - 1), (i, 0, N - 2))
+    ring = sympy.Sum(sympy.cos(q[sympy.Mod(i - 1, N)] - q[i]), (i, 0, N - 1))
+    net = sympy.Sum(k[b] * (q[bonds[b, 0]] - q[bonds[b, 1]]) ** 2, (b, 0, B - 1))
+    found = IndexedSystem.from_sympy(
+        name="system",
+        coordinates=["q[N]"],
+        parameters={"e": 1, "k[B]": 1},
+        tables=["bonds[B, 2]"],
+        lagrangian=sympy.Sum(0.5 * v[i] ** 2, (i, 0, N - 1)) - e * pairs - ring - net / 2,
+    )
+    expected = system(
+        "q[N]",
+        "sum(i in N, q_dot[i]**2/2) - e*sum(i < j in N, 1/sqrt((q[i] - q[j])**2 + e**2))"
+        "- sum(i in N periodic, cos(q[i-1] - q[i])) - sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)/2",
+        parameters={"e": 1, "k[B]": 1},
+        tables=["bonds[B, 2]"],
+    )
+    assert set(map(str, found.terms)) == set(map(str, expected.terms))
+
+
+@pytest.mark.parametrize(
+    ("index", "limits"),
+    [("Mod(2*i, N)", "(i, 0, N - 1)"), ("i", "(i, 0, N)"), ("i", "(j, i + 1, N - 1), (i, 1, N - 2)")],
+)
+def test_sums_of_sympy_that_are_refused(index: str, limits: str) -> None:
+    """Other rings, other limits, and what leaves its array."""
+    q, v = map(sympy.IndexedBase, ("q", "q_dot"))
+    i, j, N = sympy.symbols("i j N", integer=True)
+    names = {"i": i, "j": j, "N": N, "Mod": sympy.Mod}
+    place, spans = sympy.sympify(index, locals=names), sympy.sympify(f"[{limits}]", locals=names)
+    kinetic = sympy.Sum(v[i] ** 2 / 2, (i, 0, N - 1))
+    with pytest.raises(SystemDefinitionError):
+        IndexedSystem.from_sympy(
+            name="x", coordinates=["q[N]"], lagrangian=kinetic - sympy.Sum(q[place] ** 2, *map(tuple, spans))
+        )

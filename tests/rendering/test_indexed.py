@@ -1,0 +1,72 @@
+"""Text of integrators of sums over indices: strict C99, in style, as long for any number of coordinates."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from style import check_style
+
+from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods import as_method
+from scvi_codegen.native.building import find_compiler
+from scvi_codegen.rendering.indexed import render_indexed
+from scvi_codegen.rendering.source import Source
+
+STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wno-psabi", "-Werror"]
+
+LAGRANGIANS = {
+    "bodies": (
+        ["r[N, 3]"],
+        "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2)"
+        "+ g*sum(i < j in N, m[i]*m[j]/sqrt(sum(a in 3, (r[i, a] - r[j, a])**2)))",
+    ),
+    "all forms": (
+        ["u[NX, NY]", "q[N]"],
+        "sum(i in NX periodic, j in NY, u_dot[i, j]**2/2 - u[i-1, j]*u[i+2, j]*cos(g*t)) + sum(i in N, q_dot[i]**2)"
+        "- sum(b in B, exp(k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]]))) - q[0]*q[N-1]**3"
+        "- sum(i in 1..N-2, m[i]*q[i-1]*q[i+1])",
+    ),
+    "free": (["q[N]"], "sum(i in N, q_dot[i]**2/2)"),
+}
+
+
+def rendered(name: str, method: str) -> Source:
+    """The text of an integrator."""
+    coordinates, lagrangian = LAGRANGIANS[name]
+    system = IndexedSystem.from_text(
+        name=name,
+        coordinates=coordinates,
+        lagrangian=lagrangian,
+        parameters={"m[N]": 1, "k[B]": 1, "g": 2},
+        tables=["bonds[B, 2]"],
+    )
+    return render_indexed(lower_indexed(system, as_method(method, one_coordinate()), "indexed"))
+
+
+@pytest.mark.parametrize("method", ["svi:4", "stoermer-verlet"])
+@pytest.mark.parametrize("name", LAGRANGIANS)
+def test_it_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
+    """No warnings, in the style of all C here, and nothing that is not declared in the header."""
+    source = rendered(name, method)
+    for path, text in source.files.items():
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).write_text(text)
+    check_style(source.code)
+    check_style(source.header)
+    command = [*find_compiler(), *STRICT, "-c", "indexed.c", "-o", "indexed.o"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+
+
+def test_what_belongs_to_the_first_of_a_pair_is_read_and_added_once() -> None:
+    """Before and behind the loop over the second."""
+    code = rendered("bodies", "svi:4").code
+    outer = code.index(
+        "for (long long index_i = 0; index_i < size_N; index_i++)", code.index("static void add_force_0")
+    )
+    inner = code.index("for (long long index_j = index_i + 1", outer)
+    end = code.index("\n}\n", inner)
+    assert code[outer:inner].count("] = X[") == 3
+    assert code[inner:end].count("] = X[") == 3
+    assert code[inner:end].count("F[start_") == 6

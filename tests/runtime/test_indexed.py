@@ -1,0 +1,223 @@
+"""Integrators of sums over indices, held against those of the systems written out, which are derived on another way."""
+
+import pickle
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+KINETIC = "sum(i in N, q_dot[i]**2/2)"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system with sizes, data and a state."""
+
+    system: sc.IndexedSystem
+    q: Any
+    velocity: Any
+    h: float
+    tables: Any = None
+    parameters: Any = None
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """From the shape of the only array, and the rows of the only table."""
+        found = dict(zip(self.system.coordinates[0].names, self.q.shape, strict=False))
+        return found | {table.names[0]: len(self.tables[table.name]) for table in self.system.tables}
+
+
+def random(*shape: int) -> Any:
+    """Normal numbers, always the same."""
+    return np.random.default_rng(7).normal(size=shape)
+
+
+def case(coordinates: str, lagrangian: str, q: Any, velocity: Any, h: float, **beside: Any) -> Case:
+    """A system of one array."""
+    declared = {key: beside.pop(key) for key in ("declared", "places") if key in beside}
+    system = sc.IndexedSystem.from_text(
+        name="case",
+        coordinates=[coordinates],
+        lagrangian=lagrangian,
+        parameters=declared.get("declared"),
+        tables=declared.get("places", ()),
+    )
+    return Case(system, q, velocity, h, **beside)
+
+
+CASES = {
+    "ring": case(
+        "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])", random(5), None, 0.1
+    ),
+    "driven chain": case(
+        "q[N]",
+        "sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in 0..N-2, cosh(q[i+1] - q[i])) - q[0]**2 + q[N-1]*sin(t)",
+        random(4),
+        -random(4),
+        0.1,
+        declared={"m[N]": 1, "k": 1},
+        parameters={"m": [1, 2, 3, 4], "k": 1.5},
+    ),
+    "bodies": case(
+        "r[N, 2]",
+        "sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2)"
+        "+ sum(i < j in N, m[i]*m[j]/sqrt(sum(a in 2, (r[i, a] - r[j, a])**2) + e**2))",
+        3 * random(4, 2),
+        random(4, 2),
+        0.05,
+        declared={"m[N]": 1, "e": 0.5},
+        parameters={"m": [1, 2, 0.5, 1]},
+    ),
+    "net": case(
+        "q[N]",
+        f"{KINETIC} - sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2/2 + q[bonds[b, 0]]**4)",
+        random(5),
+        random(5),
+        0.1,
+        declared={"k[B]": 1},
+        places=["bonds[B, 2]"],
+        tables={"bonds": np.array([[0, 1], [1, 4], [3, 2], [0, 1], [2, 4]])},
+        parameters={"k": [1, 2, 3, 4, 5]},
+    ),
+    "field": case(
+        "u[NX, NY]",
+        "sum(i in NX periodic, j in NY, u_dot[i, j]**2/2 - (u[i+1, j] - u[i, j])**2 + cos(u[i, j]))"
+        "- sum(i in NX, j in 1..NY-1, (u[i, j] - u[i, j-1])**2)",
+        random(3, 2),
+        random(3, 2),
+        0.1,
+    ),
+}
+
+
+@pytest.mark.parametrize("method", ["svi:4", "gauss:2", "sc:5", "svi:9", "stoermer-verlet", "composition:8"])
+@pytest.mark.parametrize("name", CASES)
+def test_as_written_out(name: str, method: str) -> None:
+    """States, energies, momentum maps and errors of steps are those of the system written out, to round-off."""
+    each = CASES[name]
+    own = sc.compile_indexed(each.system, method).integrate(
+        each.q, velocity=each.velocity, h=each.h, steps=40, every=10, tables=each.tables, parameters=each.parameters
+    )
+    written = sc.expand_sums(each.system, each.sizes, tables=each.tables, parameters=each.parameters)
+    stepper = sc.compile_stepper(written, method)
+    velocity = np.zeros(each.q.size) if each.velocity is None else each.velocity.reshape(-1)
+    other = stepper.integrate(each.q.reshape(-1), velocity=velocity, h=each.h, steps=40, every=10)
+    array = each.system.coordinates[0].name
+    assert own.t == pytest.approx(other.t, abs=1e-15)
+    assert own.q[array].reshape(5, -1) == pytest.approx(other.q, rel=1e-12, abs=1e-12)
+    assert own.p[array].reshape(5, -1) == pytest.approx(other.p, rel=1e-12, abs=1e-12)
+    assert own.energy() == pytest.approx(other.energy(), rel=1e-12, abs=1e-12)
+    if method.startswith(("svi", "gauss")):
+        assert own.step_error == pytest.approx(other.step_error, rel=2.0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 64, 1000])
+def test_one_library_serves_every_size(count: int) -> None:
+    """A ring of coupled oscillators against its normal modes; momentum to round-off."""
+    stepper = sc.compile_indexed(
+        sc.IndexedSystem.from_text(
+            name="ring",
+            coordinates=["q[N]"],
+            lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        ),
+        "svi:6",
+    )
+    q, velocity = random(count), random(2, count)[1]
+    run = stepper.integrate(q, velocity=velocity, h=0.25, steps=40, every=40)
+    frequencies = 2 * np.abs(np.sin(np.pi * np.arange(count) / count))
+    modes, rates, phase = np.fft.fft(q), np.fft.fft(velocity), 10.0 * frequencies
+    slow = np.where(frequencies > 1e-12, np.sin(phase) / np.maximum(frequencies, 1e-12), 10.0)
+    expected = np.fft.ifft(modes * np.cos(phase) + rates * slow).real
+    assert run.q["q"][-1] == pytest.approx(expected, abs=1e-12)
+    assert np.ptp(run.momentum_maps()[:, 0]) < 1e-14 * np.sqrt(count)
+
+
+def test_energy_does_not_drift() -> None:
+    """Over 20 000 steps of a variational method; an explicit one of its order oscillates."""
+    each = CASES["ring"]
+    ring = sc.IndexedSystem.from_text(
+        name="ring",
+        coordinates=["q[N]"],
+        lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)",
+    )
+    run = sc.compile_indexed(ring, "svi:6").integrate(each.q, h=0.05, steps=20_000, every=200)
+    changes = run.energy() - run.energy()[0]
+    assert run.energy_error() < 1e-13
+    assert abs(changes[-20:].mean() - changes[:20].mean()) < 3e-14
+
+
+def test_runs_go_on() -> None:
+    """So many steps at once or one after the other give the same bits; a stepper survives a pickle."""
+    each = CASES["bodies"]
+    stepper = pickle.loads(pickle.dumps(sc.compile_indexed(each.system, "svi:4")))
+    runs = [stepper.start(each.q, velocity=each.velocity, h=0.05, parameters=each.parameters) for _ in range(2)]
+    runs[0].advance(30)
+    for _ in range(30):
+        runs[1].advance(1)
+    assert np.array_equal(runs[0].q["r"], runs[1].q["r"])
+    assert runs[0].t == runs[1].t
+    assert runs[0].steps == 30
+    assert runs[0].iterations == runs[1].iterations
+
+
+def test_observed_runs_keep_what_is_asked_for() -> None:
+    """And the first and the last state."""
+    each = CASES["ring"]
+    stepper = sc.compile_indexed(each.system, "svi:2")
+    run = stepper.integrate(each.q, h=0.01, steps=25, every=10, observe=lambda run: run.q["q"][:2])
+    assert run.observed is not None
+    assert run.observed.shape == (3, 2)
+    assert run.q["q"].shape == (2, 5)
+    assert run.t == pytest.approx([0.0, 0.1, 0.2])
+    assert np.array_equal(run.observed[-1], run.q["q"][-1, :2])
+
+
+@pytest.mark.parametrize(
+    ("q", "given", "message"),
+    [
+        (np.zeros((3, 3)), {}, "'bonds' is missing among tables"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 3]]}}, r"goes from 3 to 3, but r\[N, 3\] has N = 3 places"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, -1]]}}, "places from -1 to 0"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0.0, 1.0]]}}, "must be whole numbers"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [0, 1]}}, r"has the shape \(2,\)"),
+        (np.zeros((3, 2)), {"tables": {"bonds": [[0, 1]]}}, r"has the shape \(3, 2\), which is not that of r\[N, 3\]"),
+        (np.full((3, 3), np.nan), {"tables": {"bonds": [[0, 1]]}}, r"is not finite at \[0, 0\]"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [1, 2]}}, "B is 2 in k"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"kk": 1}}, "did you mean 'k'"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": np.inf}}, "is not finite"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "velocity": np.zeros((2, 3))}, r"positions \(3, 3\)"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "h": 0.0}, "the step h is 0"),
+        ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' among positions"),
+    ],
+)
+def test_what_does_not_fit_is_refused(q: Any, given: dict[str, Any], message: str) -> None:
+    """Before anything is done."""
+    net = sc.IndexedSystem.from_text(
+        name="net",
+        coordinates=["r[N, 3]"],
+        parameters={"k[B]": 1},
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(b in B, k[b]*r[bonds[b, 0], 0]*r[bonds[b, 1], 1])",
+    )
+    with pytest.raises(sc.StateError, match=message):
+        sc.compile_indexed(net, "svi:2").start(q, **{"h": 0.1, **given})
+
+
+def test_failures() -> None:
+    """A step that is too long says so and keeps the states before; a coordinate without a mass is found."""
+    each = CASES["ring"]
+    with pytest.raises(sc.StepFailedError, match="try a smaller step") as caught:
+        sc.compile_indexed(each.system, "svi:4").integrate(each.q, h=1.5, steps=3)
+    assert len(caught.value.trajectory.t) == 1
+    bare = sc.IndexedSystem.from_text(
+        name="bare", coordinates=["q[N]"], lagrangian="sum(i in 0..N-2, q_dot[i]**2/2) - sum(i in N, q[i]**2)"
+    )
+    with pytest.raises(sc.StateError, match="coordinate 2 of 3 has no positive mass"):
+        sc.compile_indexed(bare, "svi:2").start(np.ones(3), h=0.1)
+    with pytest.raises(sc.MethodError, match="no sweeps over positions"):
+        sc.compile_indexed(bare, "scvi:4")
+    with pytest.warns(sc.AccuracyWarning):
+        sc.compile_indexed(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)
