@@ -168,7 +168,10 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to find"),
         ({"bounds": {"k": (0, 1)}}, "'k' is not among the unknowns"),
         ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
-        ({"bounds": {"delta": (None, 1.0)}}, "the bounds of delta are .least, greatest., infinite where there is none"),
+        (
+            {"bounds": {"delta": (np.nan, 1.0)}},
+            "the bounds of delta are .least, greatest., infinite where there is none",
+        ),
         ({"unknown": ["alpha", "alpha"]}, "unknown names 'alpha' twice"),
         ({"observed": ["x", "x"]}, "observed names 'x' twice"),
         ({"deviations": np.inf}, "deviations are a positive number"),
