@@ -315,6 +315,7 @@ static const double STAGE_OTHER_BEND[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 
 #include "support/stage_error.h"
 #include "support/newton_from_line.h"
+#include "support/strays.h"
 
 #ifdef __GNUC__
 #define LANES 2

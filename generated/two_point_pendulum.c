@@ -133,6 +133,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #include "support/newton.h"
 #include "support/newton_from_line.h"
+#include "support/strays.h"
 
 #ifdef __GNUC__
 #define LANES 2

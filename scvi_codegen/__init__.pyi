@@ -96,8 +96,8 @@ from scvi_codegen.runtime.indexed_run import IndexedRun as IndexedRun
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper as IndexedStepper
 from scvi_codegen.runtime.indexed_stepper import IndexedTrajectory as IndexedTrajectory
 from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
-from scvi_codegen.runtime.periodic import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.periodic import periodic_orbit as periodic_orbit
+from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.run import Run as Run
 from scvi_codegen.runtime.stepper import Stepper as Stepper
 from scvi_codegen.runtime.trajectory import Trajectory as Trajectory

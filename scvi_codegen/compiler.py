@@ -41,6 +41,8 @@ from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.mechanics.changes import with_changes
+from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -120,6 +122,7 @@ def compile_stepper(
         controlled=texts.remembered("controlled", texts.controlled),
         fallback=texts.remembered("fallback", texts.fallback),
         tangent=texts.remembered("tangent", texts.tangent),
+        changes=lambda count: texts.remembered(f"changes {count}", partial(texts.changes, count))(),
         flags=flags,
         events=as_events(events),
     )
@@ -177,6 +180,16 @@ class _Texts:
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
         return render_derivatives(derivatives_of(self.system, stages, found))
+
+    def changes(self, count: int) -> Source | None:
+        """With small changes beside each of many trajectories, where their equations are sums of forces, too."""
+        twin, sweep = lagrangian_twin(self.system), self.program().sweep
+        varied = with_changes(twin, count) if twin and sweep and sweep.serves_many and sweep.constant_mass else None
+        if varied is None:
+            return None
+        stages, prefix = discretise(varied, self.method), self.program().prefix
+        program = lower(varied, self.method, stages, prefix=prefix, sweep=sweep_of(varied, stages), newton=False)
+        return render_ensemble(program)
 
     def _rendered(self, control: Control | None = None) -> Source:
         return render(self.program(), control, fallback="borrowed" if self.borrows else None)
@@ -304,7 +317,7 @@ def describe(
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
         has_fallback=borrows or (program.newton and program.sweep is not None),
-        momentum_names=tuple(auxiliary.name for auxiliary in system.auxiliaries),
+        momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         monitor="" if monitor is None else str(monitor),
         exchange_names=program.exchanges,
         constraints=program.constraints.formulas if program.constraints else (),

@@ -33,7 +33,8 @@ def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> An
     Returns:
         A ``casadi.Function`` of q (m), p (m), parameters (k), such as ``stepper.defaults``, t and h, by place or by
         name, t then being 0 where it is left out. Its values q1 and p1 are (m), with ``every`` (m, n), states in
-        columns. Where a step fails, so does the call, and solvers try shorter ways.
+        columns. Where a step fails, so does the call, and solvers try shorter ways. Where there are constraints,
+        states off them are taken as they are, and the first step leads to them.
 
     Raises:
         MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.errors import MethodError, MissingLibraryError, StateError
+from scvi_codegen.errors import MissingLibraryError, StateError
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.inputs import check_inputs_given, parameter_index
 from scvi_codegen.runtime.stepper import Stepper
@@ -38,8 +38,7 @@ class Flow:
             MethodError: for a stepper that has no derivatives, or whose steps are not all of h.
             StateError: for numbers of steps that are none, or do not fit.
         """
-        if stepper.interface.monitor:
-            raise MethodError("a flow has steps of h, not of lengths that a monitor chooses: compile without one")
+        stepper.check_steps_of_h("a flow")
         steps = checked_count(steps, "steps", least=1)
         every = 0 if every is None else checked_count(every, "every", least=1)
         if every and steps % every:

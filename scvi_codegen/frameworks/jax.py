@@ -48,7 +48,8 @@ class JaxFlow(Flow):
         """States at the end, or where every so-many-th is kept, at these.
 
         Args:
-            q, p: (.., m) initial positions and momenta. Leading axes are broadcast against each other.
+            q, p: (.., m) initial positions and momenta. Leading axes are broadcast against each other. Where there are
+                constraints, states off them are taken as they are, and the first step leads to them.
             h: (..) step.
             t: (..) initial time.
             parameters: by name, (..) each, others keeping their defaults; or (.., k) in order.

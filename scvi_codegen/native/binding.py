@@ -96,6 +96,18 @@ class Binding:
         """The bytes of a struct, writable."""
         return self._ffi.buffer(struct)
 
+    def records(self, structs: Any) -> NDArray[np.void]:
+        """An array of structs, by the names of their fields; the same memory."""
+        item = self._ffi.typeof(structs).item
+        layout: Any = {
+            "names": [name for name, _ in item.fields],
+            "formats": [_format(field.type) for _, field in item.fields],
+            "offsets": [field.offset for _, field in item.fields],
+            "itemsize": self._ffi.sizeof(item),
+        }
+        found: NDArray[np.void] = np.frombuffer(self._ffi.buffer(structs), dtype=layout)
+        return found
+
     def pointer(self, array: NDArray[Any]) -> Any:
         """To the first element of a contiguous float64 or int32 array; NULL for an empty one."""
         kind = "int[]" if array.dtype == np.int32 else "double[]"
@@ -113,3 +125,11 @@ class Binding:
             f"{self._prefix}_options *",
             [options.tolerance, options.max_iterations, int(options.absolute)],
         )
+
+
+def _format(kind: Any) -> tuple[Any, tuple[int, ...]]:
+    """Of a number or an array of numbers of C: what NumPy calls it, and its shape."""
+    shape: tuple[int, ...] = ()
+    while kind.kind == "array":
+        shape, kind = (*shape, kind.length), kind.item
+    return {"double": np.float64, "float": np.float32, "int": np.int32, "long long": np.int64}[kind.cname], shape

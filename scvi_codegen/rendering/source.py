@@ -110,7 +110,7 @@ class Interface:
         has_fallback: whether Newton's iteration is tried where sweeps fail.
         map_names, map_formulas: of the momentum maps, what symmetries conserve.
         map_exact: whether the method is known to conserve them exactly, to round-off.
-        momentum_names: of a Hamiltonian; see :attr:`momenta`.
+        momentum_names: in order; none in folders of version 0.1 for a Lagrangian: see :attr:`momenta`.
         exchange_names: of what forces give in a step, energy and momentum maps; none without forces.
         constraints: formulas of what the motion keeps at 0.
         inputs: names of functions of time given as data, each five of the parameters.
@@ -151,7 +151,7 @@ class Interface:
 
     @property
     def momenta(self) -> tuple[str, ...]:
-        """Names of the momenta: those of a Hamiltonian, else ``p_`` before the coordinate's."""
+        """Names of the momenta: those of a Hamiltonian, else ``p_`` before the coordinate's, where that is free."""
         return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
 
     def to_json(self) -> str:

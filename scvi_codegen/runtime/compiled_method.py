@@ -20,7 +20,7 @@ from scvi_codegen.runtime.inputs import (
 __all__ = ["CompiledMethod", "no_text"]
 
 
-def no_text() -> None:
+def no_text(*_: int) -> None:
     """Of a method without a text for many trajectories, or for steps that choose their length."""
 
 
@@ -47,11 +47,13 @@ class CompiledMethod:
         controlled: Callable[[], Source | None] = no_text,
         fallback: Callable[[], Source | None] = no_text,
         tangent: Callable[[], Source | None] = no_text,
+        changes: Callable[[int], Source | None] = no_text,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
         self._ensemble, self._controlled, self._fallback, self._tangent = ensemble, controlled, fallback, tangent
+        self._changes, self._with_changes = changes, dict[int, Source | None]()
         self._with_tangent: Binding | None = None
         self._with_control: Self | None = None
         self._plain = source
@@ -89,6 +91,15 @@ class CompiledMethod:
     def derivatives(self) -> Source | None:
         """The C text with the derivatives of steps, derived when first asked for; ``None`` in transformed time."""
         return self._tangent()
+
+    def changes(self, count: int) -> Source | None:
+        """The C text for many trajectories at once with so many small changes beside each, kept when asked for.
+
+        ``None`` where changes are carried along by the derivatives of steps alone.
+        """
+        if count not in self._with_changes:
+            self._with_changes[count] = self._changes(count)
+        return self._with_changes[count]
 
     def prepare(self) -> None:
         """Compile now what is otherwise compiled when a step first needs it: Newton's iteration behind sweeps.
@@ -166,6 +177,7 @@ class CompiledMethod:
             controlled=self._controlled,
             fallback=self._fallback,
             tangent=self._tangent,
+            changes=self.changes,
             flags=self.flags,
             events=wanted,
         )
@@ -192,6 +204,7 @@ class CompiledMethod:
             controlled=self._controlled,
             fallback=self._fallback,
             tangent=self._tangent,
+            changes=self.changes,
             flags=self.flags,
             events=self.events,
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.inputs import Array
 
 __all__ = ["Deviations"]
@@ -28,6 +29,7 @@ class Deviations:
     Attributes:
         t: (n,) times.
         lengths: (n, k) logarithms of the lengths of the changes, of length 1 at first.
+        greatest: (n, k) the greatest that these had after any step until then.
         stretches: (n, k) logarithms of the diagonal of R: the first i are that of the volume of i changes, summed.
         rates: (n, k) 2/T times the integral of T d(lengths), T the time passed: MEGNO before it is averaged.
         mean_rates: (n, k) the averages of these over the time passed.
@@ -36,10 +38,16 @@ class Deviations:
 
     t: Array
     lengths: Array
+    greatest: Array
     stretches: Array
     rates: Array
     mean_rates: Array
     status: NDArray[np.str_] | None = None
+
+    @classmethod
+    def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> Deviations:
+        """From (n,) times and (5, n, .., k) :data:`~scvi_codegen.runtime.growth.SERIES`."""
+        return cls(t=t, status=status, **dict(zip(SERIES, found, strict=True)))
 
     def lyapunov_exponents(self) -> Array:
         """(n, k) the k largest exponents of the time until each state, descending; not numbers at the first.
@@ -60,12 +68,12 @@ class Deviations:
         return mean
 
     def fli(self) -> Array:
-        """(n,) the fast Lyapunov indicator: the logarithm of the greatest length any change had until then.
+        """(n,) the fast Lyapunov indicator: the logarithm of the greatest length of any change until then.
 
         It grows as log t for regular motions, as lambda t for chaotic ones: Froeschle, Lega & Gonczi, Celest. Mech.
         Dyn. Astron. 67 (1997) 41; Froeschle & Lega, ibid. 78 (2000) 167.
         """
-        greatest: Array = np.maximum.accumulate(self.lengths.max(axis=-1), axis=0)
+        greatest: Array = self.greatest.max(axis=-1)
         return greatest
 
     def log_gali(self, k: int = 2) -> Array:

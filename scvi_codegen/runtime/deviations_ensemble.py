@@ -1,23 +1,29 @@
 """Indicators of chaos over many initial states: small changes carried along each motion, over threads.
 
-States and derivatives are told by the same steps in C, from piece to piece; of a motion nothing is kept but what the
+Where a text has changes beside the motions these go in vector lanes; else, and where a step in lanes fails, states and
+derivatives of each are told by the same steps in C, from piece to piece. Of a motion nothing is kept but what the
 indicators need, so that a million initial states are a question of time, not of memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.changes_in_lanes import MOTIONS, in_lanes
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import OK
+from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.spreading import Changes, ahead
@@ -45,6 +51,7 @@ class DeviationsEnsemble:
         parameters: EnsembleParameters,
         options: SolverOptions | None,
     ) -> None:
+        stepper.check_steps_of_h("a motion of an ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.every = steps if every is None else checked_count(every, "every", least=1)
@@ -54,28 +61,73 @@ class DeviationsEnsemble:
         self.t = times_after(start, self.h, np.arange(steps + 1))[0]
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
         self.changes = Changes.checked(stepper, count, directions)
-        self.found: dict[int, tuple[Deviations, StepFailedError | None]] = {}
+        self.status = np.full(len(self.q), OK, dtype="<U16")
+        self.found = np.full((len(SERIES), len(self.t[:: self.every]), len(self.q), self._width()), np.nan)
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> Deviations:
-        """Follow all motions; ``progress`` is called with the number of those done, and may raise to stop them."""
-        self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
-        run_each(len(self.q), self._follow, progress=progress, threads=threads)
-        found = [self.found[j] for j in range(len(self.q))]
+        """Follow all motions; ``progress`` is called with the number of those done, and may raise to stop them.
 
-        def of_all(name: str) -> Array:
-            return np.stack([getattr(each, name) for each, _ in found], axis=1)
+        In lanes, where the changes of a motion can stand beside it; else, and where steps in lanes failed, each by the
+        derivatives of its own.
+        """
+        told, left = progress or _silence, np.arange(len(self.q))
+        if (binding := self._lanes()) is not None:
+            left = self._all_in_lanes(binding, told, threads)
+        if len(left):
+            self.stepper.tangent  # noqa: B018  (compiled once, before threads ask for it)
+            before = len(self.q) - len(left)
+            run_each(
+                len(left),
+                lambda k, heed: self._follow(int(left[k]), heed),
+                progress=lambda done: told(before + done),
+                threads=threads,
+            )
+        return Deviations.of(self.t[:: self.every], self.found, self.status)
 
-        return Deviations(
-            t=self.t[:: self.every],
-            lengths=of_all("lengths"),
-            stretches=of_all("stretches"),
-            rates=of_all("rates"),
-            mean_rates=of_all("mean_rates"),
-            status=np.array([failure.status if failure else OK for _, failure in found]),
-        )
+    def _lanes(self) -> Binding | None:
+        """The compiled text with changes beside the motions, if there is one."""
+        if self.stepper.interface.constraints:
+            return None
+        source = self.stepper.changes(self.found.shape[-1])
+        return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
+
+    def _all_in_lanes(self, binding: Binding, told: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
+        """Follow all motions, so many at a time; the numbers of those whose steps failed."""
+        count, changes = len(self.q), self._first(0)
+        done = np.zeros(count, dtype=bool)
+
+        def follow(k: int, heed: Heed) -> None:
+            part = slice(k * MOTIONS, min((k + 1) * MOTIONS, count))
+            self.found[:, :, part], done[part] = in_lanes(
+                binding,
+                changes,
+                self.q[part],
+                self.p[part],
+                self.parameters[part],
+                t=self.t,
+                h=self.h,
+                every=self.every,
+                options=self.options,
+                heed=heed,
+            )
+
+        run_each(-(-count // MOTIONS), follow, progress=lambda _: told(int(done.sum())), threads=threads)
+        return np.flatnonzero(~done)
+
+    def _width(self) -> int:
+        """How many changes there are: of the first motion that has a step, where constraints leave fewer than 2m."""
+        for j in range(len(self.q)):
+            with suppress(StepFailedError):
+                return int(self._first(j).shape[1])
+        return self.changes.count or 2 * self.stepper.dimension
+
+    def _first(self, j: int) -> Array:
+        """(2m, k) the changes that motion j begins with."""
+        start = self.q[j], self.p[j], self.h, float(self.t[0])
+        return self.changes.at(*start, self.parameters[j], self.options)
 
     def _follow(self, j: int, heed: Heed) -> None:
-        self.found[j] = ahead(
+        found, failure = ahead(
             self.changes,
             self.q[j],
             self.p[j],
@@ -86,3 +138,10 @@ class DeviationsEnsemble:
             options=self.options,
             heed=heed,
         )
+        self.found[:, :, j] = np.nan if found is None else found
+        if failure:
+            self.status[j] = failure.status
+
+
+def _silence(_: int) -> None:
+    pass

@@ -6,26 +6,32 @@ times, and what is minimised is a smooth function of the unknowns whose slopes a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import FitError, StateError, closest
+from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest
 from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.runtime.driven import checked_inputs
 from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
-from scvi_codegen.runtime.measurements import Measurements, state_names
+from scvi_codegen.runtime.measurements import Measurements, distinct, state_names
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Fit", "fit"]
 
 SAME = 1e-10
 """Beside slopes of size 1: what is smaller tells nothing but rounding."""
+NEARER = 4
+"""Iterations of Gauss and Newton from what was found by steps half as long."""
+NOTICED = 1e-6
+"""Beside the largest unknown: by how much steps half as long may move one of which nothing is said."""
 SHARE = 0.1
 """Of a direction that changes nothing: an unknown with less of it is not named."""
 
@@ -37,7 +43,9 @@ class Fit:
     Attributes:
         names: of the k unknowns: parameters, then coordinates and momenta of the initial state.
         values: (k,) of the unknowns.
-        covariance: (k, k) of their errors, to first order.
+        covariance: (k, k) of their errors, to first order, those at bounds taken as known, with not numbers in their
+            place; none are numbers where there are no more measurements than unknowns and no noise is given.
+        at_bounds: names of the unknowns that a bound holds, not the measurements.
         parameters: of the motion, all of them by name; q, p: (m,) its initial state.
         t: (n,) times of the measurements, the initial state being that at ``start``.
         observed: names of the c quantities measured.
@@ -49,6 +57,7 @@ class Fit:
     names: tuple[str, ...]
     values: Array
     covariance: Array
+    at_bounds: tuple[str, ...]
     parameters: dict[str, float]
     q: Array
     p: Array
@@ -69,7 +78,7 @@ class Fit:
         width = max(map(len, self.names))
         errors = self.standard_errors.values()
         lines = [
-            f"{name:{width}} = {value:.8g} +- {error:.2g}"
+            f"{name:{width}} = {value:.8g} " + ("at its bound" if name in self.at_bounds else f"+- {error:.2g}")
             for name, value, error in zip(self.names, self.values, errors, strict=True)
         ]
         return "\n".join(lines)
@@ -124,16 +133,17 @@ def fit(
         deviations: number or (c,), standard deviations of the noise; by default the same for all, and told by what is
             left.
         inputs: as of :meth:`Stepper.drive`.
-        bounds: (least, greatest) by names of unknowns.
+        bounds: (least, greatest) by names of unknowns, infinite where there is none.
 
     Returns:
-        A :class:`Fit`.
+        A :class:`Fit`. An :class:`~scvi_codegen.AccuracyWarning` says where steps of h, not the measurements, tell an
+        unknown: where half as long ones would move it by more than its standard error.
 
     Raises:
         FitError: where the measurements do not tell an unknown, or no least squares are found.
-        MethodError: with constraints, and in transformed time.
+        MethodError: with constraints, in transformed time, and where a monitor chooses the steps.
         StateError: on wrong shapes, names or numbers.
-        StepFailedError: if a step fails on the way.
+        StepFailedError: if a step of the first guess fails.
     """
     from scipy.optimize import least_squares  # here: slow to import
 
@@ -152,8 +162,12 @@ def fit(
     )
     if not found.success:
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
-    _check_told(model.names, found.jac)
-    return model.fit(found.x, found.nfev, known_noise=deviations is not None)
+    held = found.active_mask != 0
+    _check_told([name for name, at in zip(model.names, held, strict=True) if not at], found.jac[:, ~held])
+    fitted = model.fit(found.x, held, found.nfev, known_noise=deviations is not None)
+    if told := model.told_by_steps(fitted, ~held):
+        warnings.warn(told, AccuracyWarning, stacklevel=3)
+    return fitted
 
 
 @dataclass(eq=False)
@@ -187,7 +201,7 @@ class _Model:
         """From what users give."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
         own = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
-        wanted = own if unknown is None else list(unknown)
+        wanted = tuple(own) if unknown is None else distinct(unknown, "unknown")
         for name in wanted:
             if name not in own:
                 raise StateError(f"there is no parameter '{name}' to find{closest(name, own)}")
@@ -218,14 +232,23 @@ class _Model:
             if name not in self.names:
                 raise StateError(f"'{name}' is not among the unknowns, so has no bounds{closest(name, self.names)}")
             pair, k = real_array(ends, f"the bounds of {name}"), self.names.index(name)
-            if pair.shape != (2,) or not pair[0] < self.guess[k] < pair[1]:
+            if pair.shape != (2,) or np.isnan(pair).any():
+                raise StateError(
+                    f"the bounds of {name} are (least, greatest), infinite where there is none, not {ends}"
+                )
+            if not pair[0] < self.guess[k] < pair[1]:
                 raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
             low[k], high[k] = pair
         return low, high
 
     def residuals(self, x: Array) -> Array:
-        """Of all measurements, in standard deviations."""
-        return self._evaluated(x)[0]
+        """Of all measurements, in standard deviations; infinite where a motion fails, from which SciPy turns back."""
+        try:
+            return self._evaluated(x)[0]
+        except StepFailedError:
+            if self.at is None:
+                raise
+            return np.full(int(self.measurements.used.sum()), np.inf)
 
     def slopes(self, x: Array) -> Array:
         """(measurements, k) of the same."""
@@ -249,18 +272,21 @@ class _Model:
             self.found = scaled[measurements.used], (slopes / measurements.deviations[:, np.newaxis])[measurements.used]
         return self.found
 
-    def fit(self, x: Array, evaluations: int, *, known_noise: bool) -> Fit:
-        """What was found."""
+    def fit(self, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
+        """What was found; ``held``: (k,) by a bound."""
         measurements, values = self.measurements, self._all(x)
         m = measurements.stepper.dimension
         scaled, slopes = self._evaluated(x)
-        free = len(scaled) - len(x)
+        free = len(scaled) - int((~held).sum())
         noise = 1.0 if known_noise else float(np.sqrt(scaled @ scaled / free)) if free else np.nan
-        inverse = np.linalg.pinv(slopes)
+        inverse = np.linalg.pinv(slopes[:, ~held])
+        covariance = np.full((len(x), len(x)), np.nan)
+        covariance[np.ix_(~held, ~held)] = noise**2 * inverse @ inverse.T
         return Fit(
             names=self.names,
             values=np.array(x),
-            covariance=noise**2 * inverse @ inverse.T,
+            covariance=covariance,
+            at_bounds=tuple(name for name, at in zip(self.names, held, strict=True) if at),
             parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=True)),
             q=values[:m],
             p=values[m : 2 * m],
@@ -273,6 +299,29 @@ class _Model:
             evaluations=evaluations,
         )
 
+    def told_by_steps(self, fitted: Fit, free: NDArray[np.bool_]) -> str:
+        """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
+
+        What moves by less than a millionth of the largest unknown is left alone: data without noise have no errors.
+        """
+        finer = replace(self, measurements=self.measurements.halved(), known=self._all(fitted.values), at=None)
+        errors, found = np.sqrt(np.diag(fitted.covariance)), fitted.values.copy()
+        noticed = np.maximum(errors, NOTICED * np.abs(found).max(initial=0.0))
+        with suppress(StepFailedError):
+            for _ in range(NEARER):
+                scaled, slopes = finer._evaluated(found)
+                found[free] -= np.linalg.pinv(slopes[:, free]) @ scaled
+                moved = np.abs(found - fitted.values)[free]
+                if not (moved > noticed[free]).any():
+                    return ""
+            ratios = moved / errors[free]
+            name = [name for name, at in zip(self.names, free, strict=True) if at][int(np.argmax(ratios))]
+            return (
+                f"h is too long for this fit: with steps half as long {name} is {ratios.max():.1f} standard errors "
+                "away. Take a shorter h, or a method of higher order"
+            )
+        return ""
+
 
 def _of_inputs(stepper: Stepper) -> set[str]:
     return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
@@ -280,6 +329,8 @@ def _of_inputs(stepper: Stepper) -> set[str]:
 
 def _check_told(names: Sequence[str], slopes: Array) -> None:
     """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is."""
+    if not names:
+        return
     sizes = np.sqrt((slopes**2).sum(axis=0))
     if nothing := np.flatnonzero(sizes <= SAME * sizes.max(initial=0.0)).tolist():
         raise FitError(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.compiled_method import CompiledMethod
@@ -81,6 +82,11 @@ class LinearisedMethod(CompiledMethod):
     def given(self) -> int:
         """Numbers that a step starts from: (q, p), parameters, t and h; MethodError where there are no derivatives."""
         return self.tangent.constant("GIVEN")
+
+    def check_steps_of_h(self, what: str) -> None:
+        """Raise :class:`MethodError` where runs have steps of other lengths, for what is made of steps of h."""
+        if self.interface.monitor:
+            raise MethodError(f"{what} has steps of h, not of lengths that a monitor chooses: compile without one")
 
     def jacobian(
         self,

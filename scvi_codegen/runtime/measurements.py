@@ -7,7 +7,7 @@ times. Breakpoints of inputs are ends of steps, too.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,11 +20,9 @@ from scvi_codegen.runtime.driven import Input, parameters_of
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.linearised import Starts
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.times import steps_within
 
-__all__ = ["Measurements", "state_names"]
-
-WHOLE = 1e-9
-"""Of a step: what rounding may leave of a span."""
+__all__ = ["Measurements", "distinct", "state_names"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,26 +60,34 @@ class Measurements:
         inputs: Mapping[str, Input],
     ) -> Measurements:
         """From what users give."""
+        stepper.check_steps_of_h("a motion that is fitted")
         if stepper.constraints:
             raise MethodError("motions with constraints are not fitted: an initial state does not vary freely on them")
         times, values = checked_times(t, "t"), real_array(measured, "measured")
         if times.ndim != 1 or not len(times) or (np.diff(times) <= 0.0).any():
             raise StateError("t is a list of ascending times")
-        names = tuple(observed or stepper.coordinates)
+        names = distinct(observed or stepper.coordinates, "observed")
+        if np.isinf(values).any():
+            raise StateError("a value in measured is infinite: where nothing was measured it is not a number")
         values = values[:, np.newaxis] if values.ndim == 1 and len(names) == 1 else values
         if values.shape != (len(times), len(names)):
             wanted = f"({len(times)}, {len(names)}) for {', '.join(names)}"
             raise StateError(f"measured has shape {wanted}, not {values.shape}; observed=[..] names its columns")
         sizes = np.ones(len(names)) if deviations is None else real_array(deviations, "deviations")
-        if sizes.shape not in ((), (len(names),)) or not (sizes > 0.0).all():
+        if sizes.shape not in ((), (len(names),)) or not ((sizes > 0.0) & np.isfinite(sizes)).all():
             raise StateError(f"deviations are a positive number, or one for each of {', '.join(names)}")
         first = float(times[0]) if start is None else checked_number(start, "the time start")
         if first > times[0]:
             raise StateError(f"the initial state, at t = {first:g}, is that before the first measurement")
-        pieces, places = _steps(first, times, abs(checked_step(h)), inputs)
+        pieces, places = _steps(first, times, checked_step(h), inputs)
         columns = np.array([_column(stepper, name) for name in names])
         sizes = np.broadcast_to(sizes, (len(names),)).copy()
         return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, places)
+
+    def halved(self) -> Measurements:
+        """The same by steps half as long."""
+        pieces = tuple((np.stack([t, t + h / 2], axis=1).ravel(), np.repeat(h / 2, 2)) for t, h in self.pieces)
+        return replace(self, pieces=pieces, places=2 * self.places)
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
@@ -91,7 +97,8 @@ class Measurements:
     def motion(self, state: Array, changes: Array, parameters: Array) -> tuple[Array, Array]:
         """(n, c) values at the measurements, (n, c, k) what they change by where the start does by (k, given)."""
         m, done = self.stepper.dimension, 0
-        values, slopes = np.empty_like(self.measured), np.empty((*self.measured.shape, len(changes)))
+        values = np.tile(state[self.columns], (len(self.t), 1))  # at the start, also where no step follows
+        slopes = np.tile(changes[:, self.columns].T, (len(self.t), 1, 1))
         for t, h in self.pieces:
             at = parameters_of(self.stepper, parameters, self.inputs)(float(t[0]) + 0.5 * float(h[0]))
             starts = Starts.chain(state[:m], state[m:], t, h)
@@ -115,7 +122,7 @@ def _steps(
     breaks = np.unique(breaks[(breaks > start) & (breaks < t[-1])])
     nodes = np.unique(np.concatenate([[start], t, breaks]))
     spans = np.diff(nodes)
-    counts = np.maximum(1, np.ceil(spans / h - WHOLE)).astype(np.intp)
+    counts = steps_within(spans, h)
     ends = np.concatenate([[0], np.cumsum(counts)])
     within = np.arange(ends[-1]) - np.repeat(ends[:-1], counts)
     lengths = np.repeat(spans / counts, counts)
@@ -126,9 +133,16 @@ def _steps(
 
 
 def state_names(stepper: Stepper) -> tuple[str, ...]:
-    """Of coordinates and momenta."""
-    momenta = stepper.interface.momentum_names or tuple(f"p_{name}" for name in stepper.coordinates)
-    return (*stepper.coordinates, *momenta)
+    """Of coordinates and momenta, each once."""
+    return (*stepper.coordinates, *stepper.interface.momenta)
+
+
+def distinct(names: Sequence[str], what: str) -> tuple[str, ...]:
+    """As they are; StateError where one occurs twice."""
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise StateError(f"{what} names '{name}' twice")
+    return tuple(names)
 
 
 def _column(stepper: Stepper, name: str) -> int:

@@ -9,11 +9,9 @@ of for what does not matter. What a motion keeps returns by itself: that much of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,11 +24,11 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_parameters, checked_vector
 from scvi_codegen.runtime.linearised import Starts
 from scvi_codegen.runtime.measurements import state_names
+from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.times import times_after
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.times import steps_within, times_after
 
-__all__ = ["PeriodicOrbit", "periodic_orbit"]
+__all__ = ["periodic_orbit"]
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 UNDECIDED = 1e-9
@@ -41,118 +39,12 @@ KEPT = 1e-3
 """Beside their sizes: how far slopes of an integral may change along a motion that keeps it, by the errors of steps."""
 BESIDE = 1e-6
 """Beside the size of a state: where its neighbours are."""
-SAME = 1e-6
-"""Beside 1: what may be rounding of a stability index."""
 SETTLED = 1e-13
 """Beside the size of state and period: a step that is rounding."""
 WORSE = 10.0
 """Than before: what a defect may become on the way."""
 RESTING = 1e-6
 """Beside the size of the state: how far a motion goes in a period that goes nowhere."""
-WHOLE = 1e-9
-"""Of a step: what rounding may leave of a period."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PeriodicOrbit:
-    """A motion that ends where it began, of the computed map.
-
-    Attributes:
-        q, p: (m,) where it begins.
-        t: when.
-        period: after which it is there again.
-        steps: of a period, each of ``period / steps``.
-        monodromy: (2m, 2m) derivative of the end by the start.
-        residual: how far the end is from the start, the largest number.
-        iterations: of Newton.
-        parameters: (k,) in the order of ``stepper.parameters``.
-        stepper: the compiled integrator.
-    """
-
-    q: Array
-    p: Array
-    t: float
-    period: float
-    steps: int
-    monodromy: Array
-    residual: float
-    iterations: int
-    parameters: Array
-    stepper: Stepper = field(repr=False)
-    options: SolverOptions | None = field(default=None, repr=False)
-
-    def run(self, *, every: int = 1) -> Trajectory:
-        """The motion of a period, ``every``-th state."""
-        return self.stepper.integrate(
-            self.q,
-            self.p,
-            h=self.period / self.steps,
-            steps=self.steps,
-            every=every,
-            t=self.t,
-            parameters=self.parameters,
-            options=self.options,
-        )
-
-    @property
-    def energy(self) -> float:
-        """Where it begins."""
-        return float(self.stepper.energy(self.q, self.p, self.t, self.parameters))
-
-    @cached_property
-    def multipliers(self) -> NDArray[np.complex128]:
-        """(2m,) Floquet multipliers, the eigenvalues of the monodromy matrix, the largest first.
-
-        Of those near 1, which are several for a motion that keeps its energy, only half of the digits are known.
-        """
-        values = np.linalg.eigvals(self.monodromy).astype(complex)
-        return values[np.argsort(-np.abs(values))]
-
-    @property
-    def reciprocal_error(self) -> float:
-        """How far sizes of multipliers are from the pairs s, 1/s of symplectic steps: the largest of s s' - 1."""
-        sizes = np.abs(self.multipliers)
-        return float(np.abs(sizes * sizes[::-1] - 1.0).max())
-
-    @property
-    def symplectic_error(self) -> float:
-        """How far the monodromy matrix is from symplectic, beside its square."""
-        product = _inverse(self.monodromy) @ self.monodromy - np.eye(len(self.monodromy))
-        return float(np.abs(product).max() / max(1.0, np.linalg.norm(self.monodromy, 2) ** 2))
-
-    @cached_property
-    def stability_indices(self) -> NDArray[np.complex128]:
-        """(m,) of each pair of multipliers s, 1/s its (s + 1/s)/2, the largest first: stable between -1 and 1.
-
-        They are known to the digits of the monodromy matrix, also at 1 (Broucke, AIAA J. 7 (1969) 1003; Howell, Celest.
-        Mech. 32 (1984) 53).
-
-        Raises:
-            MethodError: where steps are not symplectic.
-        """
-        if self.symplectic_error > UNDECIDED:
-            raise MethodError(f"multipliers are no pairs: the steps of '{self.stepper.title}' are not symplectic here")
-        left = list(np.linalg.eigvals(self.monodromy + _inverse(self.monodromy)).astype(complex) / 2.0)
-        indices = []
-        while left:
-            one = left.pop(int(np.argmax(np.abs(left))))
-            indices.append((one + left.pop(int(np.argmin(np.abs(np.array(left) - one))))) / 2.0)
-        return np.array(indices)
-
-    @property
-    def stable(self) -> bool:
-        """Whether no multiplier is larger than 1, to rounding."""
-        if self.symplectic_error > UNDECIDED:
-            return bool(np.abs(self.multipliers).max() <= 1.0 + SAME)
-        indices = self.stability_indices
-        return bool((np.abs(indices.real) <= 1.0 + SAME).all() and (np.abs(indices.imag) <= SAME).all())
-
-
-def _inverse(matrix: Array) -> Array:
-    """Of a symplectic matrix."""
-    m = len(matrix) // 2
-    a, b, c, d = matrix[:m, :m], matrix[:m, m:], matrix[m:, :m], matrix[m:, m:]
-    return np.block([[d.T, -b.T], [-c.T, a.T]])
 
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper), hold=NAMES, fixed_period=SWITCH)
@@ -180,7 +72,7 @@ def periodic_orbit(
         q, p, velocity: (m,) a guess of a state on it, one of p and velocity.
         period: a guess of its period, positive.
         steps: of a period, as many whatever its length becomes.
-        h: instead, the longest step for the period guessed.
+        h: instead, the longest step for the period guessed; its sign does not matter.
         fixed_period: whether the period is as given: so it must be where the system depends on time.
         energy: that of the orbit, if it is given.
         hold: coordinates and momenta (``"p_x"``) of the state that stay as given: an amplitude, or a section such as
@@ -192,9 +84,12 @@ def periodic_orbit(
         A :class:`PeriodicOrbit`.
 
     Raises:
-        OrbitError: where the iteration does not close an orbit, or ends in a state at rest.
-        MethodError: in transformed time, with constraints, and for an energy where forces act.
-        StateError: on wrong shapes, names or numbers.
+        OrbitError: where the iteration does not close an orbit of that energy, or ends in a state at rest, and where
+            what depends on time is another after a period.
+        MethodError: in transformed time, where a monitor chooses the steps, with constraints, for an energy where
+            forces act, and for a period that is to be found of what depends on time.
+        StateError: on wrong shapes, names or numbers, and for inputs that are not given.
+        StepFailedError: if a step fails on the way round from the guess.
     """
     search = _OrbitSearch.checked(
         stepper,
@@ -250,9 +145,10 @@ class _OrbitSearch:
     ) -> _OrbitSearch:
         """From what users give."""
         interface, names = stepper.interface, (*state_names(stepper), "period")
+        stepper.check_steps_of_h("a periodic orbit")
+        check_inputs_given(interface, parameters)
         if interface.constraints:
             raise MethodError("periodic orbits are found without constraints: take coordinates that need none")
-        check_inputs_given(interface, parameters)
         if energy is not None and interface.exchange_names:
             raise MethodError(f"forces act on '{interface.system}', so an orbit has no energy to be given")
         if (period := checked_number(period, "the period")) <= 0.0:
@@ -266,7 +162,7 @@ class _OrbitSearch:
         return cls(
             stepper=stepper,
             period=period,
-            steps=math.ceil(period / abs(checked_step(h)) - WHOLE) if h else checked_count(steps, "steps", least=1),
+            steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
             free=np.array([k for k, name in enumerate(names) if name not in held], dtype=np.intp),
             energy=None if energy is None else checked_number(energy, "the energy"),
             gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
@@ -285,13 +181,17 @@ class _OrbitSearch:
             z, found = nearer
         m, motion = self.stepper.dimension, found.monodromy
         size = float(np.abs([z[:-1], guess[:-1]]).max())
-        if not found.error <= CLOSED * size * max(1.0, float(np.linalg.norm(motion, 2))):
+        allowed = CLOSED * max(1.0, float(np.linalg.norm(motion, 2)))
+        if not found.error <= allowed * size:
             raise OrbitError(
                 f"no orbit closes near here: after {iteration} iterations it ends {found.error:.1e} from where it "
                 "began. Give a nearer guess, or more steps"
             )
+        self._check_energy(found, allowed * size)
         if np.linalg.norm(found.by_period) * z[-1] <= RESTING * size:
             raise OrbitError("the iteration ended in a state at rest, which every period closes: give a nearer guess")
+        if found.by_time.any():
+            self._check_repeats(z, found, allowed * size)
         return PeriodicOrbit(
             q=z[:m],
             p=z[m:-1],
@@ -305,6 +205,31 @@ class _OrbitSearch:
             stepper=self.stepper,
             options=self.options,
         )
+
+    def _check_energy(self, found: _Closing, allowed: float) -> None:
+        """Raise :class:`OrbitError` for an orbit that closes, but has another energy; ``allowed``: of its state."""
+        away, slopes = float(found.defects[-1]), found.slopes[-1]
+        if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(slopes))):
+            raise OrbitError(
+                f"the orbit that closes near here has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
+                "hold less of the state, or give a nearer guess"
+            )
+
+    def _check_repeats(self, z: Array, found: _Closing, allowed: float) -> None:
+        """Raise where what depends on time is another a period later: the next motion from there does not close."""
+        period = float(z[-1])
+        if len(z) - 1 in self.free:
+            raise MethodError(
+                f"'{self.stepper.interface.system}' depends on time, and orbits close after a period of what it "
+                "depends on: give that as period, with fixed_period=True"
+            )
+        later = replace(self, t=self.t + period)._closing(z)
+        away = max(float(np.abs(later.end - found.end).max()), later.error)
+        if not away <= allowed:
+            raise OrbitError(
+                f"what closes from t = {self.t:g} ends {away:.1e} from there after another period: what "
+                f"'{self.stepper.interface.system}' depends on is not the same {period:.10g} later"
+            )
 
     def _nearer(self, z: Array, found: _Closing) -> tuple[Array, _Closing] | None:
         """A step of Newton's iteration, shortened until it helps; ``None`` where none does, or is left.
@@ -333,12 +258,12 @@ class _OrbitSearch:
         stepper, m, size = self.stepper, self.stepper.dimension, len(z) - 1
         h = z[-1] / self.steps
         starts = Starts.chain(z[:m], z[m:-1], times_after(self.t, h, np.arange(self.steps))[0], np.full(self.steps, h))
-        vectors = np.zeros((self.steps + 1, size + 1, stepper.given))
+        vectors = np.zeros((self.steps + 1, size + 2, stepper.given))
         vectors[0, :size, :size] = np.eye(size)
-        vectors[0, size, -1] = 1.0 / self.steps
+        vectors[0, size:, [-1, -2]] = np.diag([1.0 / self.steps, 1.0])
         q, p = stepper.linearise(starts, vectors, self.parameters, self.options, chained=True)
         slopes = vectors[-1, :, :size].T
-        monodromy, by_period = slopes[:, :size], slopes[:, size]
+        monodromy, by_period, by_time = slopes[:, :size], slopes[:, size], slopes[:, size + 1]
         end = np.concatenate([q[-1], p[-1]])
         defects = end - z[:-1] - np.append(self.gain, np.zeros(m))
         slopes = np.column_stack([monodromy - np.eye(size), by_period])
@@ -347,7 +272,8 @@ class _OrbitSearch:
         if self.energy is not None:
             wanted = np.append(wanted, stepper.energy(z[:m], z[m:-1], self.t, self.parameters) - self.energy)
             rows = np.vstack([rows, np.append(self._slopes_of_integrals(z[:-1], self.t)[0], 0.0)])
-        return _Closing(float(np.abs(defects).max()), wanted, rows, monodromy.copy(), by_period.copy())
+        error, derivatives = float(np.abs(defects).max()), (monodromy.copy(), by_period.copy(), by_time.copy())
+        return _Closing(end, error, wanted, rows, *derivatives)
 
     def _not_implied(self, z: Array, end: Array, monodromy: Array) -> Array:
         """(2m, 2m) projection on the equations that are left: what a motion keeps returns by itself.
@@ -384,14 +310,17 @@ class _Closing:
     """How far a motion is from closing.
 
     Attributes:
+        end: (2m,) where it ends.
         error: the largest number of the end less the start.
         defects: (r,) of what has to be 0.
         slopes: (r, 2m + 1) of them by (q, p, period).
-        monodromy, by_period: derivatives of the end.
+        monodromy, by_period, by_time: derivatives of the end; the last, by all times, is 0 where nothing depends on it.
     """
 
+    end: Array
     error: float
     defects: Array
     slopes: Array
     monodromy: Array
     by_period: Array
+    by_time: Array

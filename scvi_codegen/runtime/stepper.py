@@ -40,7 +40,7 @@ class Stepper(Ensembles):
 
     def __reduce__(self) -> tuple[Any, ...]:
         texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives)
-        return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events))
+        return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events, self._with_changes))
 
     @takes(StateError, progress=FUNCTION)
     def integrate(
@@ -245,6 +245,7 @@ def _rebuild(
     texts: tuple[Source | None, ...],
     flags: tuple[str, ...],
     events: tuple[Event, ...],
+    with_changes: Mapping[int, Source | None],
 ) -> Stepper:
     ensemble, controlled, fallback, tangent = (*texts, None)[:4]
     return Stepper(
@@ -254,6 +255,7 @@ def _rebuild(
         controlled=lambda: controlled,
         fallback=lambda: fallback,
         tangent=lambda: tangent,
+        changes=with_changes.get,
         flags=flags,
         events=events,
     )

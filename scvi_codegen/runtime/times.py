@@ -1,18 +1,23 @@
-"""Times in two pieces, as runs carry them: t + n h, rounded, and what rounding cut off."""
+"""Times in two pieces, as runs carry them: t + n h, rounded, and what rounding cut off; steps that make up a span."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["times_after"]
+__all__ = ["steps_within", "times_after"]
 
 SPLITTER = 2.0**27 + 1.0
 """Times a number of 53 bits, it splits off the upper 26 (Dekker 1971)."""
+WHOLE = 1e-9
+"""Of a step: what rounding may leave of a span."""
+MOST_STEPS = 10**9
+"""More are a slip of the pen."""
 
 
 def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
@@ -26,6 +31,15 @@ def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
         rest = ((t - (total - part)) + (high - part)) + low
         time = total + rest
         return time, rest - (time - total)
+
+
+def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
+    """How many equal steps, none longer than |h|, make up each span > 0; StateError where they are too many to take."""
+    with np.errstate(over="ignore"):
+        counts = np.maximum(1.0, np.ceil(np.asarray(spans) / abs(h) - WHOLE))
+    if not counts.sum() <= MOST_STEPS:
+        raise StateError(f"steps of h = {h:g} would be {counts.sum():.0e} of them: give a longer one")
+    return counts.astype(np.intp)
 
 
 def _product(x: Array, y: float) -> tuple[Array, Array]:

@@ -1,5 +1,5 @@
 /* The derivative of steps, and its transpose, exact: those of the map which the solved equations define. Before it:
- * newton_from_line.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated. */
+ * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated. */
 
 enum {
   COUNT_OF_FAMILIES = sizeof FAMILIES / sizeof *FAMILIES
@@ -29,21 +29,24 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   return at;
 }
 
-/* The step solved, its equations factorised, its slopes evaluated. */
+/* The step solved, as where sweeps fail, its equations factorised, its slopes evaluated. */
 static int linearise_step(const linearised_step *at, const solver_options *options, real *q1, real *p1,
     solver_report *report)
 {
   const step_data *step = at->step;
+  const long long before = report->iterations;
   real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *slopes = at->slopes;
   int keep = 0, status = newton_from_line(step, &at->data, dp, &keep, options, report);
   if (status != OK)
     return status;
+  gather(END_POSITION, 1, step->h, at->data.z, M, dq, 0, 1);
+  if (strays(step, at->data.z, dq, report->iterations - before))
+    return STATUS(STRAYED);
   evaluate(step, at->data.z, at->data.rows, size_p, size_q, at->data.factors, &at->shape);
   if (!factorise(at->data.factors, &at->shape, at->data.pivot))
     return SINGULAR;
   for (int f = 0; f < COUNT_OF_FAMILIES; f++)
     slopes = slopes_of(FAMILIES + f, step, at->data.z, slopes);
-  gather(END_POSITION, 1, step->h, at->data.z, M, dq, 0, 1);
   for (int i = 0; q1 && i < M; i++) {
     q1[i] = step->q0[i] + dq[i];
     p1[i] = step->p0[i] + (dp[i] + dp[M + i]);

@@ -1,11 +1,26 @@
 """Indicators of chaos: against closed forms, variational equations by DOP853, published values, promises."""
 
+import pickle
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from scvi_codegen import SVI, Event, Gauss, LagrangianSystem, StateError, compile_stepper, problem
+from scvi_codegen import (
+    SVI,
+    Event,
+    Gauss,
+    HamiltonianSystem,
+    LagrangianSystem,
+    SpectralCollocation,
+    StateError,
+    StepFailedError,
+    compile_stepper,
+    problem,
+)
+from scvi_codegen.runtime.changes_in_lanes import MOTIONS
+from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.spreading import Changes
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
@@ -125,10 +140,21 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
 def test_states_left_out_change_nothing(galaxy):
     whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
     some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, every=50)
-    for name in ("lengths", "stretches", "rates", "mean_rates"):
+    for name in SERIES:
         assert_allclose(getattr(some.deviations(), name), getattr(whole.deviations(), name)[::50], rtol=1e-9, atol=1e-9)
     back = galaxy.integrate(whole.q[-1], whole.p[-1], h=-0.2, steps=600)
     assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
+
+
+def test_a_length_is_greatest_wherever_it_was(galaxy):
+    """Between states that are kept, too: of a regular motion, whose changes come and go."""
+    run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])
+    greatest = run.deviations(1).lengths.max()
+    assert run.deviations(1).lengths[-1, 0] < greatest - 0.01
+    some = galaxy.integrate(*REGULAR, h=0.2, steps=60, every=60).deviations(1)
+    assert some.fli()[-1] == pytest.approx(greatest, abs=1e-12)
+    many = galaxy.deviations_ensemble(*start, h=0.2, steps=60, count=1)
+    assert many.fli()[-1, 0] == pytest.approx(greatest, abs=1e-12)
 
 
 def test_friction_moves_the_middle_of_the_spectrum():
@@ -160,6 +186,9 @@ def test_constraints_leave_fewer_changes():
     assert run.megno()[-1] == pytest.approx(2.0, abs=0.3)
     with pytest.raises(StateError, match="constraints leave 2 independent changes of the state, not 3"):
         run.deviations(3)
+    assert run.deviations(directions=[0.0, 1.0, 0.0, 0.0]).lengths.shape == (4001, 1)
+    with pytest.raises(StateError, match="one that the constraints do not allow"):
+        run.deviations(directions=[0.0, 0.0, 1.0, 0.0])
 
 
 def test_ensembles_are_the_same_as_runs(galaxy):
@@ -183,6 +212,102 @@ def test_ensembles_are_the_same_as_runs(galaxy):
         last.megno()[-1], galaxy.deviations_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1).megno()[-1]
     )
     assert last.megno().shape == (2, 2)
+
+
+def by_derivatives(stepper):
+    """The same, without a text for lanes: a copy knows none that nobody asked for. Each motion is followed alone."""
+    alone = pickle.loads(pickle.dumps(stepper))
+    assert alone.changes(1) is None
+    return alone
+
+
+def same(found, other, within):
+    for name in SERIES:
+        assert_allclose(getattr(found, name), getattr(other, name), atol=within)
+    assert_array_equal(found.status, other.status)
+
+
+FORCED = LagrangianSystem.from_text(
+    name="forced",
+    coordinates=["x", "y"],
+    lagrangian="(m*x_dot**2 + y_dot**2)/2 - x**2/2 - x**2*y**2/4 - y**2",
+    parameters={"m": 1.3, "w": 1.1},
+    forces={"x": "sin(w*t)*y", "y": "u*cos(x)"},
+    inputs=["u"],
+)
+OPEN = HamiltonianSystem.from_text(
+    name="open", coordinates=["x", "y"], momenta=["a", "b"], hamiltonian="a**2/2 + b**2/3 + x**2*y + x**4 + y**2"
+)
+
+
+@pytest.mark.parametrize(
+    ("system", "method", "options"),
+    [
+        (FORCED, SVI(3), {"count": 1, "parameters": {"u_0": 0.3, "m": np.linspace(0.5, 2.0, 11)}}),
+        (FORCED, Gauss(2), {"h": -0.1, "t": 3.0, "parameters": {"u_0": 0.3}}),
+        (FORCED, SpectralCollocation(4), {"directions": np.ones((4, 2)), "parameters": {"u_0": 0.3}}),
+        (OPEN, SVI(3), {"count": 3, "every": 1, "steps": 20}),
+        (OPEN, SVI(2, "gauss-lobatto:3"), {"directions": [1.0, 0.0, 2.0, 0.0]}),
+    ],
+)
+def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
+    """To round-off of each logarithm, of eleven motions in two blocks."""
+    start = 0.4 * np.random.default_rng(1).normal(size=(2, 11, 2))
+    stepper = compile_stepper(system, method)
+    alone = by_derivatives(stepper)
+    options = {"h": 0.1, "steps": 120, "every": 40} | options
+    found = stepper.deviations_ensemble(*start, **options)
+    assert stepper.changes(found.lengths.shape[-1]) is not None
+    same(found, alone.deviations_ensemble(*start, **options), 1e-12)
+
+
+def test_changes_in_lanes_that_part_quickly_are_taken_in_shorter_pieces():
+    """x'' = 100 x: apart by e^20 in ten steps, e^600 in all; the closed form, and what the derivatives tell."""
+    saddle = LagrangianSystem.from_text(name="saddle", coordinates=["x"], lagrangian="(x_dot**2 + 100*x**2)/2")
+    stepper, start = compile_stepper(saddle, SVI(6)), ([[1e-3], [0.0]], [[0.0], [2e-3]])
+    alone = by_derivatives(stepper)
+    found = stepper.deviations_ensemble(*start, h=0.1, steps=300, every=100)
+    assert_allclose(found.stretches.sum(axis=-1), 0.0, atol=1e-10)
+    assert_allclose(found.lyapunov_exponents()[-1], [[10.0, -10.0]] * 2, atol=0.05)
+    same(found, alone.deviations_ensemble(*start, h=0.1, steps=300, every=100), 1e-10)
+
+
+def test_a_motion_that_leaves_its_lane_is_followed_alone():
+    """x'' = 4 x^3 goes to infinity, sooner or later: statuses, and what is known until then, are those told alone."""
+    away = LagrangianSystem.from_text(name="away", coordinates=["x"], lagrangian="x_dot**2/2 + x**4")
+    stepper, done = compile_stepper(away, SVI(3)), []
+    alone = by_derivatives(stepper)
+    start = np.linspace(0.0, 0.8, 20)[:, np.newaxis], np.zeros((20, 1))
+    options = {"h": 0.1, "steps": 60, "every": 20, "count": 1}
+    found = stepper.deviations_ensemble(*start, **options, progress=done.append)
+    assert 2 < sum(found.status == "ok") < 15
+    assert done[-1] == 20
+    same(found, alone.deviations_ensemble(*start, **options), 1e-12)
+
+
+def test_steps_that_are_no_motion_are_refused_as_by_runs():
+    """Kepler's problem, e = 0.9, by steps too long for the pericentre: another solution is found."""
+    kepler = compile_stepper(problem("kepler").system, SVI(4))
+    q, p = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
+    with pytest.raises(StepFailedError, match="solved by what is no motion") as failed:
+        kepler.integrate(q, p, h=0.4, steps=40)
+    before = failed.value.trajectory
+    with pytest.raises(StepFailedError, match="solved by what is no motion"):
+        kepler.jacobian(before.q[-1], before.p[-1], 0.4)
+    found = kepler.deviations_ensemble([q], [p], h=0.4, steps=40, count=1)
+    assert list(found.status) == ["strayed"]
+    assert np.isnan(found.megno()[-1]).all()
+
+
+def test_more_motions_than_go_along_together_are_told_apart(galaxy):
+    """Those of a row of a map, and each of them alone, whatever the number of threads."""
+    y = np.linspace(-0.2, 0.3, MOTIONS + 5)
+    start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
+    both = [galaxy.deviations_ensemble(*start, h=0.2, steps=40, count=1, threads=threads) for threads in (1, 3)]
+    assert_array_equal(both[0].lengths, both[1].lengths)
+    for j in (0, MOTIONS - 1, MOTIONS, MOTIONS + 4):
+        alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).deviations(1)
+        assert_allclose(both[0].lengths[-1, j], alone.lengths[-1], atol=1e-13)
 
 
 def test_a_run_that_an_event_ended_has_its_last_step_as_it_is(galaxy):

@@ -10,7 +10,17 @@ from samples import QUICK_FLAGS, linkage
 from scipy.integrate import solve_ivp
 from scipy.optimize import curve_fit
 
-from scvi_codegen import SVI, FitError, LagrangianSystem, MethodError, StateError, compile_stepper, fit
+from scvi_codegen import (
+    SVI,
+    AccuracyWarning,
+    FitError,
+    LagrangianSystem,
+    MethodError,
+    StateError,
+    StepFailedError,
+    compile_stepper,
+    fit,
+)
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
 NOISE = 0.01
@@ -158,12 +168,80 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to find"),
         ({"bounds": {"k": (0, 1)}}, "'k' is not among the unknowns"),
         ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
+        (
+            {"bounds": {"delta": (np.nan, 1.0)}},
+            "the bounds of delta are .least, greatest., infinite where there is none",
+        ),
+        ({"unknown": ["alpha", "alpha"]}, "unknown names 'alpha' twice"),
+        ({"observed": ["x", "x"]}, "observed names 'x' twice"),
+        ({"deviations": np.inf}, "deviations are a positive number"),
         ({"h": 0.0}, "the step h is 0"),
     ],
 )
 def test_what_is_wrong_is_named(options, message):
     with pytest.raises(StateError, match=message):
         fit(oscillator(), TIMES, recorded()[0], **(GUESS | {"unknown": SOME} | options))
+
+
+def test_steps_that_tell_an_unknown_are_too_long():
+    """Of second order, by long steps: what is found is off by twelve of the errors claimed, and said to be."""
+    soft = LagrangianSystem.from_text(
+        name="hard",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - a*x**2/2 - b*x**4/4",
+        parameters={"a": 1.0, "b": 1.0},
+    )
+    times = np.linspace(0.0, 20.0, 101)
+    exact = compile_stepper(soft, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], h=0.1, steps=200, every=2)
+    noisy = exact.q[:, 0] + 1e-3 * np.random.default_rng(0).normal(size=101)
+    coarse, given = compile_stepper(soft, SVI(1), flags=QUICK_FLAGS), {"q": [0.9], "p": [0.1]}
+    with pytest.warns(AccuracyWarning, match=r"h is too long for this fit: .* b is \S+ standard errors away"):
+        found = fit(coarse, times, noisy, h=0.2, **given)
+    assert abs(found.parameters["b"] - 1.0) > 10.0 * found.standard_errors["b"]
+    assert abs(fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
+
+
+def test_a_guess_beyond_which_motions_fail_is_a_guess():
+    """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
+    soft = LagrangianSystem.from_text(
+        name="soft", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 + x**4/4", parameters={"a": 1.0}
+    )
+    stepper = compile_stepper(soft, SVI(4), flags=QUICK_FLAGS)
+    run = stepper.integrate([0.9], [0.0], h=0.1, steps=100)
+    found = fit(stepper, run.t, run.q[:, 0], q=[0.8], p=[0.0], h=0.1, parameters={"a": 1.2})
+    assert_allclose(found.values, [1.0, 0.9, 0.0], atol=1e-9)
+    with pytest.raises(StepFailedError):
+        fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
+
+
+def test_what_is_measured_is_finite_or_missing():
+    values = recorded()[0].copy()
+    values[3] = np.inf
+    with pytest.raises(StateError, match="a value in measured is infinite"):
+        fit(oscillator(), TIMES, values, unknown=SOME, **GUESS)
+
+
+def test_a_measurement_at_the_start_tells_the_state_alone():
+    """No step is taken: the state is what was measured, and parameters are not told."""
+    known = {"q": [0.7], "p": [0.2], "h": 0.1}
+    with pytest.raises(FitError, match="do not tell delta: they do not depend on it"):
+        fit(oscillator(), [0.0], [0.5], unknown=["delta"], state=False, **known)
+    found = fit(oscillator(), [0.0], [[0.5, 0.4]], observed=["x", "p_x"], unknown=[], **known)
+    assert_allclose(found.values, [0.5, 0.4], rtol=1e-12)
+
+
+def test_what_a_bound_holds_has_no_error_and_the_others_that_of_a_known_one():
+    """As if it were no unknown: nothing else is known of their errors to first order."""
+    bound = {"alpha": (-0.95, 0.0)}
+    found = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME, bounds=bound, **GUESS)
+    assert found.at_bounds == ("alpha",)
+    assert "alpha = -0.95 at its bound" in str(found)
+    assert np.isnan(found.standard_errors["alpha"])
+    known = GUESS | {"parameters": GUESS["parameters"] | {"alpha": -0.95}}
+    other = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME[1:], **known)
+    assert other.at_bounds == ()
+    for name, error in other.standard_errors.items():
+        assert found.standard_errors[name] == pytest.approx(error, rel=1e-3)
 
 
 def test_times_ascend_and_constraints_are_not_fitted():

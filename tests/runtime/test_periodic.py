@@ -162,3 +162,58 @@ def test_what_is_no_orbit(galaxy):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
     with pytest.raises(StateError, match="a period is positive"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
+
+
+def test_what_depends_on_time_returns_with_it():
+    """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
+    system = LagrangianSystem.from_text(
+        name="forced",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2",
+        parameters={"w": 1.3},
+        forces={"x": "cos(w*t)/10"},
+        dissipation="x_dot**2/20",
+    )
+    stepper, period = compile_stepper(system, SVI(3)), 2 * np.pi / 1.3
+    with pytest.raises(MethodError, match="give that as period, with fixed_period=True"):
+        periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40)
+    with pytest.raises(OrbitError, match=r"depends on is not the same 4\.7 later"):
+        periodic_orbit(stepper, [0.0], [0.1], period=4.7, steps=40, fixed_period=True)
+    twice = periodic_orbit(stepper, [0.0], [0.1], period=2 * period, steps=80, fixed_period=True)
+    once = periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40, fixed_period=True)
+    assert_allclose(np.append(twice.q, twice.p), np.append(once.q, once.p), atol=1e-12)
+
+
+def test_an_orbit_has_the_energy_that_is_asked_for():
+    oscillator = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    stepper = compile_stepper(oscillator, SVI(3))
+    with pytest.raises(OrbitError, match=r"has the energy 0\.5, not 5"):
+        periodic_orbit(stepper, [1.0], [0.0], period=2 * np.pi, steps=40, hold=["x", "p_x"], energy=5.0)
+    found = periodic_orbit(stepper, [1.0], [0.1], period=2 * np.pi, steps=40, energy=5.0)
+    assert found.energy == pytest.approx(5.0, rel=1e-12)
+
+
+def test_no_input_is_taken_for_nothing_and_no_monitor_for_steps_of_one_length():
+    pushed = LagrangianSystem.from_text(
+        name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "u"}, inputs=["u"]
+    )
+    with pytest.raises(StateError, match="the input u is not given"):
+        periodic_orbit(compile_stepper(pushed, SVI(2)), [1.0], [0.0], period=6.28, steps=20)
+    watched = compile_stepper(problem("kepler").system, SVI(2), monitor="frequency")
+    with pytest.raises(MethodError, match="not of lengths that a monitor chooses"):
+        periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
+    with pytest.raises(MethodError, match="not of lengths that a monitor chooses"):
+        watched.deviations_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
+
+
+def test_names_of_a_state_are_each_its_own():
+    """A coordinate called p_x beside x: the momentum of x has another name."""
+    plane = LagrangianSystem.from_text(
+        name="plane", coordinates=["x", "p_x"], lagrangian="(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2"
+    )
+    stepper = compile_stepper(plane, SVI(3))
+    assert stepper.interface.momenta == ("_p_x", "p_p_x")
+    given = [0.9, 0.0], [0.3, 0.0]
+    along = periodic_orbit(stepper, *given, period=6.0, steps=60, hold=["p_x", "p_p_x", "x"])
+    assert along.p[0] != 0.3
+    assert periodic_orbit(stepper, *given, period=6.0, steps=60, hold=["_p_x"]).p[0] == 0.3

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.times import times_after
+from scvi_codegen.runtime.times import steps_within, times_after
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
@@ -73,3 +74,12 @@ def test_states_know_the_step_that_follows(free):
     assert np.array_equal(between.lengths, [0.25, np.nan, 0.25], equal_nan=True)
     ended = free.integrate([0.1], [0.0], h=0.25, steps=8, events="q")
     assert ended.lengths[-1] == 0.25
+
+
+def test_spans_are_made_of_equal_steps_none_of_them_longer():
+    assert steps_within([0.3, 0.30001, 1e-9, 0.1], 0.1).tolist() == [3, 4, 1, 1]
+    assert steps_within(1.1, -0.1) == 11  # 1.1 / 0.1 is more than 11 by rounding alone
+    with pytest.raises(StateError, match=r"steps of h = 1e-12 would be 1e\+12 of them"):
+        steps_within(1.0, 1e-12)
+    with pytest.raises(StateError, match="would be inf of them"):
+        steps_within(1e300, 1e-300)

@@ -1,0 +1,48 @@
+"""Motions beside small changes of them: the variational equations of what can be written down."""
+
+import sympy
+
+from scvi_codegen import LagrangianSystem, problem
+from scvi_codegen.mechanics.changes import with_changes
+from scvi_codegen.mechanics.forms import forms_of
+
+
+def test_changes_follow_the_variational_equations():
+    """x'' = -sin x - k x y^2 + cos t, and so on: forces of changes are the Hessian times these, masses the same."""
+    system = LagrangianSystem.from_text(
+        name="two",
+        coordinates=["x", "y"],
+        lagrangian="(m*x_dot**2 + y_dot**2)/2 + cos(x) - k*x**2*y**2/2",
+        parameters={"m": 2.0, "k": 0.5},
+        forces={"x": "cos(t)*y"},
+    )
+    varied = with_changes(system, 2)
+    assert [q.name for q in varied.coordinates] == [
+        *("x", "y"),
+        *("x_change_1", "y_change_1"),
+        *("x_change_2", "y_change_2"),
+    ]
+    x, y, u, w, *_ = varied.coordinates
+    k, m = sympy.symbols("k m", real=True)
+    forces = forms_of(varied).force
+    assert forms_of(varied).mass == {(i, i): (m, sympy.S.One)[i % 2] for i in range(6)}
+    assert forces[:2] == forms_of(system).force
+    wanted = -sympy.cos(x) * u - k * (y**2 * u + 2 * x * y * w) + sympy.cos(system.time) * w
+    assert sympy.expand(forces[2] - wanted) == 0
+    assert sympy.expand(forces[3] + k * (x**2 * w + 2 * x * y * u)) == 0
+    assert forms_of(varied).separable
+
+
+def test_names_that_are_taken_are_left_alone():
+    system = LagrangianSystem.from_text(
+        name="taken", coordinates=["x", "x_change_1"], lagrangian="(x_dot**2 + x_change_1_dot**2)/2 - x**2*x_change_1"
+    )
+    assert len({q.name for q in with_changes(system, 2).coordinates}) == 6
+
+
+def test_masses_that_move_have_no_changes_of_this_kind():
+    assert with_changes(problem("double-pendulum").system, 1) is None
+    magnetic = LagrangianSystem.from_text(
+        name="magnetic", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2"
+    )
+    assert with_changes(magnetic, 1) is None
