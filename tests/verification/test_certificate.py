@@ -61,6 +61,13 @@ def test_every_fault_is_caught(mutation: Mutation, record_property) -> None:
     assert found
 
 
+def test_nothing_of_a_fault_is_left_in_the_process() -> None:
+    """Its iteration of Newton, say, borrowed by sweeps that are the same with the fault and without it."""
+    (mutation,) = (one for one in MUTATIONS if one.name == "momentum by A for A^T")
+    assert caught(mutation)
+    assert certified(mutation.case).passed
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_sabotaged_passes_whole(name: str) -> None:
