@@ -161,7 +161,7 @@ def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float
             if system.constraints:
                 q, p = stepper.project(q, p, t=t)
             step = h or _step(stepper, q, p, t)
-            stepper.step(q, p, step, t)
+            stepper.step(q, p, step, t, stepper.defaults)
         except (StateError, StepFailedError):
             continue
         return State(q, p, t, step)
@@ -173,7 +173,7 @@ def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
     h = LONGEST
     for _ in range(HALVINGS):
         try:
-            q1, p1 = stepper.step(q, p, h, t)
+            q1, p1 = stepper.step(q, p, h, t, stepper.defaults)
         except StepFailedError:
             h /= 2
             continue

@@ -148,7 +148,8 @@ def _momentum(subject: Subject, k: int) -> Finding:
     """The k-th momentum map along a run."""
     given = subject.given
     try:
-        run = subject.stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t)
+        parameters = subject.stepper.defaults
+        run = subject.stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t, parameters=parameters)
     except StepFailedError as failure:
         run = Trajectory.before(failure)
         if len(run) <= TRIED:

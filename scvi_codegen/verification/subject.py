@@ -181,7 +181,7 @@ class Subject:
         """
         m = len(state.q)
         try:
-            end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t))
+            end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t, self.stepper.defaults))
         except StepFailedError:
             end = state.z
         change = end - state.z

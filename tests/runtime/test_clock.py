@@ -158,6 +158,11 @@ def test_states_between_are_at_times() -> None:
     asked = stepper().integrate(*START, h=0.1, t_end=9.0, t_eval=times)
     assert np.array_equal(asked.t, times)
     assert np.abs(kepler_time(asked.q[1:]) - times[1:]).max() < 1e-12
+    assert asked.tau is not None
+    for k in (7, 20):  # the part of its step at which a run to that time ends
+        ended = stepper().integrate(*START, h=0.1, t_end=float(times[k]))
+        assert ended.tau is not None
+        assert asked.tau[k] == pytest.approx(ended.tau[-1], abs=1e-12)
     whole = stepper().integrate(*START, h=0.1, t_end=9.0)
     assert np.array_equal(whole.at(times)[0], asked.q)
     seldom = stepper().integrate(*START, h=0.1, t_end=9.0, every=7)

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from faults import Mutation
 from mutations import MUTATIONS
 from sabotage import certified
-from samples import QUICK_FLAGS
+from samples import QUICK_FLAGS, pushed_pendulum
 
 from scvi_codegen import SVI, Certificate, verify
 from scvi_codegen.cli import main
@@ -41,6 +41,7 @@ QUICK = (
     "half of the discrete action",
     "L_vq v lost",
     "a multiplier's force off its gradient",
+    "friction that drives",
 )
 
 
@@ -85,6 +86,14 @@ def test_constrained_motions_are_certified(name: str) -> None:
     kept = {check.name for check in certificate.checks if check.outcome is Outcome.KEPT}
     assert {"stage equations", "constraints", "multipliers", "reversal", "order"} <= kept
     assert ("symplecticity" in kept) == name.startswith("wire")
+
+
+def test_inputs_are_certified_as_what_they_are_between_breakpoints() -> None:
+    system, stepper = pushed_pendulum(), compile_stepper(pushed_pendulum(), SVI(2), flags=QUICK_FLAGS)
+    for given in ({}, {"q": [0.6], "p": [-0.3], "stepper": stepper}):
+        certificate = verify(system, SVI(2), flags=QUICK_FLAGS, **given)
+        assert certificate.passed, certificate.to_text()
+        assert not certificate.not_measured
 
 
 # What a certificate says.
