@@ -225,6 +225,8 @@ def test_runs_are_saved_recorded_and_pickled(tmp_path: Any) -> None:
     recorded = sc.record_run(made.start(*START, h=0.1), tmp_path / "run", steps=40)
     assert np.array_equal(np.asarray(recorded.t), made.integrate(*START, h=0.1, steps=40).t)
     assert np.array_equal(recorded[20:].tau, made.integrate(*START, h=0.1, steps=40).tau[20:])
+    seldom = sc.record_run(made.start(*START, h=0.1), tmp_path / "seldom", steps=40, every=4)
+    assert np.array_equal(seldom[1:].tau, made.integrate(*START, h=0.1, steps=40).tau[4::4])
 
 
 def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
