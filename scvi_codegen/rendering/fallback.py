@@ -3,6 +3,7 @@
 Its kernels have second derivatives of the Lagrangian: of larger systems they are most of the text, and of the time that
 deriving and compiling takes, and most runs never need them. So a text that is compiled here has sweeps alone, and
 borrows the iteration from a second library, compiled when a sweep first fails; a text to be taken away has its own.
+A library borrows once, for all steppers of its text: one generator makes one iteration for the same sweeps.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def verify(
     solver: str = "auto",
     flags: Sequence[str] = TUNED_FLAGS,
 ) -> Certificate:
-    """Measure what the integrator of ``system`` by ``method`` promises.
+    """Measure what the integrator of ``system`` by ``method`` promises; inputs as between breakpoints, cubics of time.
 
     Args:
         system, method: what is integrated and how; a method may be its name, ``"svi:8"``.

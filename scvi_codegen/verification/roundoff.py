@@ -155,7 +155,7 @@ def _beside(state: State, scales: Array, lane: int) -> State:
 
 
 def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> Iterator[tuple[Array, Array]]:
-    """As :func:`_advanced`, of each lane."""
+    """As :func:`_advanced`, of each lane: the states that it stores."""
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
     work = Ensemble(subject.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=subject.parameters)
@@ -166,9 +166,9 @@ def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> I
     block.advance(steps)
     if block.left:
         raise BrokenError("single runs take these steps, lanes fail")
-    ends, low = (np.concatenate([block.lanes(name) for name in pair]) for pair in (("q", "p"), ("carry_q", "carry_p")))
+    low = np.concatenate([block.lanes(name) for name in ("carry_q", "carry_p")])
     for lane in range(len(starts)):
-        yield ends[:, lane], low[:, lane]
+        yield np.concatenate([work.q[-1, lane], work.p[-1, lane]]), low[:, lane]
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import ABOUT, main
 from scvi_codegen.cli.choices import Choices, read_model
+from scvi_codegen.cli.conservation import energy_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
@@ -288,6 +289,14 @@ class TestRun:
         assert "NOT conserved" in output_of(
             "run", "kepler", "--method", "explicit-euler", "--step", "0.1", "--span", "10"
         )
+
+    def test_the_largest_energy_error_is_told_and_not_the_last(self):
+        run = compile_stepper(problem("kepler").system, StoermerVerlet()).integrate(
+            problem("kepler").q, problem("kepler").velocity, h=0.01, steps=628
+        )
+        errors = np.abs(run.energy() / run.energy()[0] - 1.0)
+        assert errors[-1] < 0.01 * errors.max()
+        assert f"relative energy error: {errors.max():.2e} at most" in energy_report(problem("kepler").system, run)
 
     def test_long_states_are_cut_short(self):
         text = output_of("run", "fput-chain:9", "--steps", "3")

@@ -156,3 +156,9 @@ def constraints_off(original: Any) -> Any:
         return original(system, name, tuple(v + off if v in bound else v for v in values), **named)
 
     return changed
+
+
+def moving_part(momentum: sympy.Expr) -> sympy.Expr:
+    """The terms with velocities."""
+    terms = sympy.Add.make_args(momentum)
+    return sympy.Add(*(term for term in terms if any(x.name.endswith("_dot") for x in term.free_symbols)))

@@ -12,18 +12,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
-import shutil
-import subprocess
 import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
+from checkout import ROOT, copied, run
 from operators import Place, places
 
-ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables")
 NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
 """Words for people; their tests are of words."""
@@ -80,8 +77,10 @@ NEAR: dict[str, tuple[str, ...]] = {
     "scvi_codegen/formulas": ("formulas/test_derivatives.py", "formulas/test_expression_text.py"),
     "scvi_codegen/tables": ("tables",),
 }
-TOO_LONG = 240
-"""Seconds after which what does not end counts as noticed."""
+
+
+MOST_WORDS = 160
+"""Of a result: characters of what noticed the fault."""
 
 
 def drawn(count: int, seed: int, only: str) -> list[Place]:
@@ -107,35 +106,15 @@ def noticed(copy: Path, place: Place) -> tuple[str, str]:
     cases = [case for case in CERTIFIED if not place.path.startswith("templates") or place.path in used(copy)[case]]
     code, output = run(copy, sys.executable, "tests/faults/certify.py", *cases) if cases else (0, "")
     if code == 3:
-        return "stillborn", output
+        return "stillborn", output[:MOST_WORDS]
     if code:
-        return "certificate", output
+        return "certificate", output[:MOST_WORDS]
     existing = [name for name in near(place.path) if (copy / name).exists()]
     for name in existing:
         code, output = run(copy, sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", name)
         if code:
-            return name, output
+            return name, output[:MOST_WORDS]
     return "", ""
-
-
-def run(copy: Path, *command: str) -> tuple[int, str]:
-    """The exit status and the last line that says something."""
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(
-            [str(copy), *(str(copy / "tests" / name) for name in ("oracles", "tools", "faults"))]
-        ),
-        "SCVI_CODEGEN_CACHE": str(copy.parent / "cache"),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    try:
-        found = subprocess.run(
-            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TOO_LONG, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return 1, "it does not end"
-    lines = (found.stdout + found.stderr).strip().splitlines() or [""]
-    failed = [line for line in lines if line.startswith(("FAILED", "ERROR", "BROKEN"))] or lines
-    return found.returncode, failed[-1][:160]
 
 
 USED: dict[str, set[str]] = {}
@@ -144,19 +123,8 @@ USED: dict[str, set[str]] = {}
 def used(copy: Path) -> dict[str, set[str]]:
     """The templates that the code of each case is made from."""
     if not USED:
-        text = subprocess.run(
-            (sys.executable, "tests/faults/certify.py", "--list", *CERTIFIED),
-            cwd=copy,
-            env=os.environ
-            | {
-                "PYTHONPATH": os.pathsep.join(
-                    [str(copy), str(copy / "tests/oracles"), str(copy / "tests/tools"), str(copy / "tests/faults")]
-                )
-            },
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
+        code, text = run(copy, sys.executable, "tests/faults/certify.py", "--list", *CERTIFIED)
+        assert code == 0, text
         USED.update({case: {f"templates/{name}" for name in names} for case, names in json.loads(text).items()})
     return USED
 
@@ -171,9 +139,7 @@ def main() -> None:
     lines = given.results.read_text().splitlines() if given.results.exists() else []
     known = {entry["fault"]: entry["caught by"] for entry in map(json.loads, lines)}
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-        copy = Path(folder) / "checkout"
-        ignored = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache")
-        shutil.copytree(ROOT, copy, ignore=ignored)
+        copy = copied(Path(folder))
         for place in drawn(given.count, given.seed, given.only):
             text = (ROOT / place.path).read_text()
             fault = place.name(text)

@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import sympy
+from beside import BESIDE
 from certified_cases import case
 from faults import (
     Mutation,
     as_printed,
-    constraints_off,
     doubled,
     eight_digits,
     eight_digits_text,
@@ -26,7 +26,6 @@ from faults import (
     slopes,
     text,
     transposed,
-    without_last_of,
     without_negation,
     without_rates_of,
     wrong_rule,
@@ -36,8 +35,6 @@ from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import derivatives
 from scvi_codegen.ir import arithmetic, numbers
-from scvi_codegen.lowering import constraints as lowered_constraints
-from scvi_codegen.lowering import derivatives as lowered_derivatives
 from scvi_codegen.lowering import families
 from scvi_codegen.lowering.solvers import collocation as collocation_sweep
 from scvi_codegen.lowering.solvers import separable
@@ -50,7 +47,6 @@ from scvi_codegen.methods import (
     shooting_stages,
     stage_system,
 )
-from scvi_codegen.methods import constraints as constrained_stages
 from scvi_codegen.methods import method as method_room
 from scvi_codegen.rendering import printer as c_printer
 from scvi_codegen.tables import quadrature, tableau
@@ -85,23 +81,6 @@ ROUNDOFF = (
     ("weights of 53 bits", "round/svi-8", "sweep", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
     ("h^2 of 53 bits", "kepler/svi-3", "prepare_sweep", r"data->square_low = .*;", "data->square_low = 0.0;"),
     ("drifts of 53 bits", "kepler/svi-3", "sweep", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
-)
-
-DERIVATIVES = (
-    ("points at the time of the start", "driven/svi", "given_wide", r"f->abscissa\[n\], v", "0, v"),
-    ("arguments stretched by h too much", "cart/svi", "slopes_of", r"\(real\)loop->power \* ", ""),
-    ("results not stretched by h", "wire/lobatto-svi", "slopes_of", r"\*= \(real\)f->scatter\[s\]\.power / h", "*= 0"),
-    ("q1 by h at its start alone", "vortices/svi", "end_position", r"END_POSITION\[b\] \* z\[i \* B \+ b\]", "0"),
-    ("momenta held", "double/scvi", "push_step", r"momentum_rows\(at, 0\);", ""),
-    ("rows exchanged no more on the way back", "linkage/lobatto-svi", "lower_wide", r"if \(back\)", "if (0)"),
-    ("slopes by momenta lost on the way back", "double/gauss", "pull_step", r"momentum_rows\(at, 1\);", ""),
-    (
-        "time that does not pass on the way back",
-        "driven/svi",
-        "pull_step",
-        r"flow\(1, at->v \+ GIVEN_H - 1",
-        "flow(0, at->v",
-    ),
 )
 
 MUTATIONS = (
@@ -411,57 +390,5 @@ MUTATIONS = (
         ),
     ),
     Mutation("the chain rule of L_d lost", case("kepler/scvi"), as_printed),
-    # Constraints.
-    here(
-        "a multiplier's force off its gradient",
-        case("linkage/lobatto-svi"),
-        constrained_stages,
-        "with_reactions",
-        changed_result(lambda found: (found[0] * (1 + sympy.Rational(1, 10**6)), *found[1:])),
-    ),
-    here(
-        "hidden constraints without g_t",
-        case("wire/lobatto-svi"),
-        constrained_stages,
-        "constraint_rates",
-        lambda original: (
-            lambda system: tuple(
-                rate - g.diff(system.time) for rate, g in zip(original(system), system.constraints, strict=True)
-            )
-        ),
-    ),
-    here(
-        "multipliers without what velocities add",
-        case("linkage/lobatto-svi"),
-        lowered_constraints,
-        "along_motion",
-        lambda _: lambda system, functions: (sympy.S.Zero,) * len(functions),
-    ),
-    here(
-        "the end's momentum without the last force",
-        case("linkage/lobatto-svi"),
-        constrained_stages,
-        "_with_end",
-        lambda original: lambda table, rows, points: without_last_of(original(table, rows, points), rows),
-    ),
-    here("constraints 1e-9 off", case("linkage/lobatto-svi"), families, "system_kernel", constraints_off),
-    text(
-        "multipliers of the other sign",
-        case("linkage/lobatto-svi"),
-        r"y\[j\] = -y\[j\]",
-        "y[j] = +y[j]",
-        within=r"NAME\(multipliers\)",
-    ),
-    # Derivatives.
-    here(
-        "a slope by a parameter off by 1e-6",
-        case("double/svi"),
-        lowered_derivatives,
-        "jacobian",
-        changed_result(lambda found: found | {k: found[k] * sympy.Rational(1000001, 10**6) for k in list(found)[:1]}),
-    ),
-    *(
-        text(f"{what}, {where}", case(where), pattern, replacement, within=within)
-        for what, where, within, pattern, replacement in DERIVATIVES
-    ),
+    *BESIDE,
 )

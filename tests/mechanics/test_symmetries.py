@@ -250,6 +250,15 @@ def test_systems_without(text):
     assert symmetries(system) == ()
 
 
+@pytest.mark.parametrize("sum_", ["1e300 - m", "atanh(m) + m", "(m - 9)**1.5 + 1"])
+def test_a_sum_of_parameters_without_a_value_hides_no_symmetry(sum_):
+    """The sum might stand in a coefficient, so it is tried as a factor of one."""
+    system = LagrangianSystem.from_text(
+        name="sums", coordinates=["q", "x"], lagrangian=f"(q_dot**2 + x_dot**2)/2 + {sum_}", parameters={"m": 0.5}
+    )
+    assert "p_q" in formulas(system).values()
+
+
 def test_a_parameter_that_is_zero_by_default_breaks_symmetries_all_the_same():
     """Momentum maps are compiled for all values of the parameters."""
     assert symmetries(particle("(x**2 + y**2)**2 + eps*x**4", eps=0.0)) == ()

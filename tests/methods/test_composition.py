@@ -5,6 +5,7 @@ import pytest
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, Composition, StoermerVerlet, method_from_specification
 from scvi_codegen.models.problems import problem
 from scvi_codegen.models.systems import double_pendulum, duffing, kepler, outer_solar_system
@@ -74,6 +75,20 @@ def test_many_bodies():
     p = stepper.momentum(entry.q, entry.velocity)
     run = stepper.integrate(entry.q, p, h=200.0, steps=1000)
     assert np.abs(run.energy() / run.energy()[0] - 1).max() < 1e-12
+
+
+def test_momenta_at_rest_are_no_velocities():
+    """L + 3 v has the same motion, and momenta that are larger by 3; leapfrog steps of p / m would be others."""
+    plain, shifted = (
+        LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**4/4{more}")
+        for more in ("", " + 3*q_dot")
+    )
+    q, p = compile_stepper(plain, StoermerVerlet()).step([0.7], [0.4], 0.1)
+    np.testing.assert_allclose(
+        compile_stepper(shifted, StoermerVerlet()).step([0.7], [3.4], 0.1), [q, p + 3], rtol=1e-14
+    )
+    with pytest.raises(MethodError, match="separable"):
+        compile_stepper(shifted, Composition(8))
 
 
 def test_refusals():

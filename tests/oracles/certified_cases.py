@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sabotage import Case
-from samples import driven_duffing, linkage, pumped_cart_pole, sleigh, turning_wire
+from samples import driven_duffing, linkage, pumped_cart_pole, pumped_swing, pushed_pendulum, sleigh, turning_wire
 
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
@@ -37,6 +37,9 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "linkage": (linkage(), (0.0, 1.0, 1.94, 1.5), (0.1, 0.2, 0.0, 0.3), 0.02),
     "sleigh": (sleigh(), (0.3, -0.4, 0.5), (1.155222551473559, 0.8681156930772079, 0.56), 0.1),
     "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
+    "pushed": (pushed_pendulum(), (0.6,), (-0.3,), 0.1),
+    "swing": (pumped_swing(), (0.6,), (-0.3,), 0.1),
+    "field": (problem("charged-particle").system, (0.6, 0.3, -0.2), (-0.3, 0.4, 0.5), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
 }
 METHODS: dict[str, Callable[[], Method]] = {
@@ -78,6 +81,7 @@ WHOLE = """
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
+    pushed/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CASES = {name: case(name) for name in WHOLE.split()}
 """Everything that is sabotaged, whole."""

@@ -158,6 +158,11 @@ def test_states_between_are_at_times() -> None:
     asked = stepper().integrate(*START, h=0.1, t_end=9.0, t_eval=times)
     assert np.array_equal(asked.t, times)
     assert np.abs(kepler_time(asked.q[1:]) - times[1:]).max() < 1e-12
+    assert asked.tau is not None
+    for k in (7, 20):  # the part of its step at which a run to that time ends
+        ended = stepper().integrate(*START, h=0.1, t_end=float(times[k]))
+        assert ended.tau is not None
+        assert asked.tau[k] == pytest.approx(ended.tau[-1], abs=1e-12)
     whole = stepper().integrate(*START, h=0.1, t_end=9.0)
     assert np.array_equal(whole.at(times)[0], asked.q)
     seldom = stepper().integrate(*START, h=0.1, t_end=9.0, every=7)
@@ -220,6 +225,8 @@ def test_runs_are_saved_recorded_and_pickled(tmp_path: Any) -> None:
     recorded = sc.record_run(made.start(*START, h=0.1), tmp_path / "run", steps=40)
     assert np.array_equal(np.asarray(recorded.t), made.integrate(*START, h=0.1, steps=40).t)
     assert np.array_equal(recorded[20:].tau, made.integrate(*START, h=0.1, steps=40).tau[20:])
+    seldom = sc.record_run(made.start(*START, h=0.1), tmp_path / "seldom", steps=40, every=4)
+    assert np.array_equal(seldom[1:].tau, made.integrate(*START, h=0.1, steps=40).tau[4::4])
 
 
 def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:

@@ -97,6 +97,8 @@ def test_the_end_of_a_step_is_as_accurate_as_wanted(tolerance, degree):
         exact = reference.integrate(q, p, h=h / 8, steps=8, every=8).q[-1]
         worst = max(worst, np.max(np.abs(end - exact) / (np.abs(q) + np.abs(end - q))))
     assert worst < 3.0 * tolerance
+    assert worst < run.step_error < 30.0 * tolerance
+    assert run.step_error_t in run.t
     assert run.steps < len(stepper.integrate([0.3, 0.2], [0.2, 0.3], t_end=30.0, tolerance=tolerance / 100.0))
 
 

@@ -87,6 +87,7 @@ def test_states_are_those_kept_at_both_ends_and_nothing_jumps(compiled, sample, 
     run = compiled("driven-duffing", method).integrate(q, p, h=h, steps=20, t=0.4)
     assert np.array_equal(run.at(run.t)[0], run.q)
     assert np.array_equal(run.at(run.t)[1], run.p)
+    assert np.array_equal(run.at(np.nextafter(run.t[-1], run.t[-1] + h))[0], run.q[-1])
     for near in (np.nextafter(run.t[1:], run.t[:-1]), np.nextafter(run.t[1:-1], run.t[2:])):
         kept = run.q[1 : 1 + len(near)], run.p[1 : 1 + len(near)]
         for value, state in zip(run.at(near), kept, strict=True):

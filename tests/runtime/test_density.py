@@ -67,7 +67,7 @@ def test_steps_are_those_of_the_controller(method, solver):
 
 def test_the_monitor_may_depend_on_time_where_the_system_does():
     stepper = compile_stepper(DRIVEN, SVI(3), monitor="1/(1 + x**2 + cos(t)/2)", flags=QUICK_FLAGS)
-    run = stepper.integrate([1.0], [0.0], h=0.2, t_end=8.0)
+    run = stepper.integrate([1.0], [0.7], h=0.2, t_end=8.0)
 
     def control(t, q, p):
         return (2.0 * q[0] * p[0] - np.sin(t) / 2.0) / (1.0 + q[0] ** 2 + np.cos(t) / 2.0)
@@ -75,7 +75,7 @@ def test_the_monitor_may_depend_on_time_where_the_system_does():
     expected = by_hand(
         compile_stepper(DRIVEN, SVI(3), flags=QUICK_FLAGS),
         np.array([1.0]),
-        np.array([0.0]),
+        np.array([0.7]),
         0.2,
         len(run.t) - 2,
         lambda t, q, _: 1.0 / (1.0 + q[0] ** 2 + np.cos(t) / 2.0),
@@ -92,6 +92,23 @@ def test_a_hamiltonian_has_monitors_of_its_momenta():
     lengths = run.lengths[:-2]
     near = np.hypot(*run.q[:-2].T) < 0.3
     assert 4.0 * lengths[near].mean() < lengths[~near].mean()
+
+
+def test_forces_change_a_monitor_of_momenta():
+    system = hamiltonian_of(DRIVEN, momenta=["p"])
+    run = compile_stepper(system, SVI(3), monitor="1/(1 + p**2)", flags=QUICK_FLAGS).integrate(
+        [1.0], [0.7], h=0.2, t_end=8.0
+    )
+    expected = by_hand(
+        compile_stepper(system, SVI(3), flags=QUICK_FLAGS),
+        np.array([1.0]),
+        np.array([0.7]),
+        0.2,
+        len(run.t) - 2,
+        lambda _, __, p: 1.0 / (1.0 + p[0] ** 2),
+        lambda t, q, p: 2.0 * p[0] * (-(q[0] ** 3) + np.cos(2.0 * t) / 2.0 - p[0] / 10.0) / (1.0 + p[0] ** 2),
+    )
+    assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
 
 
 @pytest.mark.parametrize("system", [KEPLER, hamiltonian_of(KEPLER)], ids=["lagrangian", "hamiltonian"])

@@ -112,6 +112,12 @@ def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
         again = stepper.restore(again.save(), parameters=again.parameters)
         again.skip(4)
         assert (again.q[0], again.p[0]) == states[k]
+    sloped = {"u_0": 1.0, "u_1": 2.0, "u_2": -1.0, "u_3": 0.5, "u_t": 0.3, "w_0": 0.0}
+    after, plain = (stepper.start([0.3], [0.0], h=0.01, parameters=given) for given in (sloped, {"w_0": 0.0}))
+    for one in (after, plain):
+        one.hold(u=0.4)
+        one.skip(10)
+    assert after.q == plain.q
     began = time.perf_counter()
     for _ in range(1000):
         run.hold(u=0.1)

@@ -172,7 +172,10 @@ def test_pairs_of_roots_are_found_however_near(polynomials, middle, exponent, si
     assert np.abs(found.t - [middle - distance, middle + distance]).max() < 1e-15 / distance
 
 
-@pytest.mark.parametrize("function", ["cos(6*t) - 0.97", "exp(t) - 1.8 - 0.05*sin(20*t)", "sin(3*pi*t + 0.1)*(t + 1)"])
+@pytest.mark.parametrize(
+    "function",
+    ["cos(6*t) - 0.97", "exp(t) - 1.8 - 0.05*sin(20*t)", "sin(3*pi*t + 0.1)*(t + 1)", "sin(15*pi*t + 0.1)"],
+)
 def test_crossings_of_other_functions_are_found(function):
     t = np.linspace(0, 1, 100_001)
     g = sympy.lambdify(sympy.Symbol("t"), sympy.sympify(function))(t)

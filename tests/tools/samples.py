@@ -15,6 +15,7 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
@@ -85,6 +86,18 @@ def pushed_pendulum() -> LagrangianSystem:
         parameters={"c": 0.2},
         forces={"q": "u - c*q_dot"},
         inputs=["u", "w"],
+    )
+
+
+def pumped_swing() -> HamiltonianSystem:
+    """A Hamiltonian with time, rubbed and pushed."""
+    return HamiltonianSystem.from_text(
+        name="pumped swing",
+        coordinates=["q"],
+        momenta=["p"],
+        hamiltonian="p**2/(2*l**2*(1 + a*sin(w*t))**2) - g*l*(1 + a*sin(w*t))*cos(q)",
+        parameters={"l": 0.8, "g": 3.0, "a": 0.2, "w": 1.7, "c": 0.1},
+        forces={"q": "-c*p + cos(t)"},
     )
 
 

@@ -41,6 +41,7 @@ QUICK = (
     "half of the discrete action",
     "L_vq v lost",
     "a multiplier's force off its gradient",
+    "friction that drives",
 )
 
 
@@ -61,6 +62,13 @@ def test_every_fault_is_caught(mutation: Mutation, record_property) -> None:
     assert found
 
 
+def test_nothing_of_a_fault_is_left_in_the_process() -> None:
+    """Its iteration of Newton, say, borrowed by sweeps that are the same with the fault and without it."""
+    (mutation,) = (one for one in MUTATIONS if one.name == "momentum by A for A^T")
+    assert caught(mutation)
+    assert certified(mutation.case).passed
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_sabotaged_passes_whole(name: str) -> None:
@@ -78,6 +86,14 @@ def test_constrained_motions_are_certified(name: str) -> None:
     kept = {check.name for check in certificate.checks if check.outcome is Outcome.KEPT}
     assert {"stage equations", "constraints", "multipliers", "reversal", "order"} <= kept
     assert ("symplecticity" in kept) == name.startswith("wire")
+
+
+def test_inputs_are_certified_as_what_they_are_between_breakpoints() -> None:
+    system, stepper = pushed_pendulum(), compile_stepper(pushed_pendulum(), SVI(2), flags=QUICK_FLAGS)
+    for given in ({}, {"q": [0.6], "p": [-0.3], "stepper": stepper}):
+        certificate = verify(system, SVI(2), flags=QUICK_FLAGS, **given)
+        assert certificate.passed, certificate.to_text()
+        assert not certificate.not_measured
 
 
 # What a certificate says.

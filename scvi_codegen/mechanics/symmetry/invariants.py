@@ -93,7 +93,7 @@ def conserved(
     spaces = [space for space in found if space is not None and space.shape == (len(rows), len(support))]
     if len(spaces) < len(found):
         return []
-    known = [(factor, search.values_of(factor)) for factor in factors]
+    known = search.with_values(factors)
     recognised = [_recognised_row(np.array(spaces)[:, k], support, known, fractions) for k in range(len(rows))]
     return [
         {c: coefficient.xreplace(motion.numbers) for c, coefficient in row.items()}
@@ -157,10 +157,12 @@ class _Search:
         rates = (*sample.rates, 1.0)
         return [sample.value(slope) * rates[i] for i, slope in self.slopes[c].items()] or [0.0 * sample.t]
 
-    def values_of(self, factor: Expr) -> Array:
-        """A function of the parameters for the values drawn last."""
+    def with_values(self, factors: Sequence[Expr]) -> list[tuple[Expr, Array]]:
+        """Functions of the parameters for the values drawn last, without those that are 0 or not defined there."""
         known: dict[Any, Any] = dict(self.drawn)
-        return np.asarray(array_value(factor, known), dtype=float)
+        with np.errstate(all="ignore"):
+            found = [(factor, np.asarray(array_value(factor, known), dtype=float)) for factor in factors]
+        return [(factor, values) for factor, values in found if np.isfinite(values).all() and values.all()]
 
     @cached_property
     def points(self) -> list[Sample]:
@@ -267,8 +269,6 @@ def _recognised_row(
 def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[Expr, dict[Expr, Fraction]] | None:
     """The number and the powers of the factors whose product has these values."""
     if not entries.all():
-        return None
-    if not all(values.all() for _, values in factors):
         return None
     logs = [np.ones(len(entries)), *(np.zeros(len(entries)) + np.log(np.abs(values)) for _, values in factors)]
     solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]

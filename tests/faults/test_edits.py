@@ -1,0 +1,47 @@
+"""Edits of the package that its own tests must notice, where no certificate looks: a line of edits.toml each."""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from checkout import ROOT, copied, run
+from tiers import first_of_each
+
+Edit = dict[str, str]
+
+EDITS: list[Edit] = [
+    {"group": group, "name": name, **edit}
+    for group, edits in tomllib.loads((ROOT / "tests/faults/edits.toml").read_text(encoding="utf-8")).items()
+    for name, edit in edits.items()
+]
+FAILED = 1
+STILLBORN = re.compile(r"BuildError|SyntaxError|NameError|ImportError|UndefinedError")
+"""What is no notice: text that is none of C, Python or Jinja."""
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return copied(tmp_path_factory.mktemp("faults"))
+
+
+@pytest.mark.parametrize(
+    "edit",
+    first_of_each(EDITS, lambda edit: edit["file"].split("/")[0]),
+    ids=lambda edit: f"{edit['group']}: {edit['name']}",
+)
+def test_an_edit_is_noticed(edit: Edit, copy: Path) -> None:
+    path = copy / edit["file"]
+    text = path.read_text(encoding="utf-8")
+    assert text.count(edit["old"]) == 1, "the text to be edited is not there, or not alone"
+    pytest_alone = ("-m", "pytest", "-qx", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist")
+    path.write_text(text.replace(edit["old"], edit["new"]), encoding="utf-8")
+    try:
+        status, words = run(copy, sys.executable, *pytest_alone, f"tests/{edit['test']}")
+    finally:
+        path.write_text(text, encoding="utf-8")
+    assert status == FAILED, f"{edit['test']} does not notice: {words}"
+    assert not STILLBORN.search(words), words
