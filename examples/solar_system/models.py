@@ -1,0 +1,103 @@
+"""The ladder of Lagrangians, each with one effect more, as compiled steppers with their initial states at the epoch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import asteroids
+import ephemeris
+import figures
+import numpy as np
+import point_masses
+from ephemeris import BODIES, constant
+from tides import tide
+
+import scvi_codegen as sc
+
+DEGREE = 8  # order 16
+
+
+@dataclass(frozen=True)
+class Model:
+    """L and forces of the solar system, as text; ``asteroids`` attract the others besides."""
+
+    name: str
+    lagrangian: str
+    forces: dict[str, str] | None = None
+    asteroids: tuple[str, ...] = ()
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        return BODIES + self.asteroids
+
+    def with_term(self, name: str, term: str) -> Model:
+        return replace(self, name=name, lagrangian=f"{self.lagrangian} + {term}")
+
+    @cached_property
+    def stepper(self) -> sc.Stepper:
+        gm = ephemeris.masses() | asteroids.masses(self.asteroids)
+        parameters = {f"gm_{body}": mass for body, mass in gm.items()}
+        if "c**2" in self.lagrangian:
+            parameters["c"] = ephemeris.LIGHT
+        system = sc.LagrangianSystem.from_text(
+            name="solar system",
+            coordinates=point_masses.coordinates(self.bodies),
+            lagrangian=self.lagrangian,
+            parameters=parameters,
+            forces=self.forces,
+        )
+        return sc.compile_stepper(system, sc.SVI(DEGREE))
+
+    @cached_property
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities at the epoch, those of asteroids by going back from where their elements are known."""
+        q, v = (each[0] for each in ephemeris.states(np.zeros(1)))
+        if self.asteroids:
+            seen = [np.stack(asteroids.heliocentric(name)) for name in self.asteroids]
+            later = np.stack([each[0] for each in ephemeris.states(np.array([asteroids.EPOCH]))])
+            together = np.concatenate([later, np.stack([later[:, 0] + each for each in seen], axis=1)], axis=1)
+            steps = int(asteroids.EPOCH / 2.0)
+            run = self.stepper.integrate(
+                together[0].ravel(), velocity=together[1].ravel(), t=asteroids.EPOCH, h=-2.0, steps=steps, every=steps
+            )
+            q = np.vstack([q, run.q[-1].reshape(-1, 3)[len(BODIES) :]])
+            v = np.vstack([v, run.velocity[-1].reshape(-1, 3)[len(BODIES) :]])
+        return q.ravel(), v.ravel()
+
+    def runs(self, h: float, every: int) -> tuple[sc.Trajectory, sc.Trajectory]:
+        """Back and forth from the epoch, to the ends of the ephemeris, by steps of h days."""
+        q, v = self.start
+        spans = ((-h, -ephemeris.FIRST), (h, ephemeris.LAST))
+        back, forth = (
+            self.stepper.integrate(q, velocity=v, h=step, steps=int(days / h / every) * every, every=every)
+            for step, days in spans
+        )
+        return back, forth
+
+    def motion(self, h: float, every: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times in ascending order, and positions (times, bodies, 3)."""
+        back, forth = self.runs(h, every)
+        positions = np.concatenate([back.q[:0:-1], forth.q]).reshape(-1, len(self.bodies), 3)
+        return np.concatenate([back.t[:0:-1], forth.t]), positions
+
+
+def ladder() -> Iterator[Model]:
+    century = f"((t - ({ephemeris.YEAR_2000!r}))/36525)"
+    yield (model := Model("Newton", point_masses.newton(BODIES)))
+    yield (model := model.with_term("+ Einstein, Infeld, Hoffmann", point_masses.relativity(BODIES)))
+    sun = figures.zonal("sun", BODIES[1:], figures.of_the_sun(), ephemeris.SUN_RADIUS, {2: constant("J2SUN")})
+    yield (model := model.with_term("+ the Sun's J2", sun))
+    zonal = {n: constant(f"J{n}E") for n in (2, 3, 4)}
+    earth = figures.zonal("earth", ("moon", "sun"), figures.of_the_earth(century), ephemeris.EARTH_RADIUS, zonal)
+    yield (model := model.with_term("+ the Earth's J2, J3, J4", earth))
+    axes = figures.of_the_moon(century)
+    moon = figures.moon(*axes, ephemeris.MOON_RADIUS, constant("J2M"), constant("C22M"))
+    yield (model := model.with_term("+ the Moon's J2, C22", moon))
+    love, lag = ([constant(f"{name}{order}") for order in range(3)] for name in ("K2E", "TAUE"))
+    yield (model := replace(model, name="+ tides on the Earth", forces=tide(ephemeris.EARTH_RADIUS, love, lag)))
+    for number in (3, len(asteroids.ELEMENTS)):
+        names = tuple(asteroids.ELEMENTS)[:number]
+        term = asteroids.lagrangian(names)
+        yield replace(model.with_term(f"+ {number} asteroids", term), asteroids=names)

@@ -1,0 +1,100 @@
+"""The solar system from one Lagrangian, beside DE421: what each of its terms is worth, body by body.
+
+From the states of DE421 on 28 June 1969, back to 1899 and forth to 2200. Needs the extras `ephemeris` and `plot`.
+"""
+
+from __future__ import annotations
+
+import time
+
+import ephemeris
+import matplotlib
+import numpy as np
+from ephemeris import AU, BODIES
+from models import Model, ladder
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+STEP = 4.0  # days
+SAMPLING = 8.0
+SHOWN = ("mercury", "earth", "moon", "mars", "jupiter", "neptune")
+
+
+def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Between the places of bodies, in km: (times, bodies)."""
+    return np.linalg.norm(ephemeris.relative(a) - ephemeris.relative(b), axis=-1) * AU
+
+
+def measured(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Times and distances from DE421 at these; prints what the run cost and how far half steps lead away."""
+    began = time.perf_counter()
+    _ = model.stepper
+    compiling = time.perf_counter() - began
+    _ = model.start
+    began = time.process_time()
+    t, x = model.motion(STEP, round(SAMPLING / STEP))
+    running = time.process_time() - began
+    _, finer = model.motion(STEP / 2.0, round(2.0 * SAMPLING / STEP))
+    halved = distances(x, finer).max(axis=0)
+    most = BODIES[1 + halved.argmax()]
+    years = (t[-1] - t[0]) / 365.25
+    print(
+        f"{model.name:30} compiled in {compiling:4.1f} s, {years:.0f} years in {running:5.2f} s;"
+        f" half steps change {most} by {1e3 * halved.max():.0f} m, others by {1e3 * np.sort(halved)[-2]:.1f} m",
+        flush=True,
+    )
+    return t, distances(x, ephemeris.states(t)[0])
+
+
+def conserved(model: Model) -> str:
+    """How well a run keeps what L conserves, over all years."""
+    runs = model.runs(STEP, round(SAMPLING / STEP))
+    energy = max(abs(run.energy() / run.energy()[0] - 1.0).max() for run in runs)
+    errors = np.max([abs(run.momentum_errors()).max(axis=0) for run in runs], axis=0)
+    names = model.stepper.momentum_map_names
+    kept = ", ".join(f"{name} {error:.0e}" for name, error in zip(names, errors, strict=True))
+    return f"energy {energy:.0e}; {kept}"
+
+
+def print_table(title: str, rows: dict[str, np.ndarray]) -> None:
+    print(f"\n{title}\n{'':30}" + "".join(f"{body:>9}" for body in BODIES[1:]))
+    for name, largest in rows.items():
+        print(f"{name:30}" + "".join(f"{_three_digits(km):>9}" for km in largest))
+
+
+def _three_digits(km: float) -> str:
+    return f"{km:.{max(0, 2 - int(np.floor(np.log10(km))))}f}"
+
+
+def drawn(found: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    figure, axes = plt.subplots(2, 3, figsize=(12, 7), layout="constrained", sharex=True)
+    colours = plt.get_cmap("viridis_r")(np.linspace(0.1, 1.0, len(found)))
+    for body, ax in zip(SHOWN, axes.flat, strict=True):
+        for (name, (t, away)), colour in zip(found.items(), colours, strict=True):
+            year = 2000.0 + (t - ephemeris.YEAR_2000) / 365.25
+            envelope = away[:, BODIES.index(body) - 1]
+            width = 92  # of eight days: two years
+            kept = len(envelope) // width * width
+            ax.semilogy(year[:kept:width], envelope[:kept].reshape(-1, width).max(axis=1), color=colour, label=name)
+        ax.set(title=f"{body.capitalize()}, km from DE421")
+        ax.axvspan(year[0], 2000.0 + (ephemeris.END_OF_FIT - ephemeris.YEAR_2000) / 365.25, color="0.94", zorder=0)
+        ax.grid(color="0.9")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.savefig("solar_system.png", dpi=110)
+
+
+def main() -> None:
+    found = {}
+    for model in ladder():
+        found[model.name] = measured(model)
+        if model.name.endswith("Hoffmann"):
+            print(f"{'':30} kept to: {conserved(model)}", flush=True)
+    fitted = {name: away[t <= ephemeris.END_OF_FIT].max(axis=0) for name, (t, away) in found.items()}
+    print_table("largest distance from DE421, 1899 to 2053, km (planets from the Sun, Moon from the Earth)", fitted)
+    print_table("and to 2200", {name: away.max(axis=0) for name, (_, away) in found.items()})
+    drawn(found)
+
+
+if __name__ == "__main__":
+    main()
