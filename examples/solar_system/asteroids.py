@@ -1,4 +1,4 @@
-"""Fifteen asteroids: osculating elements of JPL's Small-Body Database, and the masses of DE421, which has 343 of them."""
+"""Fifteen asteroids: elements of the Small-Body Database of JPL, and the masses of DE421, which has 343 of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from point_masses import attraction, square, total
 from scipy.optimize import newton
 
 EPOCH = 2457200.5 - ephemeris.EPOCH  # 27 June 2015
-ELEMENTS = {  # number, then a in au, e, and in degrees inclination, argument of perihelion, node, mean anomaly
+ELEMENTS = {  # number, osculating a in au, e, and in degrees inclination, argument of perihelion, node, mean anomaly
     "ceres": (1, 2.7679724, 0.07578254, 10.59230, 72.65415, 80.32720, 138.6621747),
     "pallas": (2, 2.7720036, 0.23115767, 34.84026, 309.96556, 173.09215, 120.9190263),
     "vesta": (4, 2.3619132, 0.08883383, 7.14010, 151.18850, 103.84964, 75.1726759),

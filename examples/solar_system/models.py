@@ -30,13 +30,16 @@ class Model:
 
     @property
     def bodies(self) -> tuple[str, ...]:
+        """All that moves."""
         return BODIES + self.asteroids
 
     def with_term(self, name: str, term: str) -> Model:
+        """One effect more."""
         return replace(self, name=name, lagrangian=f"{self.lagrangian} + {term}")
 
     @cached_property
     def stepper(self) -> sc.Stepper:
+        """Compiled."""
         gm = ephemeris.masses() | asteroids.masses(self.asteroids)
         parameters = {f"gm_{body}": mass for body, mass in gm.items()}
         if "c**2" in self.lagrangian:
@@ -52,7 +55,7 @@ class Model:
 
     @cached_property
     def start(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities at the epoch, those of asteroids by going back from where their elements are known."""
+        """Positions and velocities at the epoch; those of asteroids by going back to it from that of their elements."""
         q, v = (each[0] for each in ephemeris.states(np.zeros(1)))
         if self.asteroids:
             seen = [np.stack(asteroids.heliocentric(name)) for name in self.asteroids]

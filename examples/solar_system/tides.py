@@ -1,8 +1,8 @@
 """The tide that the Moon raises on the Earth, as forces: it lags behind, so it is no term of L.
 
 Of degree two, with a Love number and a lag of its own for each order, as in DE421 (Williams, Boggs & Folkner, "DE421
-Lunar Orbit, Physical Librations, and Surface Coordinates", 2008). The tide at t was raised by the Moon of t - lag and has
-been carried on by the turning Earth since.
+Lunar Orbit, Physical Librations, and Surface Coordinates", 2008). The tide at t was raised by the Moon of t - lag, and
+the turning Earth has carried it on since.
 """
 
 from __future__ import annotations
