@@ -12,7 +12,7 @@ import time
 import ephemeris
 import matplotlib
 import numpy as np
-from figures import OBLIQUITY, zonal
+from figures import zonal
 from point_masses import coordinates, newton, relativity
 from scipy.optimize import minimize_scalar
 
@@ -36,7 +36,7 @@ PUBLISHED = {"g5": 4.257452, "g6": 28.2449, "g7": 3.087946, "g8": 0.673019} | {
 
 
 def bodies() -> tuple[dict[str, float], np.ndarray, np.ndarray, float]:
-    """Masses, positions and velocities, and of the inner planets half the mean of m a^2 over the mass within."""
+    """Masses, positions and velocities; J2 R^2 of inner planets as rings: half of sum m a^2 over the mass within."""
     gm = ephemeris.masses()
     q, v = (dict(zip(ephemeris.BODIES, each[0], strict=True)) for each in ephemeris.states(np.zeros(1)))
     inside = sum(gm[body] for body in INNER)
@@ -49,12 +49,18 @@ def bodies() -> tuple[dict[str, float], np.ndarray, np.ndarray, float]:
     return masses, q0, v0, float(rings)
 
 
-def stepper_of(masses: dict[str, float], rings: float) -> sc.Stepper:
+def pole(masses: dict[str, float], q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The direction of the angular momentum."""
+    momentum = np.array(list(masses.values())) @ np.cross(q, v)
+    return momentum / np.linalg.norm(momentum)
+
+
+def stepper_of(masses: dict[str, float], rings: float, axis: np.ndarray) -> sc.Stepper:
     lagrangian = newton(tuple(masses))
     parameters = {f"gm_{body}": mass for body, mass in masses.items()}
     if not PLAIN:
-        pole = ("0", repr(-np.sin(OBLIQUITY).item()), repr(np.cos(OBLIQUITY).item()))  # of the ecliptic
-        lagrangian += f" + {relativity(tuple(masses))} + {zonal('sun', PLANETS, pole, 1.0, {2: rings})}"
+        ring = zonal("sun", PLANETS, [repr(k) for k in axis.tolist()], 1.0, {2: rings})
+        lagrangian += f" + {relativity(tuple(masses))} + {ring}"
         parameters["c"] = ephemeris.LIGHT
     system = sc.LagrangianSystem.from_text(
         name="giant planets", coordinates=coordinates(tuple(masses)), lagrangian=lagrangian, parameters=parameters
@@ -69,8 +75,7 @@ def elements(run: sc.Trajectory, masses: dict[str, float]) -> tuple[np.ndarray, 
     """
     gm = np.array(list(masses.values()))
     q, v = (x.reshape(len(x), -1, 3) for x in (run.q, run.velocity))
-    total = np.einsum("b,bi->i", gm, np.cross(q[0], v[0]))
-    z = total / np.linalg.norm(total)
+    z = pole(masses, q[0], v[0])
     x = np.cross([0.0, 1.0, 0.0], z) / np.linalg.norm(np.cross([0.0, 1.0, 0.0], z))
     axes = np.array([x, np.cross(z, x), z])
     q, v = ((each[:, 1:] - each[:, :1]) @ axes.T for each in (q, v))
@@ -102,7 +107,7 @@ def frequency(t: np.ndarray, signal: np.ndarray, rank: int = 0) -> float:
 
 def main() -> None:
     masses, q, v, rings = bodies()
-    stepper = stepper_of(masses, rings)
+    stepper = stepper_of(masses, rings, pole(masses, q, v))
     steps = round(MILLION_YEARS * 365.25e6 / STEP / EVERY) * EVERY
     began = time.process_time()
     run = stepper.integrate(q.ravel(), velocity=v.ravel(), h=STEP, steps=steps, every=EVERY)
