@@ -1,8 +1,9 @@
 """What the figures of the Sun, the Earth and the Moon add to L, as text: terms of their potentials at point masses.
 
-Axes are functions of t, days from the epoch of the ephemeris, in its frame, the mean equator and equinox of 2000; they
-are given, not moved by L: the Sun's is fixed, the Earth's precesses (IAU 2006, Capitaine, Wallace & Chapront 2003), the
-Moon turns by Cassini's laws, inclined by 1.543 degrees, with the mean elements of Simon et al. (1994).
+Axes are functions of t, days from the epoch of the ephemeris, in its frame, the mean equator and equinox of 2000: the
+Sun's is fixed, the Earth's precesses (IAU 2006, Capitaine, Wallace & Chapront 2003), the Moon's pole follows Cassini's
+laws, inclined by 1.543 degrees, with the mean elements of Simon et al. (1994). How far the Moon has turned about it is
+a coordinate.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ def of_the_earth(century: str) -> Vector:
     return [x, y, f"(1 - ({x}**2 + {y}**2)/2)"]
 
 
-def of_the_moon(century: str) -> tuple[Vector, Vector]:
-    """The Moon's pole, and its axis towards the mean Earth: Cassini's laws."""
+def of_the_moon(century: str, turn: str = "0") -> tuple[Vector, Vector]:
+    """The Moon's pole, and its axis towards the mean Earth, by Cassini's laws, turned ahead by an angle."""
     inclination = radians(1.543)
     node = f"({radians(125.044555)!r} - {radians(6967919.3622 / 3600.0)!r}*{century})"  # on the ecliptic of 2000
-    latitude = f"({radians(93.27209906)!r} + {radians(1739527263.2179 / 3600.0)!r}*{century})"  # from there
+    latitude = f"({radians(93.27209906)!r} + {radians(1739527263.2179 / 3600.0)!r}*{century} + {turn})"  # from there
     up, across = repr(cos(inclination)), repr(sin(inclination))
     pole = [f"-{across}*sin{node}", f"{across}*cos{node}", up]
     towards = [
@@ -64,6 +65,11 @@ def moon(pole: Vector, towards: Vector, radius: float, j2: float, c22: float) ->
     # along the third axis: 1 - up^2 - near^2; cos^2(latitude) cos(2 longitude) is near^2 less that
     degree_two = f"{-j2!r}*(3*{up}**2 - 1)/2 + {3.0 * c22!r}*(2*{near}**2 + {up}**2 - 1)"
     return f"{attraction('moon', 'earth')}*({radius!r}/{distance('moon', 'earth')})**2*({degree_two})"
+
+
+def turning_moon(radius: float, inertia: float) -> str:
+    """The energy of `moon_turn`, the angle by which the Moon is ahead; the moment of inertia in m radius^2."""
+    return f"gm_moon*{inertia * radius**2!r}*moon_turn_dot**2/2"
 
 
 def _along(axis: Vector, a: str, b: str) -> str:

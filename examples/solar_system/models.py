@@ -9,6 +9,7 @@ from functools import cached_property
 import asteroids
 import ephemeris
 import figures
+import libration
 import numpy as np
 import point_masses
 from ephemeris import BODIES, constant
@@ -17,6 +18,8 @@ from tides import tide
 import scvi_codegen as sc
 
 DEGREE = 8  # order 16
+TURN = "moon_turn"
+"""The last coordinate, where the Moon has a figure."""
 
 
 @dataclass(frozen=True)
@@ -46,28 +49,41 @@ class Model:
             parameters["c"] = ephemeris.LIGHT
         system = sc.LagrangianSystem.from_text(
             name="solar system",
-            coordinates=point_masses.coordinates(self.bodies),
+            coordinates=[*point_masses.coordinates(self.bodies), *([TURN] if self.turns else [])],
             lagrangian=self.lagrangian,
             parameters=parameters,
             forces=self.forces,
         )
         return sc.compile_stepper(system, sc.SVI(DEGREE))
 
+    @property
+    def turns(self) -> bool:
+        """Whether the Moon does."""
+        return TURN in self.lagrangian
+
     @cached_property
     def start(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities at the epoch; those of asteroids by going back to it from that of their elements."""
-        q, v = (each[0] for each in ephemeris.states(np.zeros(1)))
-        if self.asteroids:
-            seen = [np.stack(asteroids.heliocentric(name)) for name in self.asteroids]
-            later = np.stack([each[0] for each in ephemeris.states(np.array([asteroids.EPOCH]))])
-            together = np.concatenate([later, np.stack([later[:, 0] + each for each in seen], axis=1)], axis=1)
-            steps = int(asteroids.EPOCH / 2.0)
-            run = self.stepper.integrate(
-                together[0].ravel(), velocity=together[1].ravel(), t=asteroids.EPOCH, h=-2.0, steps=steps, every=steps
-            )
-            q = np.vstack([q, run.q[-1].reshape(-1, 3)[len(BODIES) :]])
-            v = np.vstack([v, run.velocity[-1].reshape(-1, 3)[len(BODIES) :]])
-        return q.ravel(), v.ravel()
+        if not self.asteroids:
+            return self.state(0.0, np.zeros((2, 0, 3)))
+        then = asteroids.EPOCH
+        sun = np.array(ephemeris.states(np.array([then])))[:, 0, :1]
+        seen = np.stack([asteroids.heliocentric(name) for name in self.asteroids], axis=1)
+        q, v = self.state(then, sun + seen)
+        steps = int(then / 2.0)
+        run = self.stepper.integrate(q, velocity=v, t=then, h=-2.0, steps=steps, every=steps)
+        return self.state(0.0, np.array([self.places(each[-1])[len(BODIES) :] for each in (run.q, run.velocity)]))
+
+    def state(self, t: float, small: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates and velocities: those of DE421, and of asteroids as given, (2, asteroids, 3)."""
+        large = np.array(ephemeris.states(np.array([t])))[:, 0]
+        both = np.concatenate([large, small], axis=1).reshape(2, -1)
+        q, v = np.column_stack([both, libration.state(t)]) if self.turns else both
+        return q, v
+
+    def places(self, q: np.ndarray) -> np.ndarray:
+        """Coordinates by bodies: (..., bodies, 3)."""
+        return q[..., : 3 * len(self.bodies)].reshape(*q.shape[:-1], -1, 3)
 
     def runs(self, h: float, every: int) -> tuple[sc.Trajectory, sc.Trajectory]:
         """Back and forth from the epoch, to the ends of the ephemeris, by steps of h days."""
@@ -82,8 +98,8 @@ class Model:
     def motion(self, h: float, every: int) -> tuple[np.ndarray, np.ndarray]:
         """Times in ascending order, and positions (times, bodies, 3)."""
         back, forth = self.runs(h, every)
-        positions = np.concatenate([back.q[:0:-1], forth.q]).reshape(-1, len(self.bodies), 3)
-        return np.concatenate([back.t[:0:-1], forth.t]), positions
+        q = np.concatenate([back.q[:0:-1], forth.q])
+        return np.concatenate([back.t[:0:-1], forth.t]), self.places(q)
 
 
 def ladder() -> Iterator[Model]:
@@ -95,9 +111,10 @@ def ladder() -> Iterator[Model]:
     zonal = {n: constant(f"J{n}E") for n in (2, 3, 4)}
     earth = figures.zonal("earth", ("moon", "sun"), figures.of_the_earth(century), ephemeris.EARTH_RADIUS, zonal)
     yield (model := model.with_term("+ the Earth's J2, J3, J4", earth))
-    axes = figures.of_the_moon(century)
+    axes = figures.of_the_moon(century, turn=TURN)
     moon = figures.moon(*axes, ephemeris.MOON_RADIUS, constant("J2M"), constant("C22M"))
-    yield (model := model.with_term("+ the Moon's J2, C22", moon))
+    turning = figures.turning_moon(ephemeris.MOON_RADIUS, 4.0 * constant("C22M") / constant("LGAM"))
+    yield (model := model.with_term("+ the Moon's J2, C22, libration", f"{moon} + {turning}"))
     love, lag = ([constant(f"{name}{order}") for order in range(3)] for name in ("K2E", "TAUE"))
     yield (model := replace(model, name="+ tides on the Earth", forces=tide(ephemeris.EARTH_RADIUS, love, lag)))
     for number in (3, len(asteroids.ELEMENTS)):

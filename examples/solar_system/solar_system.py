@@ -40,7 +40,7 @@ def measured(model: Model) -> tuple[np.ndarray, np.ndarray]:
     most = BODIES[1 + halved.argmax()]
     years = (t[-1] - t[0]) / 365.25
     print(
-        f"{model.name:30} compiled in {compiling:4.1f} s, {years:.0f} years in {running:5.2f} s;"
+        f"{model.name:32} compiled in {compiling:4.1f} s, {years:.0f} years in {running:5.2f} s;"
         f" half steps change {most} by {1e3 * halved.max():.0f} m, others by {1e3 * np.sort(halved)[-2]:.1f} m",
         flush=True,
     )
@@ -73,9 +73,9 @@ def conserved(model: Model) -> str:
 
 
 def print_table(title: str, rows: dict[str, np.ndarray]) -> None:
-    print(f"\n{title}\n{'':30}" + "".join(f"{body:>9}" for body in BODIES[1:]))
+    print(f"\n{title}\n{'':32}" + "".join(f"{body:>9}" for body in BODIES[1:]))
     for name, largest in rows.items():
-        print(f"{name:30}" + "".join(f"{_three_digits(km):>9}" for km in largest))
+        print(f"{name:32}" + "".join(f"{_three_digits(km):>9}" for km in largest))
 
 
 def _three_digits(km: float) -> str:
@@ -107,13 +107,13 @@ def main() -> None:
         found[model.name] = t, distances(x, ephemeris.states(t)[0])
         turning[model.name] = turning_of_the_moon(t[fitted], x[fitted])
         if model.name.endswith("Hoffmann"):
-            print(f"{'':30} kept to: {conserved(model)}", flush=True)
+            print(f"{'':32} kept to: {conserved(model)}", flush=True)
     largest = {name: away[t <= ephemeris.END_OF_FIT].max(axis=0) for name, (t, away) in found.items()}
     print_table("largest distance from DE421, 1899 to 2053, km (planets from the Sun, Moon from the Earth)", largest)
     print_table("and to 2200", {name: away.max(axis=0) for name, (_, away) in found.items()})
     print("\nchange of the Moon's mean motion against DE421, 1899 to 2053, arcseconds a century squared")
     for name, excess in turning.items():
-        print(f"{name:30}{excess:9.2f}")
+        print(f"{name:32}{excess:9.2f}")
     drawn(found)
 
 
