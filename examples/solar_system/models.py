@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -102,7 +102,8 @@ class Model:
         return np.concatenate([back.t[:0:-1], forth.t]), self.places(q)
 
 
-def ladder() -> Iterator[Model]:
+def ladder(counts: Sequence[int] = (3,)) -> Iterator[Model]:
+    """Models, the last of them with so many asteroids."""
     century = f"((t - ({ephemeris.YEAR_2000!r}))/36525)"
     yield (model := Model("Newton", point_masses.newton(BODIES)))
     yield (model := model.with_term("+ Einstein, Infeld, Hoffmann", point_masses.relativity(BODIES)))
@@ -117,7 +118,7 @@ def ladder() -> Iterator[Model]:
     yield (model := model.with_term("+ the Moon's J2, C22, libration", f"{moon} + {turning}"))
     love, lag = ([constant(f"{name}{order}") for order in range(3)] for name in ("K2E", "TAUE"))
     yield (model := replace(model, name="+ tides on the Earth", forces=tide(ephemeris.EARTH_RADIUS, love, lag)))
-    for number in (3, len(asteroids.ELEMENTS)):
+    for number in counts:
         names = tuple(asteroids.ELEMENTS)[:number]
         term = asteroids.lagrangian(names)
         yield replace(model.with_term(f"+ {number} asteroids", term), asteroids=names)

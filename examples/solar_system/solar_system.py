@@ -1,11 +1,13 @@
 """The solar system from one Lagrangian, beside DE421: what each of its terms is worth, body by body.
 
 From the states of DE421 on 28 June 1969, back to 1899 and forth to 2200. Needs the extras `ephemeris` and `plot`.
+Numbers on the command line, up to 15, are of asteroids in further models, after the one with three.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 
 import ephemeris
 import matplotlib
@@ -101,7 +103,7 @@ def drawn(found: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
 
 def main() -> None:
     found, turning = {}, {}
-    for model in ladder():
+    for model in ladder((3, *map(int, sys.argv[1:]))):
         t, x = measured(model)
         fitted = t <= ephemeris.END_OF_FIT
         found[model.name] = t, distances(x, ephemeris.states(t)[0])

@@ -268,12 +268,12 @@ class TestRuns:
         title, *rows = output.split("\n\n")[1].splitlines()
         bodies = rows[0].split()
         table = {row[:32].strip(): dict(zip(bodies, map(float, row[32:].split()), strict=True)) for row in rows[1:]}
-        newton, relativity, sun, earth, moon, tides, _, more = table.values()
+        newton, relativity, sun, earth, moon, tides, more = table.values()
         assert "1899 to 2053" in title
         assert newton["mercury"] > 20_000 > 15 > relativity["mercury"] > 10 > 1 > sun["mercury"] > more["mercury"]
         assert sun["moon"] > 1_000 > 100 > earth["moon"] > 2 * moon["moon"] > 10 > 0.5 > tides["moon"]
         assert tides["mars"] > 2 * more["mars"]
-        assert max(more.values()) < 40
+        assert max(more.values()) < 50
         turning = [float(line[32:]) for line in output.split("\n\n")[3].splitlines()[1:]]
         assert abs(turning[4] - 25.86) < 0.2  # by laser ranging, Chapront, Chapront-Touze & Francou, A&A 387 (2002)
         assert abs(turning[5]) < 1.0
