@@ -1,0 +1,34 @@
+"""The libration of the Moon in longitude as DE421 has it: the angle by which it is ahead of Cassini's laws."""
+
+from __future__ import annotations
+
+import ephemeris
+import figures
+import numpy as np
+import sympy
+
+OFFSET = np.radians(67.92 / 3600.0)
+"""Of the principal axis from the one towards the mean Earth: Williams, Boggs & Folkner (2008)."""
+
+
+def axes(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pole of the Moon's figure and its principal axis nearest to the Earth, by the angles of DE421: (3, times)."""
+    phi, theta, psi = ephemeris.tables.position("librations", ephemeris.EPOCH, t)
+    s, c = np.sin, np.cos
+    pole = np.array([s(theta) * s(phi), -s(theta) * c(phi), c(theta)])
+    x, y = c(phi) * c(psi) - s(phi) * c(theta) * s(psi), s(phi) * c(psi) + c(phi) * c(theta) * s(psi)
+    return pole, np.array([x, y, s(theta) * s(psi)])
+
+
+def turn(t: np.ndarray) -> np.ndarray:
+    """The angle in radians."""
+    pole, near = axes(t)
+    towards = sympy.lambdify("century", figures.of_the_moon("century")[1])((t - ephemeris.YEAR_2000) / 36525.0)
+    across = np.cross(pole, near, axis=0)
+    return -np.arcsin(np.sum(np.array(towards) * across, axis=0)) - OFFSET
+
+
+def state(t: float) -> tuple[float, float]:
+    """The angle at a time, and its rate in radians a day."""
+    before, now, after = turn(t + np.array([-0.1, 0.0, 0.1]))
+    return float(now), float((after - before) / 0.2)

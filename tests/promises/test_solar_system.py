@@ -1,0 +1,299 @@
+"""The Lagrangian of ``examples/solar_system``: its terms against forms found otherwise, and its runs against DE421."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+
+import scvi_codegen as sc
+
+FOLDER = Path(__file__).parents[2] / "examples" / "solar_system"
+MASSES = {"a": 1.0, "b": 0.7, "d": 0.2}
+PLACES = np.array([[0.1, -0.2, 0.3], [1.4, 0.3, -0.2], [-0.6, 1.9, 0.4]])
+VELOCITIES = np.array([[0.1, -0.3, 0.2], [-0.2, 0.6, 0.1], [0.4, 0.1, -0.3]])
+PEERS = ("de421", "jplephem", "matplotlib")
+needs_ephemeris = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in PEERS), reason="needs the extras 'ephemeris' and 'plot'"
+)
+
+
+@pytest.fixture(scope="module")
+def example():
+    """Imports a module of the example."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)
+        yield importlib.import_module
+
+
+def relativistic(example, masses, c):
+    terms = example("point_masses")
+    return sc.LagrangianSystem.from_text(
+        name="relativistic",
+        coordinates=terms.coordinates(tuple(masses)),
+        lagrangian=f"{terms.newton(tuple(masses))} + {terms.relativity(tuple(masses))}",
+        parameters={f"gm_{body}": mass for body, mass in masses.items()} | {"c": c},
+    )
+
+
+def newhall_accelerations(gm, x, v, c):
+    """The equations of motion as ephemerides use them: Newhall, Standish & Williams, A&A 125 (1983), equation 1."""
+    n = len(gm)
+    to = x[None] - x[:, None]  # [a, b]: from a to b
+    r = np.linalg.norm(to, axis=-1) + np.eye(n)
+    pull = gm * (1.0 - np.eye(n)) / r**3
+    newton = np.einsum("ab,abi->ai", pull, to)
+    potential = (gm * (1.0 - np.eye(n)) / r).sum(axis=1)
+    along = np.einsum("abi,bi->ab", to, v) / r
+    factor = -4.0 * potential[:, None] - potential + (v**2).sum(1)[:, None] + 2.0 * (v**2).sum(1) - 4.0 * v @ v.T
+    factor += -1.5 * along**2 + 0.5 * np.einsum("abi,bi->ab", to, newton)
+    drag = pull * np.einsum("abi,abi->ab", -to, 4.0 * v[:, None] - 3.0 * v)
+    extra = np.einsum("ab,abi->ai", pull * factor, to) + np.einsum("ab,abi->ai", drag, v[:, None] - v)
+    extra += 3.5 * np.einsum("ab,bi->ai", gm * (1.0 - np.eye(n)) / r, newton)
+    return newton + extra / c**2
+
+
+def test_bodies_move_as_einstein_infeld_and_hoffmann_found(example):
+    """What is left in the equations of L, of the accelerations in closed form, is of the next order, 1/c^4."""
+    system = relativistic(example, MASSES, 1.0)
+    q, v = (sympy.Matrix(list(each)) for each in (system.coordinates, system.velocities))
+    momenta = sympy.Matrix([system.lagrangian]).jacobian(v)
+    forces = sympy.Matrix([system.lagrangian]).jacobian(q)
+    accelerations = sympy.Matrix(sympy.symbols(f"acceleration:{len(q)}"))
+    equations = momenta.jacobian(v) * accelerations + momenta.jacobian(q) * v - forces.T
+    names = [symbol for symbol in system.lagrangian.free_symbols if symbol not in {*q, *v}]
+    residual = sympy.lambdify([list(q), list(v), list(accelerations), names], list(equations), cse=True)
+    gm, left = np.array(list(MASSES.values())), []
+    for c in (20.0, 200.0):
+        values = [c if symbol.name == "c" else MASSES[symbol.name.removeprefix("gm_")] for symbol in names]
+        found = newhall_accelerations(gm, PLACES, VELOCITIES, c)
+        left.append(np.array(residual(PLACES.ravel(), VELOCITIES.ravel(), found.ravel(), values)))
+    assert np.abs(left[0]).max() < 1e-4
+    np.testing.assert_allclose(left[1] * 1e4, left[0], rtol=0.05, atol=1e-6)
+
+
+def test_the_centre_of_energy_moves_with_the_momentum(example):
+    """The theorem of the centre of mass, to the next order in 1/c^2, which no symmetry of the text shows."""
+    bends, gm = [], np.array(list(MASSES.values()))
+    for c in (10.0, 100.0):
+        stepper = sc.compile_stepper(relativistic(example, MASSES, c), sc.SVI(6))
+        run = stepper.integrate(PLACES.ravel(), velocity=VELOCITIES.ravel(), h=0.02, steps=100)
+        assert len(stepper.momentum_map_names) >= 6
+        assert abs(run.momentum_errors()).max() < 1e-13
+        x, v, p = (each.reshape(len(run), -1, 3) for each in (run.q, run.velocity, run.p))
+        r = np.linalg.norm(x[:, None] - x[:, :, None], axis=-1) + np.diag([np.inf] * 3)
+        energy = gm * (1.0 + ((v**2).sum(-1) / 2.0 - (gm / r).sum(-1) / 2.0) / c**2)
+        centre = np.einsum("tb,tbi->ti", energy, x) - run.t[:, None] * p[0].sum(axis=0)
+        bends.append(abs(centre - centre[0]).max())
+    assert 1e-9 < bends[0] < 1e-3
+    assert bends[1] < 2e-4 * bends[0]
+
+
+def advance(example, masses, c, a, e, orbits):
+    """Angle by which the pericentre of two bodies moves forward in one orbit, and its first order in 1/c^2."""
+    (_, heavy), (_, light) = masses.items()
+    total = heavy + light
+    nearest, fastest = a * (1.0 - e), np.sqrt(total / a * (1.0 + e) / (1.0 - e))
+    share = np.array([[-light / total], [heavy / total]])
+    rate = " + ".join(f"(b_{x} - a_{x})*(b_{x}_dot - a_{x}_dot)" for x in "xyz")
+    stepper = sc.compile_stepper(relativistic(example, masses, c), sc.SVI(8))
+    run = stepper.integrate(
+        (share * [nearest, 0.0, 0.0]).ravel(),
+        velocity=(share * [0.0, fastest, 0.0]).ravel(),
+        h=2.0 * np.pi * np.sqrt(a**3 / total) / 60.0,
+        steps=60 * orbits + 20,
+        events=sc.Event(rate, direction=1),
+    )
+    last = run.events[0].q[-1].reshape(2, 3)
+    x, y, _ = last[1] - last[0]
+    count = len(run.events[0].t)
+    return np.arctan2(y, x) / count, 6.0 * np.pi * total / (c**2 * a * (1.0 - e**2))
+
+
+def test_perihelia_advance_by_the_formula_and_its_error_is_of_the_next_order(example):
+    errors = []
+    for c in (100.0, 200.0):
+        found, formula = advance(example, {"a": 1.0, "b": 0.8}, c, a=1.0, e=0.3, orbits=10)
+        errors.append(found / formula - 1.0)
+    assert 1e-5 < abs(errors[0]) < 1e-2
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.02)
+
+
+def test_mercury_advances_by_43_arcseconds_a_century(example):
+    """G m of the Sun and Mercury in au^3/day^2, Mercury's mean elements (Simon et al. 1994)."""
+    masses = {"a": 2.959122082855911e-4, "b": 4.91254957186794e-11}
+    light = 299792.458 * 86400.0 / 149597870.7
+    found, formula = advance(example, masses, light, a=0.38709831, e=0.20563175, orbits=40)
+    orbits = 36525.0 / (2.0 * np.pi * np.sqrt(0.38709831**3 / sum(masses.values())))
+    assert found == pytest.approx(formula, rel=1e-5)
+    assert np.degrees(found) * 3600.0 * orbits == pytest.approx(42.98, abs=0.005)
+
+
+def value(text, values):
+    """Of a formula without velocities and time."""
+    return float(eval(text, {"sqrt": np.sqrt, "sin": np.sin, "cos": np.cos} | values))
+
+
+def placed(**places):
+    return {
+        f"{body}_{x}": coordinate for body, place in places.items() for x, coordinate in zip("xyz", place, strict=True)
+    }
+
+
+def test_zonal_harmonics_are_those_of_two_masses_on_the_axis(example):
+    """Halves at a distance d along the axis have J_n R^n = -d^n for even n, and none for odd ones."""
+    axis, place, d, radius = np.array([0.36, -0.48, 0.8]), np.array([1.1, 2.0, -0.4]), 0.05, 0.7
+    harmonics = {2: -((d / radius) ** 2), 4: -((d / radius) ** 4)}
+    values = placed(a=(0.3, 0.1, 0.2), b=place) | {"gm_a": 2.0, "gm_b": 3.0}
+    text = example("figures").zonal("a", ["b"], [repr(k) for k in axis.tolist()], radius, harmonics)
+    to = place - [0.3, 0.1, 0.2]
+    exact = sum(3.0 / np.linalg.norm(to + side * d * axis) for side in (-1, 1)) - 6.0 / np.linalg.norm(to)
+    assert value(text, values) == pytest.approx(exact, rel=1e-6)
+
+
+def test_the_third_harmonic_is_that_of_unequal_masses(example):
+    """Of masses that have neither a dipole nor a quadrupole: -1, 3, -3, 1 at equal distances, and one at the centre."""
+    axis, place, d, radius = np.array([0.36, -0.48, 0.8]), np.array([1.1, 2.0, -0.4]), 0.01, 0.7
+    weights, at = np.array([-1.0, 3.0, -3.0, 1.0]), d * np.array([-1.5, -0.5, 0.5, 1.5])
+    j3 = float(-(weights @ at**3) / radius**3)
+    text = example("figures").zonal("a", ["b"], [repr(k) for k in axis.tolist()], radius, {3: j3})
+    exact = sum(w / np.linalg.norm(place - s * axis) for w, s in zip(weights, at, strict=True))
+    values = placed(a=(0, 0, 0), b=place) | {"gm_a": 1.0, "gm_b": 1.0}
+    assert value(text, values) == pytest.approx(exact, rel=1e-3)
+
+
+def test_the_moon_is_a_body_of_three_axes(example):
+    """Against six masses in pairs on its axes, whose quadrupole is J2 and C22 by definition."""
+    lengths, gm_moon, gm_earth, radius = np.array([0.011, 0.009, 0.008]), 0.3, 2.0, 0.02
+    axes = np.linalg.qr(np.array([[1.0, 0.3, 0.2], [-0.1, 1.0, 0.5], [0.4, 0.2, 1.0]]))[0].T
+    x2, y2, z2 = (lengths**2 / 3.0).tolist()
+    j2, c22 = (x2 + y2 - 2.0 * z2) / (2.0 * radius**2), (x2 - y2) / (4.0 * radius**2)
+    earth = np.array([0.5, -0.7, 0.4])
+    masses = [side * length * axis for (length, axis), side in product(zip(lengths, axes, strict=True), (-1, 1))]
+    exact = sum(gm_moon * gm_earth / 6.0 / np.linalg.norm(earth - place) for place in masses)
+    exact -= gm_moon * gm_earth / np.linalg.norm(earth)
+    written = [[repr(k) for k in axes[i].tolist()] for i in (2, 0)]
+    values = placed(moon=(0, 0, 0), earth=earth) | {"gm_moon": gm_moon, "gm_earth": gm_earth}
+    assert value(example("figures").moon(*written, radius, j2, c22), values) == pytest.approx(exact, rel=2e-3)
+
+
+def test_tides_are_mignards_for_one_love_number_and_one_small_lag(example):
+    """Mignard, The Moon and the Planets 20 (1979), equation 5, for an Earth that turns about the z axis."""
+    tides = example("tides")
+    place, speed, radius, love, lag = np.array([0.9, -0.5, 0.6]), np.array([0.02, 0.07, -0.03]), 0.3, 0.4, 1e-6
+    forces = tides.tide(radius, (love,) * 3, (lag,) * 3)
+    states = placed(moon=place, earth=(0, 0, 0)) | placed(moon_dot=speed, earth_dot=(0, 0, 0))
+    states = {re.sub(r"_dot_(\w)$", r"_\1_dot", name): number for name, number in states.items()} | {"gm_moon": 0.2}
+    found = np.array([value(forces[f"moon_{x}"], states) for x in "xyz"])
+    r2 = place @ place
+    turned = np.cross(place, [0.0, 0.0, float(tides.TURNING)]) + speed
+    at_once, late = r2 * place, 2.0 * (place @ speed) * place + r2 * turned
+    factor = -3.0 * love * 0.2**2 * radius**5 / r2**5
+    late *= factor * lag
+    np.testing.assert_allclose(found - factor * at_once, late, rtol=0, atol=1e-4 * abs(late).max())
+    assert [value(forces[f"earth_{x}"], states) for x in "xyz"] == pytest.approx(-found, rel=1e-14)
+
+
+def test_the_moon_librates_as_a_pendulum(example):
+    """Freely at sqrt(3 gamma) times its mean motion, for small angles on a circular orbit."""
+    figures = example("figures")
+    radius, gm_earth, gm_moon, c22, gamma = 0.02, 2.0, 0.3, 2.2e-5, 2.3e-4
+    values = placed(moon=(0, 0, 0), earth=(1.3, 0, 0)) | {"gm_moon": gm_moon, "gm_earth": gm_earth}
+    inertia = value(
+        figures.turning_moon(radius, 4.0 * c22 / gamma), {"gm_moon": gm_moon, "moon_turn_dot": np.sqrt(2.0)}
+    )
+
+    def energy(angle):
+        near = [repr(float(k)) for k in (np.cos(angle), np.sin(angle), 0.0)]
+        return value(figures.moon(["0", "0", "1"], near, radius, 2e-4, c22), values)
+
+    stiffness = (2.0 * energy(0.0) - energy(0.01) - energy(-0.01)) / 0.01**2
+    assert stiffness / inertia == pytest.approx(3.0 * gamma * gm_earth / 1.3**3, rel=1e-4)
+
+
+@needs_ephemeris
+def test_the_moon_turns_by_cassinis_laws(example):
+    """Within a tenth of a degree of the librations of DE421: physical ones, and principal axes off the mean ones."""
+    ephemeris = example("ephemeris")
+    t = np.arange(ephemeris.FIRST, ephemeris.LAST, 4.7)
+    mean = example("figures").of_the_moon("century")
+    names = {"sin": np.sin, "cos": np.cos, "century": (t - ephemeris.YEAR_2000) / 36525.0}
+    for axis, texts in zip(example("libration").axes(t), mean, strict=True):
+        given = np.array([eval(text, names) for text in texts])
+        assert np.degrees(np.linalg.norm(given - axis, axis=0)).max() < 0.1
+    assert 3600.0 * np.degrees(abs(example("libration").turn(t).mean())) < 10.0
+
+
+@needs_ephemeris
+def test_elements_of_asteroids_are_those_of_their_states(example):
+    asteroids, gm = example("asteroids"), example("ephemeris").constant("GMS")
+    for name, (_, a, e, inclination, *_) in asteroids.ELEMENTS.items():
+        q, v = asteroids.heliocentric(name)
+        h = np.cross(q, v)
+        normal = h @ [0.0, -np.sin(asteroids.OBLIQUITY), np.cos(asteroids.OBLIQUITY)] / np.linalg.norm(h)
+        assert 1.0 / (2.0 / np.linalg.norm(q) - v @ v / gm) == pytest.approx(a, rel=1e-12)
+        assert np.linalg.norm(np.cross(v, h) / gm - q / np.linalg.norm(q)) == pytest.approx(e, abs=1e-12)
+        assert np.degrees(np.arccos(normal)) == pytest.approx(inclination, abs=1e-10)
+
+
+def output_of(script, folder, *arguments):
+    path = os.pathsep.join([str(FOLDER.parents[1]), os.environ.get("PYTHONPATH", "")])
+    result = subprocess.run(
+        [sys.executable, "-W", "error", str(FOLDER / script), *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    return result.stdout
+
+
+@pytest.mark.full
+@pytest.mark.usefixtures("as_users_compile")
+@needs_ephemeris
+class TestRuns:
+    def test_each_term_brings_the_solar_system_nearer_to_de421(self, tmp_path):
+        output = output_of("solar_system.py", tmp_path)
+        title, *rows = output.split("\n\n")[1].splitlines()
+        bodies = rows[0].split()
+        table = {row[:32].strip(): dict(zip(bodies, map(float, row[32:].split()), strict=True)) for row in rows[1:]}
+        newton, relativity, sun, earth, moon, tides, more = table.values()
+        assert "1899 to 2053" in title
+        assert newton["mercury"] > 20_000 > 15 > relativity["mercury"] > 10 > 1 > sun["mercury"] > more["mercury"]
+        assert sun["moon"] > 1_000 > 100 > earth["moon"] > 2 * moon["moon"] > 10 > 0.5 > tides["moon"]
+        assert tides["mars"] > 2 * more["mars"]
+        assert max(more.values()) < 50
+        turning = [float(line[32:]) for line in output.split("\n\n")[3].splitlines()[1:]]
+        assert abs(turning[4] - 25.86) < 0.2  # by laser ranging, Chapront, Chapront-Touze & Francou, A&A 387 (2002)
+        assert abs(turning[5]) < 1.0
+        halves = [float(found) for found in re.findall(r"half steps change \w+ by (\d+) m", output)]
+        assert max(halves) < 100
+        assert (tmp_path / "solar_system.png").stat().st_size > 50_000
+
+    def test_rebound_goes_the_same_way(self, tmp_path):
+        pytest.importorskip("rebound", reason="needs the extra 'bench'")
+        output = output_of("beside_rebound.py", tmp_path, "1")
+        apart = [float(metres) for line in output.splitlines() if "apart" in line for metres in line.split()[4:-1]]
+        assert len(apart) >= 10
+        assert max(apart) < 20.0
+
+    def test_secular_frequencies_are_near_laskars(self, tmp_path):
+        """Two million years are few: seven periods of g5."""
+        rows = [
+            line.split() for line in output_of("secular.py", tmp_path, "2").splitlines() if re.match("[gs][5-8] ", line)
+        ]
+        found = {name: (float(here), float(published)) for name, here, _, _, published in rows}
+        for name in ("g5", "g6", "s6"):
+            assert found[name][0] == pytest.approx(found[name][1], abs=0.02)
+        assert (tmp_path / "secular.png").stat().st_size > 20_000
