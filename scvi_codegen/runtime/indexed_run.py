@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import time
+import zipfile
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +35,9 @@ ADVICE = {
     "not converged": "sweeps contract where h times the highest frequency is less than 1 or 2: try a smaller step",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
+MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t")
+"""Of a run, beside its arrays."""
+
 ALIGNMENT = 64
 """Bytes: those of the widest vector."""
 
@@ -198,6 +203,58 @@ class IndexedRun:
     def step_error_t(self) -> float:
         """When that step began."""
         return float(self._run.error_t)
+
+    def save(self) -> bytes:
+        """All of it, arrays and tables, for :meth:`IndexedStepper.restore`: a file of NumPy's (.npz)."""
+        places, fields = self._kept
+        numbers = [self._problem.parameters[k] for k in range(len(self.interface.parameters))]
+        moments = [getattr(self._run, name) for name in MOMENTS]
+        saved: dict[str, Any] = {f"table {name}": array for name, array in places.items()}
+        saved |= {f"field {name}": array for name, array in fields.items()}
+        saved |= {f"state {name}": array for name, array in self.q.items()}
+        saved |= {f"memory {name}": array for name, array in self._numbers.items()}
+        file = io.BytesIO()
+        title = np.array(self.interface.title)
+        np.savez(file, title=title, parameters=numbers, moments=moments, iterations=self.iterations, **saved)
+        return file.getvalue()
+
+    @classmethod
+    def restored(
+        cls, interface: IndexedInterface, binding: Binding, saved: bytes, options: SolverOptions | None
+    ) -> Self:
+        """The run that :meth:`save` gave.
+
+        Raises:
+            StateError: for other bytes, and for a run of another integrator.
+        """
+        try:
+            found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
+            if str(found["title"]) != interface.title:
+                raise StateError(f"this is a run of '{found['title']}', not of '{interface.title}'")
+            moments = dict(zip(MOMENTS, found["moments"].tolist(), strict=True))
+            run = cls(
+                interface,
+                binding,
+                q={array.name: found[f"state {array.name}"] for array in interface.coordinates},
+                p=None,
+                velocity=None,
+                h=moments["h"],
+                t=moments["t"],
+                parameters=dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
+                | {field.name: found[f"field {field.name}"] for field in interface.fields},
+                tables={table.name: found[f"table {table.name}"] for table in interface.tables},
+                options=options,
+            )
+            for name, array in run._numbers.items():
+                array[:] = found[f"memory {name}"]
+            for name, value in moments.items():
+                setattr(run._run, name, type(getattr(run._run, name))(value))
+            run.iterations = int(found["iterations"])
+        except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+            if isinstance(error, StateError):
+                raise
+            raise StateError(f"these bytes are no saved run: {error}") from error
+        return run
 
     def advance(self, steps: int, *, progress: Callable[[int], None] | None = None) -> None:
         """So many steps.

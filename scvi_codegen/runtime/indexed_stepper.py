@@ -124,6 +124,14 @@ class IndexedStepper:
             options=options,
         )
 
+    def restore(self, saved: bytes, *, options: SolverOptions | None = None) -> IndexedRun:
+        """The run whose :meth:`IndexedRun.save` gave these bytes, to go on exactly as it would have.
+
+        Raises:
+            StateError: for bytes that are no saved run, or one of another integrator.
+        """
+        return IndexedRun.restored(self.interface, self._binding, saved, options)
+
     @takes(StateError, parameters=MAPPING, tables=MAPPING, observe=FUNCTION, progress=FUNCTION)
     def integrate(
         self,

@@ -192,6 +192,26 @@ def test_runs_go_on() -> None:
     assert runs[0].iterations == runs[1].iterations
 
 
+@pytest.mark.parametrize("method", ["svi:4", "composition:8"])
+def test_a_saved_run_goes_on(method: str) -> None:
+    """To the bit, with its tables and parameters; other bytes are refused."""
+    each = CASES["net"]
+    stepper = sc.compile_indexed(each.system, method)
+    run = stepper.start(each.q, velocity=each.velocity, h=0.1, tables=each.tables, parameters=each.parameters)
+    run.advance(7)
+    again = stepper.restore(run.save())
+    for one in (run, again):
+        one.advance(5)
+    assert np.array_equal(run.q["q"], again.q["q"])
+    assert np.array_equal(run.p["q"], again.p["q"])
+    assert (run.t, run.steps, run.iterations, run.energy) == (again.t, again.steps, again.iterations, again.energy)
+    for wrong in (b"", b"no run", run.save()[:200]):
+        with pytest.raises(sc.StateError, match="no saved run"):
+            stepper.restore(wrong)
+    with pytest.raises(sc.StateError, match="this is a run of"):
+        sc.compile_indexed(each.system, "svi:2").restore(run.save())
+
+
 def test_observed_runs_keep_what_is_asked_for() -> None:
     """And the first and the last state."""
     each = CASES["ring"]

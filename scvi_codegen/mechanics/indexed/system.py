@@ -20,6 +20,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop
@@ -203,6 +204,21 @@ class IndexedSystem:
                 slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
                 found.append(replace(term, formula=at_rest, slots=slots))
         return tuple(found)
+
+    @property
+    def kernels(self) -> tuple[tuple[IndexedTerm, dict[str, Expr]], ...]:
+        """What is derived: the terms of -V or -H, with the slopes of each by its slots."""
+        found = []
+        for term in self.potentials:
+            slots = [slot for slot, access in term.slots if access.array in self.state]
+            slopes = gradient(term.formula, slots)
+            found.append((term, {slot.name: slopes.get(k, S.Zero) for k, slot in enumerate(slots)}))
+        return tuple(found)
+
+    def _repr_latex_(self) -> str:
+        arguments = ", ".join(array.name for array in self.state)
+        terms = " + ".join(map(latex_sum, self.terms)).replace("+ -", "-")
+        return rf"$\displaystyle {self._function[0]}({arguments}) = {terms}$"
 
     @property
     def depends_on_time(self) -> bool:

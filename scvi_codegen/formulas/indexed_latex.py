@@ -1,0 +1,47 @@
+"""Sums over indices as a mathematician writes them."""
+
+from __future__ import annotations
+
+from sympy import latex
+
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.symbols import DOT
+from scvi_codegen.indices import Access, Loop, Place
+
+__all__ = ["latex_sum"]
+
+
+def latex_sum(term: IndexedTerm) -> str:
+    r"""A term in LaTeX.
+
+    >>> from scvi_codegen.formulas.indexed import parse_array, parse_indexed
+    >>> (term,) = parse_indexed("sum(i in 0..N-2, (q[i+1] - q[i])**2/2)", [parse_array("q[N]")], {})
+    >>> print(latex_sum(term))
+    \sum_{i=0}^{N-2} \left(\frac{\left(q_{i+1} - q_{i}\right)^{2}}{2}\right)
+    """
+    formula = latex(term.formula, symbol_names={slot: _entry(access) for slot, access in term.slots})
+    pairs = {loop.behind for loop in term.loops}
+    sums = [_sum(loop) for loop in term.loops if loop.index not in pairs]
+    return f"{' '.join(sums)} \\left({formula}\\right)" if sums else str(formula)
+
+
+def _sum(loop: Loop) -> str:
+    if loop.behind:
+        return rf"\sum_{{0 \le {loop.behind} < {loop.index} < {loop.end}}}"
+    if loop.periodic:
+        return rf"\sum_{{{loop.index} \in \mathbb{{Z}}_{{{loop.end}}}}}"
+    return rf"\sum_{{{loop.index}={loop.first}}}^{{{loop.end + -1}}}"
+
+
+def _entry(access: Access) -> str:
+    name = access.array.name
+    letter = rf"\dot{{{_letter(name.removesuffix(DOT))}}}" if name.endswith(DOT) else _letter(name)
+    return f"{letter}_{{{', '.join(map(_place, access.places))}}}"
+
+
+def _letter(name: str) -> str:
+    return name if len(name) == 1 else rf"\mathrm{{{name}}}".replace("_", r"\_")
+
+
+def _place(place: Place) -> str:
+    return rf"{_letter(place.table)}_{{{place.index} {place.column}}}" if place.table else str(place)
