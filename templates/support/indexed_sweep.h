@@ -38,9 +38,10 @@ static inline double drift_of(const run_memory *run, long long i, double *low)
   return drift;
 }
 
-/* Where the points stand by the forces of former steps, or without any. */
-static void first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+/* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate. */
+static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
 {
+  double largest = DBL_MIN;
   for (long long i = 0; i < n; i++) {
     double low;
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
@@ -50,7 +51,9 @@ static void first_positions(const run_memory *run, const parts_of_work *parts, c
     else if (run->guess > 1)
       x += unit * (lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]));
     parts->X[i] = x;
+    largest = larger(largest, fabs(run->q[i]));
   }
+  return largest;
 }
 
 /* The points by the forces; returned is the sum of the squares of what that changes, and added to `size`, if it is not
@@ -94,30 +97,22 @@ static void last_positions(const run_memory *run, const parts_of_work *parts, co
   }
 }
 
-/* Whether all forces are finite. */
-static int finite_forces(const lanes *F, long long n)
+/* Whether all forces are finite. And what the highest coefficient of the forces at the points moves a coordinate by,
+ * squared, over what they bend it by: the largest of these, everything as a part of the largest coordinate. */
+static int examine(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest, double *error)
 {
   lanes faults = lanes_of(0.0);
-  for (long long i = 0; i < n; i++)
-    faults += 0.0 * F[i];
-  return lanes_total(faults) == 0.0;
-}
-
-/* What the highest coefficient of the forces at the points moves a coordinate by, squared, over what they bend it by:
- * the largest of these, everything as a part of the largest coordinate. */
-static double unresolved(const run_memory *run, const lanes *F, const lengths *by, long long n)
-{
-  double largest = DBL_MIN, least = 0.0;
-  for (long long i = 0; i < n; i++)
-    largest = larger(largest, fabs(run->q[i]));
+  double least = 0.0;
   for (long long i = 0; i < n; i++) {
     const lane_view force = {F[i]};
     const double unit = by->square * run->inverse_mass[i], size = fabs(run->q[i]) + largest;
     const double bend = fabs(unit) * (fabs(force.lane[0]) + fabs(force.lane[KEPT - 1])) + NEGLIGIBLE * size;
     const double top = RESOLVED * unit * lanes_total(HIGHEST * F[i]);
+    faults += 0.0 * F[i];
     least = larger(least, top * top / (bend * size));
   }
-  return least;
+  *error = least;
+  return lanes_total(faults) == 0.0;
 }
 
 /* The state at the end of the step. */
@@ -143,9 +138,9 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
   const lanes t = run->t + run->h * ABSCISSA[0];
+  const double largest = first_positions(run, &parts, &by, n);
   double size = 0.0, first = 0.0, last = INFINITY, error;
   int status = 0;
-  first_positions(run, &parts, &by, n);
   forces(given, parts.X, t, parts.F, n);
   for (int k = 0; status == 0; k++) {
     double change = improve(run, &parts, &by, n, k == 0 ? &size : NULL);
@@ -161,9 +156,8 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
     return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
   last_positions(run, &parts, &by, n);
   forces(given, parts.X, t, parts.F, n);
-  if (!finite_forces(parts.F, n))
+  if (!examine(run, parts.F, &by, n, largest, &error))
     return NOT_FINITE;
-  error = unresolved(run, parts.F, &by, n);
   if (run->error == run->error && !(error <= run->error)) {
     run->error = error;
     run->error_t = run->t;
