@@ -79,8 +79,9 @@ def given_name(key: object) -> str:
 def check_name(name: object) -> None:
     """Raise :class:`SystemDefinitionError` for what cannot be a name in C and in formulas."""
     if not isinstance(name, str) or not IDENTIFIER.fullmatch(name):
+        arrays = "; arrays are those of IndexedSystem" if isinstance(name, str) and "[" in name else ""
         raise SystemDefinitionError(
-            f"{name!r} is not a name: use letters a-z, A-Z, digits and underscores, beginning with a letter"
+            f"{name!r} is not a name: use letters a-z, A-Z, digits and underscores, beginning with a letter{arrays}"
         )
     if name in C_KEYWORDS:
         raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for instance to '{name}_'")
