@@ -154,6 +154,8 @@ class _Declaration(_Indices):
     def read(self) -> Array:
         name = self.take_name("the name of an array")
         check_name(name.text)
+        if self.peek().text != "[":
+            self.refuse(f"an array has its sizes in brackets, as {name.text}[N]", self.column)
         self.expect("[")
         axes = [self.axis()]
         while self.accept(","):

@@ -262,5 +262,5 @@ def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[st
     return given
 
 
-SYSTEM = of("a system, a LagrangianSystem or HamiltonianSystem", MechanicalSystem)
+SYSTEM = of("a LagrangianSystem or a HamiltonianSystem (an IndexedSystem goes to compile_indexed)", MechanicalSystem)
 """For :func:`~scvi_codegen.kinds.takes`."""

@@ -55,16 +55,23 @@ static int finite_slopes(const lanes *G, long long n)
   return lanes_total(faults) == 0.0;
 }
 
+/* About how far a coordinate moves in a step. */
+static inline double moved_by(const run_memory *run, const lanes *velocity, long long i)
+{
+  const lane_view rate = {velocity[i]};
+  return fabs(run->h * rate.lane[KEPT / 2]);
+}
+
 /* What the highest coefficient of the velocities at the points moves a coordinate by, squared, over what they bend it
  * by: the largest of these, everything as a part of the largest coordinate. */
 static double unresolved(const run_memory *run, const lanes *velocity, long long n)
 {
   double largest = DBL_MIN, least = 0.0;
   for (long long i = 0; i < n; i++)
-    largest = larger(largest, fabs(run->q[i]));
+    largest = larger(largest, fabs(run->q[i]) + moved_by(run, velocity, i));
   for (long long i = 0; i < n; i++) {
     const lane_view rate = {velocity[i]};
-    const double size = fabs(run->q[i]) + largest;
+    const double size = fabs(run->q[i]) + moved_by(run, velocity, i) + largest;
     const double ends = fabs(rate.lane[KEPT - 1] - rate.lane[0]) + fabs(rate.lane[KEPT / 2] - rate.lane[0]);
     const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
     const double top = RESOLVED * run->h * lanes_total(HIGHEST * velocity[i]);

@@ -38,7 +38,8 @@ static inline double drift_of(const run_memory *run, long long i, double *low)
   return drift;
 }
 
-/* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate. */
+/* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate, and its
+ * drift. */
 static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
 {
   double largest = DBL_MIN;
@@ -51,7 +52,7 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
     else if (run->guess > 1)
       x += unit * (lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]));
     parts->X[i] = x;
-    largest = larger(largest, fabs(run->q[i]));
+    largest = larger(largest, fabs(run->q[i]) + fabs(drift));
   }
   return largest;
 }
@@ -105,7 +106,8 @@ static int examine(const run_memory *run, const lanes *F, const lengths *by, lon
   double least = 0.0;
   for (long long i = 0; i < n; i++) {
     const lane_view force = {F[i]};
-    const double unit = by->square * run->inverse_mass[i], size = fabs(run->q[i]) + largest;
+    const double unit = by->square * run->inverse_mass[i];
+    const double size = fabs(run->q[i]) + fabs(by->h * run->inverse_mass[i] * run->p[i]) + largest;
     const double bend = fabs(unit) * (fabs(force.lane[0]) + fabs(force.lane[KEPT - 1])) + NEGLIGIBLE * size;
     const double top = RESOLVED * unit * lanes_total(HIGHEST * F[i]);
     faults += 0.0 * F[i];

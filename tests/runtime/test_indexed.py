@@ -49,6 +49,7 @@ def case(coordinates: str, lagrangian: str, q: Any, velocity: Any, h: float, **b
 
 
 CASES = {
+    "from rest at 0": case("q[N]", f"{KINETIC} - sum(i in N, q[i]**2/2)", np.zeros(3), np.ones(3), 0.1),
     "ring": case(
         "q[N]", f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])", random(5), None, 0.1
     ),
