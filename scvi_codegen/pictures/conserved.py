@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import CANVAS, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel
-from scvi_codegen.pictures.motion import MOTION, MOTIONS, Array, DrawnMotion, Motions, several
+from scvi_codegen.pictures.motion import HISTORIES, MOTION, Array, DrawnMotion, EnergyHistory, several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,12 +21,17 @@ __all__ = ["draw_energy_error", "largest_in_bins", "plot_energy", "plot_momentum
 BINS = 600
 
 
-@takes(trajectories=MOTIONS, path=PATH, ax=CANVAS)
-def plot_energy(trajectories: Motions, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
+@takes(trajectories=HISTORIES, path=PATH, ax=CANVAS)
+def plot_energy(
+    trajectories: EnergyHistory | Sequence[EnergyHistory],
+    path: str | os.PathLike[str] | None = None,
+    *,
+    ax: Axes | None = None,
+) -> Axes:
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (not divided where H_0 = 0), a colour a trajectory.
 
     Args:
-        trajectories: one or several.
+        trajectories: one or several, of sums over indices, too.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
 
     Raises:
@@ -63,14 +69,14 @@ def plot_momentum_maps(
     return drawn
 
 
-def draw_energy_error(axes: Axes, motion: DrawnMotion) -> None:
+def draw_energy_error(axes: Axes, motion: EnergyHistory) -> None:
     """The curve of a single motion, with its title."""
     error, scaled = _energy_error(motion)
     _draw_error(axes, motion.t, error, 0)
     axes.set(xlabel="t", title="relative energy error" if scaled else "energy error")
 
 
-def _energy_error(motion: DrawnMotion) -> tuple[Array, bool]:
+def _energy_error(motion: EnergyHistory) -> tuple[Array, bool]:
     energy = motion.energy()
     scale = abs(energy[0])
     return np.abs(energy - energy[0]) / (scale or 1.0), bool(scale)

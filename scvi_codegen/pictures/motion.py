@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,30 @@ from scvi_codegen.kinds import Kind
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface
 
-__all__ = ["MOTION", "MOTIONS", "Array", "DrawnMotion", "Motions", "Mover", "column", "several"]
+__all__ = [
+    "HISTORIES",
+    "MOTION",
+    "MOTIONS",
+    "Array",
+    "DrawnMotion",
+    "EnergyHistory",
+    "Motions",
+    "Mover",
+    "column",
+    "several",
+]
+
+Drawn = TypeVar("Drawn")
 
 Array: TypeAlias = NDArray[np.float64]
+
+
+class EnergyHistory(Protocol):
+    """Times, and an energy at each: of a :class:`DrawnMotion`, and of sums over indices."""
+
+    @property
+    def t(self) -> Array: ...  # noqa: D102
+    def energy(self) -> Array: ...  # noqa: D102
 
 
 class Mover(Protocol):
@@ -59,13 +80,20 @@ Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]
 """One, or several of the same system."""
 
 MOTION = Kind("a trajectory", lambda value: hasattr(value, "stepper") and hasattr(value, "q"))
-MOTIONS = Kind(
-    "a trajectory or a list of them",
-    lambda value: MOTION.holds(value) or (isinstance(value, Sequence) and all(map(MOTION.holds, value))),
-)
 
 
-def several(motions: Motions) -> Sequence[DrawnMotion]:
+def _one_or_several(kind: Kind) -> Kind:
+    return Kind(
+        f"{kind.words} or a list of them",
+        lambda value: kind.holds(value) or (isinstance(value, Sequence) and all(map(kind.holds, value))),
+    )
+
+
+MOTIONS = _one_or_several(MOTION)
+HISTORIES = _one_or_several(Kind(MOTION.words, lambda value: hasattr(value, "t") and hasattr(value, "energy")))
+
+
+def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
     """One or several motions as several.
 
     Raises:

@@ -111,6 +111,8 @@ def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | No
         values = np.asarray((given or {})[table.name])
         if values.size and values.dtype.kind not in "iu":
             raise StateError(f"the table '{table.name}' must be whole numbers, not {values.dtype.name}")
+        if values.ndim == 1 and table.axes[1].number == 1:
+            values = values[:, None]
         if values.ndim != 2 or values.shape[1] != table.axes[1].number:
             raise StateError(f"the table '{table.name}' has the shape {values.shape}, not that of {table}")
         if values.size and not 0 <= values.min() <= values.max() < 2**31:

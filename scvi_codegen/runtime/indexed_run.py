@@ -81,6 +81,9 @@ class IndexedRun:
         self._problem = self._new_problem(numbers)
         self._start(state, self._momenta(p, velocity), checked_step(h), checked_number(t, "t"))
 
+    def __repr__(self) -> str:
+        return f"<IndexedRun of {self.interface.title}: {self.sizes}, t = {self.t:g} after {self.steps} steps>"
+
     def _new_problem(self, numbers: list[float]) -> Any:
         places, fields = self._kept
         problem = self._binding.new("problem *")
@@ -166,6 +169,11 @@ class IndexedRun:
         if self.interface.momenta:
             raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
+
+    @property
+    def inverse_masses(self) -> dict[str, Numbers]:
+        """1/m of every coordinate by the name of its array, copies."""
+        return self._arrays(self._numbers["inverse_mass"])
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
         found, start = {}, 0

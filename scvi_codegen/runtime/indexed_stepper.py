@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
+from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
@@ -35,6 +36,7 @@ class IndexedTrajectory:
         observed: (k, ..) what the observer returned, or ``None``.
         energies: (k, 3) kinetic and potential energy, and their sum.
         maps: (k, count) what symmetries conserve, in the order of ``stepper.momentum_map_names``.
+        inverse_masses: 1/m of every coordinate, of the shape of one state.
         h: step; steps: their number; iterations: sweeps of all of them.
         step_error, step_error_t: an estimate of the error of the end of the worst step, relative to the largest
             coordinate, and when it began; not numbers for explicit methods.
@@ -46,12 +48,22 @@ class IndexedTrajectory:
     observed: Numbers | None
     energies: Numbers
     maps: Numbers
+    inverse_masses: Mapping[str, Numbers]
     h: float
     steps: int
     iterations: int
     step_error: float
     step_error_t: float
     goal: None = None
+
+    def __repr__(self) -> str:
+        arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())
+        return f"<IndexedTrajectory of {self.steps} steps of {self.h:g}: {arrays}>"
+
+    @property
+    def velocity(self) -> dict[str, Numbers]:
+        """Velocities by the name of the array of their coordinates, of the shape of ``p``."""
+        return {name: p * self.inverse_masses[name] for name, p in self.p.items()}
 
     def energy(self) -> Numbers:
         """P . v - L at each state (k,)."""
@@ -158,9 +170,9 @@ class IndexedStepper:
             steps, every: numbers of steps.
             t: initial time.
             parameters: numbers, and arrays of them, by name; others keep their defaults.
-            tables: (rows, columns) whole numbers by name.
+            tables: (rows, columns) whole numbers by name; (rows,) do for a single column.
             observe: what is kept of a state in place of all of it: a function of the run, whose ``t``, ``q``, ``p``,
-                ``velocity``, ``energy`` are those of the moment.
+                ``velocity``, ``energy`` are those of the moment; a number or an array, always of one shape.
             options: when sweeps end.
             progress: called now and then with the number of steps done.
 
@@ -168,7 +180,8 @@ class IndexedStepper:
             :class:`IndexedTrajectory`, steps // every + 1 states.
 
         Raises:
-            StateError: on wrong names, shapes and numbers, and where an index would leave its array.
+            StateError: on wrong names, shapes and numbers, where an index would leave its array, and for observations
+                that are no real numbers or change their shape.
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
         every = checked_count(every, "every", least=1)
@@ -198,7 +211,7 @@ class _Kept:
         self.energies: list[tuple[float, float, float]] = []
         self.maps: list[Numbers] = []
         self.states: list[tuple[dict[str, Numbers], dict[str, Numbers]]] = []
-        self.observed: list[Any] = []
+        self.observed: list[Numbers] = []
 
     def take(self, *, keep: bool) -> None:
         """The present state, whole if nobody observes or it is to be kept."""
@@ -206,9 +219,15 @@ class _Kept:
         self.energies.append(self.run.energies)
         self.maps.append(self.run.momentum_maps)
         if self.observe is not None:
-            self.observed.append(np.array(self.observe(self.run), dtype=np.float64))
+            self.observed.append(self._observed(self.observe(self.run)))
         if keep or self.observe is None:
             self.states.append((self.run.q, self.run.p))
+
+    def _observed(self, given: ArrayLike) -> Numbers:
+        found, when = real_array(given, "what observe returns"), f"at t = {self.run.t:g}"
+        if self.observed and found.shape != self.observed[0].shape:
+            raise StateError(f"observe returns the shape {found.shape} {when}, {self.observed[0].shape} at the start")
+        return found
 
     def trajectory(self) -> IndexedTrajectory:
         """All of it."""
@@ -221,6 +240,7 @@ class _Kept:
             observed=np.array(self.observed) if self.observe is not None else None,
             energies=np.array(self.energies),
             maps=np.array(self.maps),
+            inverse_masses=run.inverse_masses,
             h=run.h,
             steps=run.steps,
             iterations=run.iterations,

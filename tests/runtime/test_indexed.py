@@ -226,6 +226,63 @@ def test_observed_runs_keep_what_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
+    ("observe", "message"),
+    [
+        (lambda run: None, "what observe returns must be real numbers, not None"),
+        (lambda run: {"a": 1.0}, "what observe returns must be real numbers"),
+        (lambda run: np.zeros(run.steps), r"the shape \(1,\) at t = 0.1, \(0,\) at the start"),
+    ],
+)
+def test_observations_that_cannot_be_kept_are_refused(observe: Any, message: str) -> None:
+    """By name, not by NumPy, and not as NaN."""
+    each = CASES["ring"]
+    with pytest.raises(sc.StateError, match=message):
+        sc.compile_indexed(each.system, "svi:2").integrate(each.q, h=0.1, steps=2, observe=observe)
+
+
+def test_velocities_are_those_of_other_masses() -> None:
+    """Of the states that are kept, and of a run; what they show of themselves is a line."""
+    each = CASES["bodies"]
+    stepper = sc.compile_indexed(each.system, "svi:2")
+    given = {"velocity": each.velocity, "h": 0.05, "parameters": each.parameters}
+    run, going = stepper.integrate(each.q, steps=3, **given), stepper.start(each.q, **given)
+    assert run.velocity["r"].shape == (4, 4, 2)
+    assert run.velocity["r"][0] == pytest.approx(each.velocity, rel=1e-15)
+    assert run.p["r"][0, 2] == pytest.approx(0.5 * each.velocity[2], rel=1e-15)
+    assert going.inverse_masses["r"][:, 0] == pytest.approx([1, 0.5, 2, 1])
+    going.advance(3)
+    assert np.array_equal(going.velocity["r"], run.velocity["r"][-1])
+    shown = [repr(one) for one in (run, going, each.system)]
+    assert shown[0] == "<IndexedTrajectory of 3 steps of 0.05: r (4, 4, 2)>"
+    assert "{'N': 4}, t = 0.15 after 3 steps>" in shown[1]
+    assert shown[2] == "IndexedSystem(name='case', coordinates=(r[N, 2]))"
+
+
+def test_a_table_of_one_column_may_be_a_list() -> None:
+    """What is held in place, say."""
+    held = sc.IndexedSystem.from_text(
+        name="held",
+        coordinates=["q[N]"],
+        tables=["pins[P, 1]"],
+        lagrangian=f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)",
+    )
+    stepper = sc.compile_indexed(held, "svi:4")
+    runs = [stepper.integrate(random(4), h=0.1, steps=5, tables={"pins": pins}) for pins in ([1, 3], [[1], [3]])]
+    assert np.array_equal(runs[0].q["q"], runs[1].q["q"])
+    assert np.array_equal(runs[0].q["q"][-1, ::2], random(4)[::2])
+    assert not np.any(runs[0].q["q"][-1, 1::2] == random(4)[1::2])
+
+
+def test_energies_are_drawn() -> None:
+    """As of other trajectories, whose axes they may share."""
+    pytest.importorskip("matplotlib")
+    each = CASES["ring"]
+    run = sc.compile_indexed(each.system, "svi:2").integrate(each.q, h=0.1, steps=20)
+    line = sc.plot_energy([run, run]).get_lines()[0]
+    assert line.get_ydata()[1:] == pytest.approx(abs(run.energy() / run.energy()[0] - 1)[1:], abs=1e-15)
+
+
+@pytest.mark.parametrize(
     ("q", "given", "message"),
     [
         (np.zeros((3, 3)), {}, "'bonds' is missing among tables"),

@@ -66,6 +66,9 @@ class IndexedSystem:
     tables: tuple[Array, ...]
     terms: tuple[IndexedTerm, ...]
 
+    def __repr__(self) -> str:
+        return f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))"
+
     def __post_init__(self) -> None:
         self._check_names()
         for term in self.terms:
