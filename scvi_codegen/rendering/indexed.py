@@ -15,7 +15,7 @@ from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.lanes import POINTS, sweep_text
+from scvi_codegen.rendering.lanes import LIBRARY, POINTS, sweep_text
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 from scvi_codegen.rendering.printer import INVERSE_ROOT, scalar_functions
 from scvi_codegen.rendering.source import Source, included
@@ -48,6 +48,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "mass_names": [each.kernel.name for each in program.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": _inverse_roots(scalars),
+        "vector_functions": _vector_functions(program),
         "coordinates": " + ".join(map(_product, program.coordinates)),
         "sweep": sweep_text(program.sweep, POINTS, program.sweep.lanes, fallback="none") if program.sweep else None,
         "hot": "static",
@@ -60,6 +61,12 @@ def render_indexed(program: IndexedProgram) -> Source:
         declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
         support=tuple((name, support_text(name)) for name in included(code)),
     )
+
+
+def _vector_functions(program: IndexedProgram) -> list[str]:
+    """Those of the vector library that occur in the forces of an explicit method."""
+    kernels = [each.kernel for each in program.forces] if program.splitting else []
+    return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
 
 
 def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:

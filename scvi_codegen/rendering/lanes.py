@@ -18,7 +18,7 @@ from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = ["POINTS", "TRAJECTORIES", "Lanes", "SweepText", "sweep_text"]
+__all__ = ["LIBRARY", "POINTS", "TRAJECTORIES", "Lanes", "SweepText", "sweep_text"]
 
 LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """What glibc's libmvec has for every x86-64 vector width since 2.22."""
