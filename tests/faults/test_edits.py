@@ -30,7 +30,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "edit",
-    first_of_each(EDITS, lambda edit: edit["file"].split("/")[0]),
+    first_of_each(EDITS, lambda edit: "one of them, of Python: those of C take thrice as long"),
     ids=lambda edit: f"{edit['group']}: {edit['name']}",
 )
 def test_an_edit_is_noticed(edit: Edit, copy: Path) -> None:

@@ -94,6 +94,7 @@ CASES = {
 }
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("method", ["svi:4", "gauss:2", "sc:5", "svi:9", "stoermer-verlet", "composition:8"])
 @pytest.mark.parametrize("name", CASES)
 def test_as_written_out(name: str, method: str) -> None:
