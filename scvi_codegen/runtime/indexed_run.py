@@ -172,8 +172,8 @@ class IndexedRun:
 
     @property
     def inverse_masses(self) -> dict[str, Numbers]:
-        """1/m of every coordinate by the name of its array, copies."""
-        return self._arrays(self._numbers["inverse_mass"])
+        """1/m of every coordinate by the name of its array, copies; nothing where a Hamiltonian is given."""
+        return {} if self.interface.momenta else self._arrays(self._numbers["inverse_mass"])
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
         found, start = {}, 0

@@ -36,7 +36,7 @@ class IndexedTrajectory:
         observed: (k, ..) what the observer returned, or ``None``.
         energies: (k, 3) kinetic and potential energy, and their sum.
         maps: (k, count) what symmetries conserve, in the order of ``stepper.momentum_map_names``.
-        inverse_masses: 1/m of every coordinate, of the shape of one state.
+        inverse_masses: 1/m of every coordinate, of the shape of one state; nothing where a Hamiltonian is given.
         h: step; steps: their number; iterations: sweeps of all of them.
         step_error, step_error_t: an estimate of the error of the end of the worst step, relative to the largest
             coordinate, and when it began; not numbers for explicit methods.
@@ -62,11 +62,17 @@ class IndexedTrajectory:
 
     @property
     def velocity(self) -> dict[str, Numbers]:
-        """Velocities by the name of the array of their coordinates, of the shape of ``p``."""
+        """Velocities by the name of the array of their coordinates, of the shape of ``p``.
+
+        Raises:
+            StateError: where a Hamiltonian is given.
+        """
+        if not self.inverse_masses:
+            raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
         return {name: p * self.inverse_masses[name] for name, p in self.p.items()}
 
     def energy(self) -> Numbers:
-        """P . v - L at each state (k,)."""
+        """Energy p . v - L, or H, at each state (k,)."""
         return self.energies[:, 2]
 
     def energy_error(self) -> float:

@@ -143,6 +143,8 @@ def test_a_hamiltonian_as_written_out(method: str) -> None:
         stepper.start(q, velocity=p, h=0.05, tables=bonds)
     with pytest.raises(sc.StateError, match="velocities are not known"):
         stepper.start(q, p, h=0.05, tables=bonds).velocity  # noqa: B018  (the access is the point)
+    with pytest.raises(sc.StateError, match="velocities are not known"):
+        run.velocity  # noqa: B018  (the access is the point)
 
 
 @pytest.mark.parametrize("count", [2, 3, 64, 1000])
