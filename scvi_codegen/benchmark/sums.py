@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -28,7 +27,7 @@ from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import unwarned
 
-__all__ = ["run_growth", "run_sums"]
+__all__ = ["Lattice", "ring", "run_growth", "run_sums"]
 
 ERRORS = (1e-4, 1e-7, 1e-10)
 OWN = "composition"
@@ -339,7 +338,7 @@ def _growth(plan: Plan, say: Say) -> Iterator[dict[str, Any]]:
             say(f"growth: {count} coordinates by {method}")
             with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
                 environment = os.environ | {building.CACHE_VARIABLE: folder}
-                command = [sys.executable, "-m", "scvi_codegen.benchmark.sums", method, str(count)]
+                command = [sys.executable, "-m", "scvi_codegen.benchmark.contenders.one_size", method, str(count)]
                 run = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
             yield {"by": f"{OURS} {method}", "coordinates": count} | _numbers(run.stdout.split())
 
@@ -347,28 +346,3 @@ def _growth(plan: Plan, say: Say) -> Iterator[dict[str, Any]]:
 def _numbers(found: Sequence[str]) -> dict[str, float]:
     names = ("first_step_s", "ns_a_coordinate_and_step", "sweeps", "gflops", "memory_mb")
     return dict(zip(names, map(float, found), strict=True))
-
-
-def _one_size(method: str, count: int) -> str:
-    """What a fresh process measures."""
-    began = time.perf_counter()
-    each = ring(count, 1.0)
-    run = compile_indexed(each.system, method).start(each.q, velocity=each.v, h=0.1)
-    run.advance(1)
-    first = time.perf_counter() - began
-    run.advance(3)
-    steps, sweeps, best = max(3, 3 * 10**5 // count), run.iterations, float("inf")
-    for _ in range(7):
-        start = time.process_time()
-        run.advance(steps)
-        best = min(best, (time.process_time() - start) / steps)
-    iterations = (run.iterations - sweeps) / (7 * steps)
-    points = int(method.removeprefix("svi:")) if method.startswith("svi") else 1
-    operations = (iterations + 2) * points * (7 + 2 * points) if points > 1 else 9
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    numbers = (first, 1e9 * best / count, iterations, 1e-9 * operations * count / best, memory)
-    return " ".join(map(repr, numbers))
-
-
-if __name__ == "__main__":
-    print(_one_size(sys.argv[1], int(sys.argv[2])))

@@ -21,6 +21,7 @@ from scvi_codegen.benchmark import (
     paper_tables,
     report,
     start_up,
+    sums,
 )
 from scvi_codegen.benchmark.contenders import ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
@@ -454,6 +455,31 @@ class TestTables:
         assert max(ours["least_error"], other["least_error"]) < 1e-12
         assert min(ours["second_ms"], other["second_ms"], ours["first_step_s"], other["first_step_s"]) > 0.0
         assert "KeyError" in missing["why_not"]
+
+    @pytest.mark.parametrize("lattice", [sums.ring(8, 1.0), sums.field(6, 0.2)], ids=lambda lattice: lattice.name)
+    def test_lattices_by_hand_move_as_generated_ones(self, lattice):
+        steps = 10
+        by_hand, ours = (
+            run() for run in (sums._by_hand(lattice, 8, steps), sums._ours(lattice, Composition(8), steps))
+        )
+        assert np.abs(by_hand - ours).max() < 1e-14
+        assert np.abs(ours - lattice.q).max() > 0.01
+
+    @pytest.mark.full
+    def test_sums_are_measured_at_equal_error(self, monkeypatch):
+        monkeypatch.setattr(sums, "lattices", lambda plan: (sums.ring(32, 2.0), sums.bodies(4, 0.5)))
+        rows = sums.run_sums(bench.Plan(quick=True, peers=()), lambda text: None).rows
+        assert [row["error"] for row in rows] == [*sums.ERRORS, *sums.ERRORS]
+        assert all(row["doubt"] < 1e-13 and row["DOP853"] > 0.0 and row["composition"] > 0.0 for row in rows)
+        assert "leapfrog" in rows[0]
+        assert "leapfrog" not in rows[-1]
+
+    @pytest.mark.full
+    def test_growth_is_measured(self, monkeypatch):
+        monkeypatch.setattr(sums, "GROWTH", (100, 100_000))
+        rows = sums.run_growth(bench.Plan(quick=True), lambda text: None).rows
+        assert [row["coordinates"] for row in rows] == [100, 100_000] * 3
+        assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::2], rows[1::2], strict=True))
 
     def test_start_up(self):
         cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows

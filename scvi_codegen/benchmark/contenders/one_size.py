@@ -1,0 +1,48 @@
+"""A ring of one size in a fresh process: time to the first step, time a step, memory."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from pathlib import Path
+
+from scvi_codegen.benchmark.sums import ring
+from scvi_codegen.indexed_compiler import compile_indexed
+
+__all__: list[str] = []
+
+
+def _one_size(method: str, count: int) -> str:
+    """What a fresh process measures."""
+    began = time.perf_counter()
+    each = ring(count, 1.0)
+    run = compile_indexed(each.system, method).start(each.q, velocity=each.v, h=0.1)
+    run.advance(1)
+    first = time.perf_counter() - began
+    run.advance(3)
+    steps, sweeps, best = max(3, 3 * 10**5 // count), run.iterations, float("inf")
+    for _ in range(7):
+        start = time.process_time()
+        run.advance(steps)
+        best = min(best, (time.process_time() - start) / steps)
+    iterations = (run.iterations - sweeps) / (7 * steps)
+    points = int(method.removeprefix("svi:")) if method.startswith("svi") else 1
+    operations = (iterations + 2) * points * (7 + 2 * points) if points > 1 else 9
+    memory = _most_memory()
+    numbers = (first, 1e9 * best / count, iterations, 1e-9 * operations * count / best, memory)
+    return " ".join(map(repr, numbers))
+
+
+def _most_memory() -> float:
+    """The most that the process had, in megabytes; where the system tells it (Linux)."""
+    try:  # ru_maxrss would be that of the process which began this one, if that had more
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+    except OSError:
+        return float("nan")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status)
+    return int(found[1]) / 1024 if found else float("nan")
+
+
+if __name__ == "__main__":
+    print(_one_size(sys.argv[1], int(sys.argv[2])))
