@@ -78,11 +78,4 @@ def _interface(system: IndexedSystem, method: Method, source: Source) -> Indexed
         maps=momentum_maps(system),
         accesses=tuple((access, term.loops) for term in system.terms for _, access in term.slots),
         depends_on_time=system.depends_on_time,
-        work=_work(source),
     )
-
-
-def _work(source: Source) -> int:
-    """Numbers a coordinate, as the header says."""
-    line = next(line for line in source.header.split("\n") if line.startswith(f"#define {source.prefix.upper()}_WORK "))
-    return int(line.split()[-1])

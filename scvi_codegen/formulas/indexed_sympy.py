@@ -10,7 +10,7 @@ twice, functions of indices), so a sum is read term by term, as it stands.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from sympy import Expr, Idx, Indexed, Mod, Sum, Symbol, Tuple
 from sympy.printing.str import StrPrinter
@@ -36,7 +36,10 @@ def indexed_text(expression: Expr) -> str:
 
 class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Sum(self, expression: Sum) -> str:
-        wrapped = {index for index, _ in map(_wrapped, expression.function.atoms(Mod))}
+        wrapped = dict(map(_wrapped, expression.function.atoms(Mod)))
+        for place in (each for entry in expression.function.atoms(Indexed) for each in entry.indices):
+            if place.is_Add and place.free_symbols & set(wrapped):
+                raise SystemDefinitionError(f"{place} leaves a ring: write Mod({place}, ..) as at its other places")
         loops = ", ".join(_loops(expression.limits, wrapped))
         return f"sum({loops}, {self._print(expression.function)})"
 
@@ -60,7 +63,7 @@ def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
     return indices[0], length
 
 
-def _loops(limits: Sequence[Tuple], wrapped: set[Symbol]) -> list[str]:
+def _loops(limits: Sequence[Tuple], wrapped: Mapping[Symbol, Expr]) -> list[str]:
     """The loops of a sum, outermost first; an index that begins behind another is the second of a pair."""
     if any(len(limit) != 3 for limit in limits):
         raise SystemDefinitionError(f"a sum has an index and two bounds, as (i, 0, N - 1), not {limits}")
@@ -74,7 +77,12 @@ def _loops(limits: Sequence[Tuple], wrapped: set[Symbol]) -> list[str]:
                 raise SystemDefinitionError(f"pairs are taken from a whole axis, ({index}, 0, N - 2), not {limits}")
             loops.append(f"{index} < {pairs[index]} in {length}")
         elif index in wrapped:
-            loops.append(f"{index} in {last + 1} periodic" if first == 0 else f"{index} in {first}..{last} periodic")
+            if first != 0 or wrapped[index] != last + 1:
+                message = (
+                    f"Mod(.., {wrapped[index]}) needs the whole ring, ({index}, 0, {wrapped[index] - 1}), not {limits}"
+                )
+                raise SystemDefinitionError(message)
+            loops.append(f"{index} in {last + 1} periodic")
         elif index not in pairs.values():
             loops.append(f"{index} in {first}..{last}")
     return loops

@@ -8,7 +8,7 @@ from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 
-__all__ = ["IndexedHamiltonianSweep", "IndexedProgram", "IndexedSweep", "LoopedKernel"]
+__all__ = ["IndexedProgram", "LoopedKernel"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,45 +34,6 @@ class LoopedKernel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedSweep(SeparableSweep):
-    """The iteration of :class:`SeparableSweep` where forces are sums of several kernels."""
-
-    terms: tuple[Kernel, ...]
-
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Those of the sums."""
-        return self.terms
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """One."""
-        return ("indexed_sweep",)
-
-    @property
-    def constant_mass(self) -> None:  # type: ignore[override]
-        """Masses are sums, too."""
-        return None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedHamiltonianSweep(HamiltonianSweep):
-    """The iteration on positions and momenta together, whose rates are sums of several kernels."""
-
-    terms: tuple[Kernel, ...]
-
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Those of the sums."""
-        return self.terms
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """One."""
-        return ("indexed_hamiltonian_sweep",)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedProgram:
     """An integrator of any number of coordinates, without syntax.
 
@@ -84,7 +45,7 @@ class IndexedProgram:
         momenta: of a Hamiltonian, behind the coordinates in the state.
         parameter_names, parameter_defaults: of the numbers.
         forces, masses: loops.
-        sweep: the fixed-point iteration of one coordinate, whose kernels are those of ``forces``.
+        sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
         splitting: the kicks and drifts that replace it where the method is explicit.
     """
 
@@ -101,5 +62,5 @@ class IndexedProgram:
     parameter_defaults: tuple[float, ...]
     forces: tuple[LoopedKernel, ...]
     masses: tuple[LoopedKernel, ...]
-    sweep: IndexedSweep | IndexedHamiltonianSweep | None
+    sweep: SeparableSweep | HamiltonianSweep | None
     splitting: Splitting | None

@@ -7,8 +7,7 @@ system of one coordinate serve all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 from sympy import Expr, S, Symbol
 
@@ -17,9 +16,8 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.indexed import IndexedHamiltonianSweep, IndexedProgram, IndexedSweep, LoopedKernel
+from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.choice import sweep_of
@@ -51,12 +49,12 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     one = one_coordinate(system)
     splitting = splitting_of(one, method)
     forces = tuple(_force(system, term, number) for number, term in enumerate(system.potentials))
-    sweep = None if splitting else _sweep(one, method, forces)
+    sweep = None if splitting else _sweep(one, method)
     return IndexedProgram(
         prefix=prefix,
         title=comment_text(f"{system.name}: {method.title}"),
         notes=notes_of(method, one),
-        order=method.order or 2,
+        order=method.order or (sweep.points if sweep else 0),
         sizes=system.sizes,
         coordinates=system.coordinates,
         momenta=system.momenta,
@@ -71,23 +69,15 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     )
 
 
-def _sweep(
-    one: MechanicalSystem, method: Method, forces: Sequence[LoopedKernel]
-) -> IndexedSweep | IndexedHamiltonianSweep:
-    found, terms = sweep_of(one, discretise(one, method)), tuple(each.kernel for each in forces)
-    if isinstance(found, SeparableSweep):
-        return IndexedSweep(**_fields(found), terms=terms)
-    if isinstance(found, HamiltonianSweep):
-        return IndexedHamiltonianSweep(**_fields(found), terms=terms)
+def _sweep(one: MechanicalSystem, method: Method) -> SeparableSweep | HamiltonianSweep:
+    found = sweep_of(one, discretise(one, method))
+    if isinstance(found, SeparableSweep | HamiltonianSweep):
+        return found
     explicit = "" if one.auxiliaries else ", Stoermer-Verlet or a composition"
     raise MethodError(
         f"{method.name} has no sweeps over positions: for sums over indices take an SVI, a Runge-Kutta method of at "
         f"most 32 points{explicit}"
     )
-
-
-def _fields(found: Sweep) -> dict[str, Any]:
-    return {field.name: getattr(found, field.name) for field in fields(found)}  # type: ignore[arg-type]  # all are
 
 
 def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:

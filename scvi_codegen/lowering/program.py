@@ -100,12 +100,7 @@ def lower(
         mass_entries=tuple(mass),
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
-        momentum_maps=tuple(
-            MomentumMap(
-                name=comment_text(each.name), formula=comment_text(each.formula), exact=method.exactness.keeps(each)
-            )
-            for each in symmetries
-        ),
+        momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
         sweep=sweep,
         splitting=splitting,
@@ -120,6 +115,11 @@ def lower(
         inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
+
+
+def _momentum_map(symmetry: Symmetry, method: Method) -> MomentumMap:
+    name, formula = comment_text(symmetry.name), comment_text(symmetry.formula)
+    return MomentumMap(name=name, formula=formula, exact=method.exactness.keeps(symmetry))
 
 
 def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:

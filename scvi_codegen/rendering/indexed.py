@@ -15,7 +15,7 @@ from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.lanes import LIBRARY, POINTS, sweep_text
+from scvi_codegen.rendering.lanes import LIBRARY, POINTS, SweepText, sweep_text
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 from scvi_codegen.rendering.printer import INVERSE_ROOT, scalar_functions
 from scvi_codegen.rendering.source import Source, included
@@ -50,7 +50,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "inverse_roots": _inverse_roots(scalars),
         "vector_functions": _vector_functions(program),
         "coordinates": " + ".join(map(_product, program.coordinates)),
-        "sweep": sweep_text(program.sweep, POINTS, program.sweep.lanes, fallback="none") if program.sweep else None,
+        "sweep": _sweep_text(program),
         "hot": "static",
     }
     code = environment.get_template("indexed.c.jinja").render(context)
@@ -61,6 +61,11 @@ def render_indexed(program: IndexedProgram) -> Source:
         declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
         support=tuple((name, support_text(name)) for name in included(code)),
     )
+
+
+def _sweep_text(program: IndexedProgram) -> SweepText | None:
+    sweep, kernels = program.sweep, [each.kernel for each in program.forces]
+    return sweep_text(sweep, POINTS, sweep.lanes, fallback="none", kernels=kernels) if sweep else None
 
 
 def _vector_functions(program: IndexedProgram) -> list[str]:

@@ -95,7 +95,9 @@ class SweepText:
         return any("LIBRARY" in line for line in self.functions)
 
 
-def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, fallback: Fallback) -> SweepText:
+def sweep_text(
+    sweep: Sweep, meaning: Lanes, lanes: int, *, fallback: Fallback, kernels: Sequence[Kernel] | None = None
+) -> SweepText:
     """A sweep in vectors of ``lanes`` lanes.
 
     Args:
@@ -103,9 +105,11 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, fallback: Fallback) 
         meaning: of a lane.
         lanes: in a vector.
         fallback: what is tried where it fails.
+        kernels: those applied to vectors, if they are not the sweep's own.
     """
+    kernels = tuple(sweep.kernels if kernels is None else kernels)
     mass = sweep.constant_mass
-    applied = (*sweep.kernels, *((mass,) if mass and not meaning.are_points else ()))
+    applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
     solver = _solver(sweep, fallback) if meaning.are_points else ()
     return SweepText(
@@ -117,7 +121,7 @@ def sweep_text(sweep: Sweep, meaning: Lanes, lanes: int, *, fallback: Fallback) 
         },
         functions=tuple(map(_function, sorted(functions))),
         tables=tuple(_tables(sweep, meaning)),
-        kernels=sweep.kernels,
+        kernels=kernels,
         mass=mass,
         support=(*meaning.before, "contraction", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),

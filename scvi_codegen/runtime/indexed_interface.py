@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
-from scvi_codegen.indices import Access, Array, IndexedMap, Loop
+from scvi_codegen.indices import Access, Array, IndexedMap, Loop, Place
 from scvi_codegen.native.arguments import checked_number, real_array
 
 __all__ = [
@@ -41,7 +41,6 @@ class IndexedInterface:
         maps: what symmetries conserve.
         accesses: every access of an array, with the loops around it.
         depends_on_time: whether energy is not conserved.
-        work: numbers a coordinate.
     """
 
     prefix: str
@@ -59,7 +58,6 @@ class IndexedInterface:
     maps: tuple[IndexedMap, ...]
     accesses: tuple[tuple[Access, tuple[Loop, ...]], ...]
     depends_on_time: bool
-    work: int
 
 
 def read_state(
@@ -95,11 +93,9 @@ def field_values(
         values = real_array(given.get(array.name, default), array.name)
         _check_finite(values, array.name)
         shape = array.shape(sizes)
-        try:
-            found[array.name] = np.ascontiguousarray(np.broadcast_to(values, shape))
-        except ValueError as error:
-            message = f"'{array.name}' has the shape {values.shape}; {array} is {_text(shape)} here"
-            raise StateError(message) from error
+        if values.shape not in ((), shape):
+            raise StateError(f"'{array.name}' has the shape {values.shape}; {array} is {_text(shape)} here")
+        found[array.name] = np.ascontiguousarray(np.broadcast_to(values, shape))
     return found
 
 
@@ -140,25 +136,44 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
 
 
 def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables: Mapping[str, Places]) -> None:
-    """Raise :class:`StateError` where, with these sizes and tables, an access leaves its array."""
+    """Raise :class:`StateError` where, with these sizes and tables, an access leaves its array, or an index a table."""
+    rows = {table.name: table for table in interface.tables}
     for access, loops in interface.accesses:
         spans = {loop.index: loop for loop in loops}
         if any(loop.end.at(sizes) <= loop.first.at(sizes) for loop in loops):
             continue  # nothing is summed
-        for place, axis in zip(access.places, access.array.axes, strict=True):
-            length, offset = axis.at(sizes), place.base.number
+        for k, place in enumerate(access.places):
             if place.table:
-                column = tables[place.table][:, place.column]
-                low, high = (int(column.min()), int(column.max())) if column.size else (0, 0)
-            elif place.index:
-                loop = spans[place.index]
-                low, high = loop.first.at(sizes) + offset, loop.end.at(sizes) - 1 + offset
-                if loop.periodic:
-                    low, high = (0, length - 1) if abs(offset) <= length else (low, high)
-            else:
-                low = high = place.base.at(sizes)
-            if low < 0 or high >= length:
-                raise StateError(f"{access} goes from {low} to {high}, but {access.array} has {axis} = {length} places")
+                _check_span(f"{place}", _span(spans[place.index], sizes), rows[place.table], 0, sizes)
+            span = _places(place, spans, sizes, tables, access.array.axes[k].at(sizes))
+            _check_span(f"{access}", span, access.array, k, sizes)
+
+
+def _places(
+    place: Place, spans: Mapping[str, Loop], sizes: Mapping[str, int], tables: Mapping[str, Places], length: int
+) -> tuple[int, int]:
+    """The first and the last place on an axis of a length."""
+    if place.table:
+        column = tables[place.table][:, place.column]
+        return int(column.min()), int(column.max())
+    if not place.index:
+        return (place.base.at(sizes),) * 2
+    loop, offset = spans[place.index], place.base.number
+    if loop.periodic and abs(offset) <= length:
+        return 0, loop.end.at(sizes) - 1
+    first, last = _span(loop, sizes)
+    return first + offset, last + offset
+
+
+def _span(loop: Loop, sizes: Mapping[str, int]) -> tuple[int, int]:
+    """The first and the last value of an index."""
+    return loop.first.at(sizes), loop.end.at(sizes) - 1
+
+
+def _check_span(what: str, span: tuple[int, int], array: Array, axis: int, sizes: Mapping[str, int]) -> None:
+    (low, high), length = span, array.axes[axis].at(sizes)
+    if low < 0 or high >= length:
+        raise StateError(f"{what} goes from {low} to {high}, but {array} has {array.axes[axis]} = {length} places")
 
 
 def _of_axes(array: Array, values: Numbers, what: str) -> Numbers:

@@ -32,7 +32,7 @@ from scvi_codegen.runtime.portions import SLICE_SECONDS
 __all__ = ["IndexedRun"]
 
 ADVICE = {
-    "not converged": "sweeps contract where h times the highest frequency is less than 1 or 2: try a smaller step",
+    "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
 }
 MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t")
@@ -109,7 +109,7 @@ class IndexedRun:
         state_of, rest_of = aligned(2 * n), aligned(2 * n)  # of a Hamiltonian momenta stand behind positions
         self._numbers = {"q": state_of[:n], "p": state_of[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
         self._numbers["inverse_mass"] = aligned(n)
-        self._numbers["work"] = aligned(n * self.interface.work)
+        self._numbers["work"] = aligned(n * self._binding.constant("WORK"))
         inverse = self._numbers["inverse_mass"]
         if self._binding.function("inverse_masses")(self._problem, self._pointer("inverse_mass")):
             place = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))

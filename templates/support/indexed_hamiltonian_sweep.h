@@ -87,26 +87,28 @@ static void move(run_memory *run, const lanes *rates, lanes end, lanes weights, 
     add_compensated(&run->q[i], &run->carry_q[i], lanes_total(end * (weights * rates[i - first])), 0.0);
 }
 
+/* Errors of positions become errors of momenta in a sweep, and back in the next: changes are judged in pairs. */
 static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
   const lanes t = run->t + run->h * ABSCISSA[0];
   const lanes by_velocity = run->h * POSITION_WEIGHT[0], by_force = run->h * MOMENTUM_WEIGHT[0];
-  double first = 0.0, last = INFINITY, error;
+  double first = 0.0, last = INFINITY, change = 0.0, error;
   int status = 0;
   if (run->guess > 0)
     continue_slopes(run, &parts, n);
   else
     memset(parts.G, 0, sizeof(lanes) * 2 * (size_t)n);
   for (int k = 0; status == 0; k++) {
-    double change = improve(run, parts.X, parts.G + n, POSITION, by_velocity, 0, n, options->absolute);
-    change += improve(run, parts.X, parts.G, MOMENTUM, by_force, n, n, options->absolute);
+    const double of_q = improve(run, parts.X, parts.G + n, POSITION, by_velocity, 0, n, options->absolute);
+    const double of_p = improve(run, parts.X, parts.G, MOMENTUM, by_force, n, n, options->absolute);
     forces(given, parts.X, t, parts.G, 2 * n);
-    if (k == 0)
-      continue; /* nothing to compare with */
-    status = sweep_status(change, last, options, k - 1);
-    first = k == 1 ? change : first;
+    change = k % 2 ? of_q + of_p : change + of_q + of_p;
+    if (k == 0 || k % 2)
+      continue;
+    status = sweep_status(change, last, options, k / 2 - 1);
+    first = k == 2 ? change : first;
     last = change;
     report->iterations++;
   }

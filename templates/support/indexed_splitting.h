@@ -71,8 +71,10 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   }
   report->iterations++;
   run->error = NAN;
-  if (!all_sums_finite(run->q, parts.dq, n) || !all_sums_finite(run->p, parts.dp, n))
+  if (!all_sums_finite(run->q, parts.dq, n) || !all_sums_finite(run->p, parts.dp, n)) {
+    run->guess = 0; /* the forces that are kept are those of no state */
     return NOT_FINITE;
+  }
   add_all(run->q, parts.dq, run->carry_q, n);
   add_all(run->p, parts.dp, run->carry_p, n);
   run->guess = ends_with_a_kick();

@@ -165,7 +165,13 @@ def test_sums_of_sympy_are_read() -> None:
 
 @pytest.mark.parametrize(
     ("index", "limits"),
-    [("Mod(2*i, N)", "(i, 0, N - 1)"), ("i", "(i, 0, N)"), ("i", "(j, i + 1, N - 1), (i, 1, N - 2)")],
+    [
+        ("Mod(2*i, N)", "(i, 0, N - 1)"),
+        ("Mod(i + 1, 2*N)", "(i, 0, N - 1)"),
+        ("Mod(i + 1, N)", "(i, 0, N - 2)"),
+        ("i", "(i, 0, N)"),
+        ("i", "(j, i + 1, N - 1), (i, 1, N - 2)"),
+    ],
 )
 def test_sums_of_sympy_that_are_refused(index: str, limits: str) -> None:
     """Other rings, other limits, and what leaves its array."""

@@ -299,6 +299,11 @@ def test_energies_are_drawn() -> None:
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"kk": 1}}, "did you mean 'k'"),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": np.inf}}, "is not finite"),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "velocity": np.zeros((2, 3))}, r"positions \(3, 3\)"),
+        (
+            np.zeros((3, 3)),
+            {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [[1.0]]}},
+            r"'k' has the shape \(1, 1\)",
+        ),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "h": 0.0}, "the step h is 0"),
         ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' among positions"),
     ],
@@ -319,7 +324,7 @@ def test_what_does_not_fit_is_refused(q: Any, given: dict[str, Any], message: st
 def test_failures() -> None:
     """A step that is too long says so and keeps the states before; a coordinate without a mass is found."""
     each = CASES["ring"]
-    with pytest.raises(sc.StepFailedError, match="try a smaller step") as caught:
+    with pytest.raises(sc.StepFailedError, match="try a smaller h") as caught:
         sc.compile_indexed(each.system, "svi:4").integrate(each.q, h=1.5, steps=3)
     assert len(caught.value.trajectory.t) == 1
     bare = sc.IndexedSystem.from_text(
@@ -331,3 +336,34 @@ def test_failures() -> None:
         sc.compile_indexed(bare, "scvi:4")
     with pytest.warns(sc.AccuracyWarning):
         sc.compile_indexed(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)
+
+
+def test_an_index_leaves_no_table() -> None:
+    """A loop over another size than the table's rows, found before a row is read."""
+    system = sc.IndexedSystem.from_text(
+        name="x",
+        coordinates=["q[N]"],
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2 - q[bonds[i, 0]]**2)",
+    )
+    message = r"bonds\[i, 0\] goes from 0 to 4, but bonds\[B, 2\] has B = 1 places"
+    with pytest.raises(sc.StateError, match=message):
+        sc.compile_indexed(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
+    with pytest.raises(sc.SystemDefinitionError, match="out of bounds"):
+        sc.expand_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
+
+
+@pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
+@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+def test_sweeps_contract_up_to_the_steps_that_are_told(form: str, method: str, most: float) -> None:
+    """Of an oscillator, also where positions or momenta pass through 0; its energy is kept."""
+    formulas = {
+        "lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
+        "hamiltonian": "sum(i in N, (p_q[i]**2 + q[i]**2)/2)",
+    }
+    system = sc.IndexedSystem.from_text(name="o", coordinates=["q[N]"], **{form: formulas[form]})
+    run = sc.compile_indexed(system, method).start(np.ones(3), 0.3 * np.ones(3), h=0.95 * most)
+    before = run.energy
+    run.advance(50)
+    assert run.energy == pytest.approx(before, rel=1e-13)
+    assert np.isnan(run.step_error) == (method == "svi:1" and form == "hamiltonian")

@@ -9,6 +9,10 @@ from pathlib import Path
 
 from scvi_codegen.benchmark.sums import ring
 from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods import as_method
 
 __all__: list[str] = []
 
@@ -27,11 +31,26 @@ def _one_size(method: str, count: int) -> str:
         run.advance(steps)
         best = min(best, (time.process_time() - start) / steps)
     iterations = (run.iterations - sweeps) / (7 * steps)
-    points = int(method.removeprefix("svi:")) if method.startswith("svi") else 1
-    operations = (iterations + 2) * points * (7 + 2 * points) if points > 1 else 9
+    operations = _operations(each.system, method, iterations)
     memory = _most_memory()
     numbers = (first, 1e9 * best / count, iterations, 1e-9 * operations * count / best, memory)
     return " ".join(map(repr, numbers))
+
+
+def _operations(system: IndexedSystem, method: str, sweeps: float) -> float:
+    """Additions, multiplications and the like, a coordinate and step: of the kernels, and of the products with tables."""
+    program = lower_indexed(system, as_method(method, one_coordinate(system)), "ring")
+    force = sum(_counted(each.kernel) for each in program.forces)
+    if program.sweep is None:
+        drifts = program.splitting.drifts if program.splitting is not None else ()
+        return sum(map(bool, drifts)) * (force + 4)  # a kick and a drift are each a product and a sum
+    points = program.sweep.points
+    return (sweeps + program.sweep.sweeps_after) * points * (force + 2 * points)
+
+
+def _counted(kernel: Kernel) -> int:
+    """Each result is added to what other terms gave."""
+    return sum(kernel.operation_counts().values()) + len(kernel.results)
 
 
 def _most_memory() -> float:

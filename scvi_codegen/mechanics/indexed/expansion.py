@@ -104,10 +104,9 @@ def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
 
 
 def _filled(array: Array, value: ArrayLike, sizes: Mapping[str, int]) -> NDArray[np.float64]:
-    try:
-        return np.broadcast_to(np.asarray(value, dtype=np.float64), array.shape(sizes))
-    except ValueError as error:
-        raise SystemDefinitionError(f"'{array.name}' has the shape {np.shape(value)}, not that of {array}") from error
+    if np.shape(value) not in ((), array.shape(sizes)):
+        raise SystemDefinitionError(f"'{array.name}' has the shape {np.shape(value)}, not that of {array}")
+    return np.broadcast_to(np.asarray(value, dtype=np.float64), array.shape(sizes))
 
 
 def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Elements]:
@@ -131,7 +130,10 @@ def _entry(
     names: Mapping[str, NDArray[np.str_]],
 ) -> Symbol:
     periods = {loop.index: loop.end.at(sizes) for loop in loops if loop.periodic}
-    places = tuple(_place(place, at, periods, sizes, tables) for place in access.places)
+    try:
+        places = tuple(_place(place, at, periods, sizes, tables) for place in access.places)
+    except IndexError as error:
+        raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
     if any(not 0 <= place < length for place, length in zip(places, access.array.shape(sizes), strict=True)):
         raise SystemDefinitionError(f"{access} is at {list(places)}, outside of {access.array}, at {dict(at)}")
     name = access.array.name
