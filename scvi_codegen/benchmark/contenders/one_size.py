@@ -38,7 +38,7 @@ def _one_size(method: str, count: int) -> str:
 
 
 def _operations(system: IndexedSystem, method: str, sweeps: float) -> float:
-    """Additions, multiplications and the like, a coordinate and step: of the kernels, and of the products with tables."""
+    """Additions, multiplications and the like, a coordinate and step: of kernels, and of the products with tables."""
     program = lower_indexed(system, as_method(method, one_coordinate(system)), "ring")
     force = sum(_counted(each.kernel) for each in program.forces)
     if program.sweep is None:
