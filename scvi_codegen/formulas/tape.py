@@ -8,6 +8,7 @@ from typing import Any
 
 import sympy
 
+from scvi_codegen.formulas.parts import parts
 from scvi_codegen.formulas.vocabulary import LARGEST, NAME_OF, shortened
 from scvi_codegen.tables.precision import Number, mp
 
@@ -101,8 +102,7 @@ def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> N
     Raises:
         ArithmeticError: if the value, or that of a part, is not real or not within the range of a C double.
     """
-    parts = list(dict.fromkeys(sympy.preorder_traversal(expression)))
     try:
-        return Tape(parts, list(values))(list(map(mp.mpf, values.values())))[0]
+        return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]
     except ArithmeticError as error:
         raise ArithmeticError(f"'{shortened(expression)}' is not a finite real number") from error

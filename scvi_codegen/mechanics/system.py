@@ -30,6 +30,7 @@ from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.parts import identity
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import of
@@ -153,11 +154,11 @@ class MechanicalSystem(ABC):
         symbols = (*self.coordinates, *self.auxiliaries, *self.parameters, self.time)
         return (
             self.name,
-            sympy.srepr(self.formula),
+            identity(self.formula),
             " ".join(symbol.name for symbol in symbols),
             repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
-            sympy.srepr(self.clock.rate) if self.clock else "",
-            *map(sympy.srepr, (*self.forces, *self.constraints)),
+            identity(self.clock.rate) if self.clock else "",
+            *map(identity, (*self.forces, *self.constraints)),
             repr((len(self.constraints), self.inputs)),
         )
 

@@ -14,7 +14,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,8 +22,9 @@ from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.parts import parts
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, array_value
+from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, array_value, drawn_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 
@@ -48,7 +48,6 @@ MORE_POINTS = 12
 """Points beyond as many as columns."""
 MORE_PARAMETERS = 4
 """Values of the parameters beyond as many as are needed to recognise a coefficient."""
-VERIFIED_AT = 3
 NEGLIGIBLE = mp.mpf(10) ** -40
 
 
@@ -117,7 +116,7 @@ class _Search:
         are of size 1, or are near the default values where the system is not defined there.
         """
         for near in (False, True):
-            self.drawn = _drawn(self.motion.constants, count, near=near)
+            self.drawn = drawn_parameters(self.motion.constants, count, near=near)
             together = max(1, AT_ONCE // (2 * (len(chosen) + MORE_POINTS)))
             found = [
                 space
@@ -164,34 +163,16 @@ class _Search:
             found = [(factor, np.asarray(array_value(factor, known), dtype=float)) for factor in factors]
         return [(factor, values) for factor, values in found if np.isfinite(values).all() and values.all()]
 
-    @cached_property
-    def points(self) -> list[Sample]:
-        """Points in 60 digits, none if the system is defined nowhere."""
-        for near in (False, True):
-            drawn = _drawn(self.motion.constants, 1, near=near)
-            found = list(self.motion.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, VERIFIED_AT))
-            if found:
-                return found
-        return []
-
     def verified(self, row: Mapping[int, Expr]) -> bool:
         """Whether the combination is conserved to 40 digits at all these points."""
-        for sample in self.points:
+        for sample in self.motion.verifying:
             try:
                 terms = [sample.value(x) * term for c, x in row.items() for term in self.terms(c, sample)]
             except ArithmeticError:  # a root of a parameter that may be negative
                 return False
             if abs(mp.fsum(terms)) > NEGLIGIBLE * (1 + mp.fsum(map(abs, terms))):
                 return False
-        return bool(self.points)
-
-
-def _drawn(constants: Mapping[Symbol, float], count: int, *, near: bool) -> dict[Symbol, Array]:
-    """``count`` random values of each parameter."""
-    generator = np.random.default_rng(len(constants))
-    if near:
-        return {x: value + (abs(value) or 1.0) * generator.uniform(-0.1, 0.1, count) for x, value in constants.items()}
-    return {x: math.copysign(1.0, value) * generator.uniform(0.6, 1.7, count) for x, value in constants.items()}
+        return bool(self.motion.verifying)
 
 
 def _null_space(matrix: Array, sizes: Array) -> Array:
@@ -233,7 +214,7 @@ def _factors(system: MechanicalSystem, motion: Rates) -> list[Expr]:
     constants = set(motion.constants)
     found: list[Expr] = list(motion.constants)
     masses = forms_of(system).mass
-    sums = [*system.formula.atoms(sympy.Add), *masses.values()]
+    sums = [*(part for part in parts(system.formula) if part.is_Add), *masses.values()]
     sums.append(sympy.Add(*(entry for (i, j), entry in masses.items() if i == j)))
     for total in sums:
         own = sympy.Add(*(term for term in sympy.Add.make_args(total) if term.free_symbols <= constants))

@@ -8,6 +8,7 @@ at random, what vanishes at all points vanishes identically.
 from __future__ import annotations
 
 import functools
+import math
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +19,14 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
+from scvi_codegen.formulas.parts import parts
 from scvi_codegen.formulas.tape import Tape, evaluate
 from scvi_codegen.mechanics.constraints import constraint_multipliers, with_reactions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Rates", "Sample", "array_value", "rates_of"]
+__all__ = ["Rates", "Sample", "array_value", "drawn_parameters", "rates_of"]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +35,7 @@ SPREADS = (1.0, 0.3, 0.1)
 """Sizes of velocities or momenta: some Lagrangians exist for small ones only."""
 ATTEMPTS = 24
 LARGEST = 10**300
+VERIFIED_AT = 3
 LONGEST_NUMBER = 1000
 """Numerators and denominators of numbers in a formula that are as good as parameters: measured, not derived."""
 
@@ -54,7 +57,7 @@ class Sample:
     value: Callable[[Expr], Any]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Rates:
     """How a system moves: v and L_q, or H_p and -H_q, as expressions of ``arguments``, time and ``constants``.
 
@@ -110,6 +113,16 @@ class Rates:
             count -= 1
             yield found
 
+    @functools.cached_property
+    def verifying(self) -> list[Sample]:
+        """Points in 60 digits, none if the system is defined nowhere."""
+        for near in (False, True):
+            drawn = drawn_parameters(self.constants, 1, near=near)
+            found = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, VERIFIED_AT))
+            if found:
+                return found
+        return []
+
     def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any]) -> Sample:
         m = len(self.momenta)
         transformed, forces = (tuple(map(value, given)) for given in (self.transformed, self.forces))
@@ -120,8 +133,18 @@ class Rates:
         return Sample(t=values[self.time], state=(*q, *p), rates=(*v, *forces), value=value)
 
 
+def drawn_parameters(constants: Mapping[Symbol, float], count: int, *, near: bool) -> dict[Symbol, Array]:
+    """``count`` random values of each parameter, of size 1 with the sign of its default value, or near that."""
+    generator = np.random.default_rng(len(constants))
+    if near:
+        return {x: value + (abs(value) or 1.0) * generator.uniform(-0.1, 0.1, count) for x, value in constants.items()}
+    return {x: math.copysign(1.0, value) * generator.uniform(0.6, 1.7, count) for x, value in constants.items()}
+
+
 def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Number], expression: Expr) -> Number:
-    return known[expression] if expression in known else evaluate(expression, values)
+    if expression in known:
+        return known[expression]
+    return evaluate(expression, {x: values[x] for x in expression.free_symbols})
 
 
 def rates_of(system: MechanicalSystem) -> Rates:
@@ -146,7 +169,7 @@ def rates_of(system: MechanicalSystem) -> Rates:
 
 def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
     """A symbol for the absolute value of each."""
-    found = set().union(*(expression.atoms(sympy.Rational) for expression in expressions))
+    found = (part for part in parts(*expressions) if part.is_Rational)
     sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}
 
