@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.kinds import TEXT, TEXTS, of, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -34,6 +34,7 @@ from scvi_codegen.verification.certificate import Certificate, Check, Outcome
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
 from scvi_codegen.verification.identities import identity_checks
+from scvi_codegen.verification.pace import Pace, of_one_pace, pace_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks
@@ -58,6 +59,7 @@ def verify(
     h: float | None = None,
     t: float = 0.0,
     stepper: Stepper | None = None,
+    tolerance: float | None = None,
     solver: str = "auto",
     flags: Sequence[str] = TUNED_FLAGS,
 ) -> Certificate:
@@ -66,9 +68,11 @@ def verify(
     Args:
         system, method: what is integrated and how; a method may be its name, ``"svi:8"``.
         q, p: (m,) a state to measure at, both or neither; by default one that is found by trying.
-        h: a step; by default one that moves this state by about a tenth of its size.
+        h: a step, in transformed time of tau; by default one that moves this state by about a tenth of its size.
         t: time.
-        stepper: the integrator as built, for example from ``load_package``; by default compiled now.
+        stepper: the integrator as built, for example from ``load_package``; by default compiled now. Of one with a
+            monitor (:func:`~scvi_codegen.compile_stepper`) the steps that it chooses are measured, too.
+        tolerance: measure runs of steps that choose their length for this relative error of a step, too; 0: round-off.
         solver, flags: as of ``compile_stepper``.
 
     Returns:
@@ -80,16 +84,19 @@ def verify(
         MethodError: if the method does not take the system, or has no such solver.
         StateError: if only one of q and p is given, or no state is found.
     """
-    method = as_method(method, system)
-    if system.clock is not None:
-        raise MethodError(f"certificates of motions in transformed time are not made: '{system.name}' has none")
     began = time.perf_counter()
+    method = as_method(method, system)
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
     given = _given(system, stepper, q, p, h, t)
-    subject = Subject(system, method, stepper, _newton(system, method, stepper, solver, flags), given)
+    steps, single = stepper, of_one_pace(system, stepper.energy(given.q, given.p, given.t))
+    if single is not system or stepper.interface.monitor:
+        steps = compile_stepper(single, method, solver=solver, flags=flags)
+    subject = Subject(single, method, steps, _newton(single, method, steps, solver, flags), given)
+    paced = steps is not stepper or tolerance is not None
     checks = (
+        *(pace_checks(Pace(subject, stepper, _in_own_time(system), tolerance)) if paced else ()),
         *step_checks(subject),
         *(() if system.constraints else roundoff_checks(subject)),
         *structure_checks(subject),
@@ -98,11 +105,18 @@ def verify(
         *identity_checks(subject),
         largest_step(subject),
     )
-    return _certificate(subject, checks, time.perf_counter() - began)
+    return _certificate(stepper, subject, checks, time.perf_counter() - began)
 
 
-def _certificate(subject: Subject, checks: tuple[Check, ...], seconds: float) -> Certificate:
-    stepper, given = subject.stepper, subject.given
+def _in_own_time(system: MechanicalSystem) -> MechanicalSystem:
+    if system.clock is None:
+        return system
+    assert system.clock.plain is not None
+    return system.clock.plain
+
+
+def _certificate(stepper: Stepper, subject: Subject, checks: tuple[Check, ...], seconds: float) -> Certificate:
+    given = subject.given
     return Certificate(
         title=stepper.title,
         system=subject.system.name,

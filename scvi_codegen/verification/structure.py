@@ -17,7 +17,7 @@ from scvi_codegen.verification.certificate import Check, Finding, checked, infor
 from scvi_codegen.verification.linearisation import Linearised
 from scvi_codegen.verification.subject import EPSILON, State, Subject
 
-__all__ = ["largest_step", "structure_checks"]
+__all__ = ["ROUNDINGS", "largest_step", "momentum_kept", "structure_checks"]
 
 Array = NDArray[np.float64]
 
@@ -153,10 +153,15 @@ def _momentum(subject: Subject, k: int) -> Finding:
         run = Trajectory.before(failure)
         if len(run) <= TRIED:
             raise
+    return momentum_kept(run, k, f" of {given.h:g}")
+
+
+def momentum_kept(run: Trajectory, k: int, such: str = "") -> Finding:
+    """The change of the k-th momentum map along a run of such steps."""
     steps = len(run) - 1
     bound = ROUNDINGS * EPSILON * float(np.sqrt(steps))
     error = float(np.abs(run.momentum_errors()[:, k]).max())
-    return Finding(error, bound, f"relative, {steps} steps of {given.h:g}")
+    return Finding(error, bound, f"relative, {steps} steps{such}")
 
 
 def largest_step(subject: Subject) -> Check:

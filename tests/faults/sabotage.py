@@ -33,13 +33,15 @@ they borrowed, with the fault, for what is certified later in the process."""
 
 @dataclass(frozen=True)
 class Case:
-    """A system at a state, and how to make a method."""
+    """A system at a state, and how to make a method; what chooses the length of the steps of its runs, if anything."""
 
     system: MechanicalSystem
     method: Callable[[], Method]
     q: tuple[float, ...]
     p: tuple[float, ...]
     h: float
+    tolerance: float | None = None
+    monitor: str | None = None
 
 
 class Sabotage:
@@ -104,7 +106,10 @@ def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, ed
     """The certificate of a case with a fault in force, or without one."""
     flags = QUICK_FLAGS if apply is None else (*QUICK_FLAGS, f"-DFAULT_{next(_numbers)}")
     with _sabotaged(apply) as sabotage:
-        certificate = verify(case.system, case.method(), case.q, case.p, h=case.h, flags=flags)
+        stepper = compiler.compile_stepper(case.system, case.method(), flags=flags, monitor=case.monitor)
+        certificate = verify(
+            case.system, case.method(), case.q, case.p, h=case.h, stepper=stepper, tolerance=case.tolerance
+        )
         assert not edits_text or sabotage.edits, "the text to be edited was not found"
     return certificate
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from sabotage import Case
 from samples import driven_duffing, linkage, pumped_cart_pole, pumped_swing, pushed_pendulum, sleigh, turning_wire
 
+from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
     SCVI,
@@ -25,12 +27,13 @@ from scvi_codegen.methods import (
 from scvi_codegen.models.problems import problem
 from scvi_codegen.models.systems import point_vortices
 
-__all__ = ["CASES", "case"]
+__all__ = ["CASES", "CONTROLLED", "REVERSIBLE", "case"]
 
 STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], float]] = {
     "pendulum": (problem("planar-pendulum").system, (0.7,), (0.9,), 0.2),
     "driven": (driven_duffing(), (0.6,), (-0.3,), 0.2),
     "kepler": (problem("kepler").system, (0.3, 0.8), (-1.1, 0.4), 0.1),
+    "slowed": (reparametrise(problem("kepler").system, "distance"), (0.3, 0.8), (-1.1, 0.4), 0.2),
     "round": (problem("kepler").system, (0.8, 0.1), (0.1, 1.2), 0.35),
     "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
     "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
@@ -81,7 +84,13 @@ WHOLE = """
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
-    pushed/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
+    slowed/svi-3 pushed/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
-CASES = {name: case(name) for name in WHOLE.split()}
+CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)
+REVERSIBLE = replace(case("kepler/svi-3"), monitor="frequency")
+CASES = {
+    **{name: case(name) for name in WHOLE.split()},
+    "kepler/svi-3, controlled": CONTROLLED,
+    "kepler/svi-3, reversible": REVERSIBLE,
+}
 """Everything that is sabotaged, whole."""

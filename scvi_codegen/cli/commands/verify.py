@@ -32,11 +32,13 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
 
     MODEL may also be a folder written by 'generate': then the C code in it is what is measured. A step is held against
     the paper's equations in 60 digits and these against the exact motion; order, symplecticity, reversal, momenta,
-    Newton's matrix and identities between methods are measured. The JSON goes into the folder or beside the model file.
+    Newton's matrix and identities between methods are measured; with a tolerance or a monitor, of the model or as an
+    option, also what runs make of such steps. The JSON goes into the folder or beside the model file.
 
     \b
     Examples:
       scvi-codegen verify kepler --method scvi:3
+      scvi-codegen verify kepler --monitor distance
       scvi-codegen verify mine.toml
       scvi-codegen generate mine.toml -o mine_svi
       scvi-codegen verify mine_svi
@@ -74,7 +76,15 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
 def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
     p = model.momenta(stepper)
     return verification.verify(
-        model.system, model.method, model.q, p, h=model.step, t=model.t, stepper=stepper, solver=solver
+        model.system,
+        model.method,
+        model.q,
+        p,
+        h=model.h,
+        t=model.t,
+        stepper=stepper,
+        tolerance=model.tolerance,
+        solver=solver,
     )
 
 

@@ -1,0 +1,47 @@
+"""Faults of transformed time, and of what chooses the length of steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from certified_cases import CONTROLLED, REVERSIBLE, case
+from faults import function, text
+
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["PACES"]
+
+TO_NINE_DIGITS = replace(CONTROLLED, tolerance=1e-9)
+
+PACES = (
+    text("a clock that is fast", case("slowed/svi-3"), r"\? sum\[0\] :", "? sum[0] * 1.00000001 :", within="duration"),
+    text("a time that is met to eight digits", case("slowed/svi-3"), r"\(4 \* REAL_EPSILON\)", "1e-8"),
+    function(
+        "transformed time at another energy",
+        case("slowed/svi-3"),
+        Integrator,
+        "parameters_at",
+        lambda original: lambda self, q, p, parameters=None: original(self, q, 1.01 * p, parameters),
+    ),
+    text("a step allowed ten thousand times the error", TO_NINE_DIGITS, r"\(tolerance, 1 /", "(1e4 * tolerance, 1 /"),
+    text("stages of chosen steps not solved", TO_NINE_DIGITS, r"REAL\(0.00390625\)", "REAL(1e10)"),
+    text(
+        "time that runs ahead of chosen steps",
+        CONTROLLED,
+        r"now->step.h\);",
+        "now->step.h * (1 + 1e-10));",
+        within="take_step",
+    ),
+    text(
+        "time that runs ahead of the steps of a monitor",
+        REVERSIBLE,
+        r"now->step.h\);",
+        "now->step.h * (1 + 1e-10));",
+        within="take_step",
+    ),
+    text("a density that is forgotten", REVERSIBLE, r"run->density = now->density;", "run->density = 0;"),
+    text(
+        "half of the growth of the density", REVERSIBLE, r"1 - run->part : 1 \+ run->part", "1 - run->part : run->part"
+    ),
+    text("a turn that is not seen", REVERSIBLE, r"now->turned = \(real\)run->direction.*;", "now->turned = 0;"),
+)

@@ -1,0 +1,53 @@
+"""Certificates of runs in transformed time, and of steps that choose their length. Faults: ``faults/paces.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from certified_cases import CONTROLLED, REVERSIBLE, case
+from sabotage import Case
+from samples import QUICK_FLAGS
+
+from scvi_codegen import compile_stepper, verify
+from scvi_codegen.verification.certificate import Check, Outcome
+from scvi_codegen.verification.pace import Pace, of_one_pace, pace_checks
+from scvi_codegen.verification.subject import State, Subject
+
+PACES = {
+    "transformed": (case("slowed/svi-3"), {"steps of tau", "time", "end", "time back"}),
+    "controlled": (CONTROLLED, {"lengths", "tolerance", "angular momentum at any pace"}),
+    "reversible": (REVERSIBLE, {"lengths", "pace", "way back", "angular momentum at any pace"}),
+}
+
+
+def checks_of(given: Case) -> Iterator[Check]:
+    """Without those of single steps, which ``test_certificate.py`` has."""
+    own = given.system.clock.plain if given.system.clock else given.system
+    runs = compile_stepper(given.system, given.method(), flags=QUICK_FLAGS, monitor=given.monitor)
+    q, p = np.array(given.q), np.array(given.p)
+    steps = of_one_pace(given.system, runs.energy(q, p))
+    single = compile_stepper(steps, given.method(), flags=QUICK_FLAGS)
+    subject = Subject(steps, given.method(), single, None, State(q, p, 0.0, given.h))
+    return pace_checks(Pace(subject, runs, own, given.tolerance))
+
+
+@pytest.mark.parametrize("name", PACES)
+def test_what_runs_make_of_steps_is_measured(name: str) -> None:
+    given, promises = PACES[name]
+    checks = list(checks_of(given))
+    assert all(check.outcome is Outcome.KEPT for check in checks), "\n".join(map(str, checks))
+    assert {check.name for check in checks} == promises
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", PACES)
+def test_certificates_have_it(name: str) -> None:
+    given, promises = PACES[name]
+    stepper = compile_stepper(given.system, given.method(), flags=QUICK_FLAGS, monitor=given.monitor)
+    certificate = verify(
+        given.system, given.method(), given.q, given.p, h=given.h, stepper=stepper, tolerance=given.tolerance
+    )
+    assert certificate.passed, certificate.to_text()
+    assert promises <= {check.name for check in certificate.checks}
