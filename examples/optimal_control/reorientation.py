@@ -30,14 +30,15 @@ u, w = sp.symbols("u w")
 satellite = sc.LagrangianSystem.from_sympy(
     name="satellite", lagrangian=L, coordinates=angles, forces={angles[1]: u, angles[2]: w}, inputs=["u", "w"]
 )
+phase = np.linspace(0, 2 * np.pi, 41)
+lifted = 0.75 * (1 - np.cos(phase))
 at_rest = dict.fromkeys(("alpha", "beta", "theta_dot", "alpha_dot", "beta_dot"), 0.0)
 task = {
     "duration": 10.0,
     "start": {"theta": 0.0, **at_rest},
     "end": {"theta": np.pi / 2, **at_rest},
     "cost": "u**2 + w**2",
-    "bounds": {"alpha": (-2.5, 2.5), "beta": (-2.5, 2.5)},
-    "guess": {"theta": [0.0, np.pi / 2], "alpha": [0, 1, 1, -1, -1, 0], "beta": [0, -1, 1, 1, -1, 0]},
+    "guess": {"theta": [0.0, np.pi / 2], "alpha": np.sin(phase) + lifted, "beta": np.sin(phase) - lifted},  # a loop
     "degree": 1,
 }
 momentum = sp.lambdify([*angles, *rates], sp.diff(L, rates[0]))
@@ -47,12 +48,12 @@ for steps in map(int, sys.argv[1:] or (20, 40, 80)):
     motion = compared(satellite, 3, {**task, "steps": steps}, momentum)
 print(f"angular momentum of the states: {abs(motion.p[:, 0]).max():.0e}")
 
-figure, axes = plt.subplots(figsize=(9, 2), layout="constrained")
+figure, axes = plt.subplots(figsize=(9, 1.8), layout="constrained")
 for place, k in enumerate(np.linspace(0, steps, 9).astype(int)):
     rods = 2 * np.exp(1j * np.array(turning(*motion.q[k])))
     points = np.cumsum([0, *rods])
     points -= (points[:-1] + points[1:]).mean() / 2  # the centre of mass stays
-    axes.plot(points.real + 5 * place, points.imag, "C0", lw=2)
-    axes.plot((points.real + 5 * place)[1:3], points.imag[1:3], "C3", lw=2)
+    axes.plot(points.real + 6 * place, points.imag, "C0", lw=2)
+    axes.plot((points.real + 6 * place)[1:3], points.imag[1:3], "C3", lw=2)
 axes.set(aspect="equal", xticks=[], yticks=[], xlabel="from left to right, in equal times")
 figure.savefig("reorientation.png", dpi=110)

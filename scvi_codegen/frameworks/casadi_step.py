@@ -12,24 +12,20 @@ from itertools import accumulate, pairwise
 from math import comb
 from typing import Any
 
-import sympy
-from sympy import Expr, Symbol
-
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ArgumentError, MethodError
-from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
+from scvi_codegen.frameworks.casadi_ends import Ends, numeric, own_parameters, read
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.kinds import TEXTS, takes
-from scvi_codegen.mechanics.inputs import PARTS, input_parameters
+from scvi_codegen.kinds import SWITCH, TEXTS, takes
+from scvi_codegen.mechanics.inputs import PARTS
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem, Table
 
-__all__ = ["casadi_step", "numeric", "own_parameters"]
+__all__ = ["casadi_step", "straight"]
 
 ARGUMENTS = ("q", "p", "stages", "inputs", "parameters", "t", "h")
 RESULTS = ("q1", "p1", "residual", "along", "integrals")
@@ -37,13 +33,14 @@ HIGHEST = len(PARTS) - 2
 """Degree of inputs, which are cubics in compiled steps."""
 
 
-@takes(ArgumentError, system=SYSTEM, along=TEXTS)
-def casadi_step(system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = ()) -> Any:
+@takes(ArgumentError, system=SYSTEM, along=TEXTS, solved=SWITCH)
+def casadi_step(
+    system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
+) -> Any:
     """One step as equations, a ``casadi.Function``: constraints of a nonlinear program, or of a root finder.
 
     The step from (q, p) at t to t + h ends at q1 and p1 where the residual is 0; its unknowns are the stages. Nothing
-    is solved or compiled, everything has exact derivatives of any order: IPOPT takes the Hessian as it is, and
-    ``casadi.rootfinder`` makes of it a flow that has second derivatives, too.
+    is solved or compiled, everything has exact derivatives of any order, and IPOPT takes the Hessian as it is.
 
     Args:
         system: a Lagrangian or a Hamiltonian.
@@ -51,6 +48,8 @@ def casadi_step(system: MechanicalSystem, method: Method | str, *, degree: int =
         degree: of the inputs within the step, 0 (held) to 3.
         along: formulas in coordinates, velocities (momenta of a Hamiltonian, too), inputs, parameters and t, taken at
             the g points of the method's quadrature.
+        solved: let CasADi's Newton iteration solve the equations at each call, to 1e-12: the step is then a map without
+            stages and residual, that has second derivatives, too.
 
     Returns:
         A ``casadi.Function`` by place or by name of q (m), p (m), stages (s), inputs (k, degree + 1) in Bernstein's
@@ -72,27 +71,37 @@ def casadi_step(system: MechanicalSystem, method: Method | str, *, degree: int =
         raise MethodError(f"'{system.name}' moves in transformed time: give the system as it was before")
     if checked_count(degree, "degree", least=0) > HIGHEST:
         raise MethodError(f"inputs are polynomials of degree {HIGHEST} at most, not {degree}")
-    written = _Written(ca, system, discretise(system, as_method(method, system)), degree)
+    stages = discretise(system, as_method(method, system))
+    written = _Written(ca, system, stages, degree)
     *rows, p1 = written.rows()
     values, weights = written.along(along) if along else (ca.SX(0, 0), ca.SX(0, 1))
     found = [written.end_position(), p1, ca.vertcat(*rows), values, written.h * values @ weights]
-    return ca.Function("step", written.given, found, [*ARGUMENTS], [*RESULTS])
+    step = ca.Function("step", written.given, found, [*ARGUMENTS], [*RESULTS])
+    return _solved(ca, Ends(ca, system), stages, step) if solved else step
 
 
-def own_parameters(system: MechanicalSystem) -> dict[Symbol, float]:
-    """Default values of the parameters that are no parts of inputs."""
-    parts = input_parameters(system.inputs)
-    return {name: value for name, value in system.constants.items() if name.name not in parts}
+def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
+    """A guess of each block of unknowns: the straight line from (q, p) with a velocity."""
+    return [
+        float(block.straight[0]) * q + float(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
+        if block.size is None
+        else 0 * q[: block.size]
+        for block in stages.blocks
+    ]
 
 
-def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Callable[..., list[Any]]:
-    """Expressions as a function of CasADi's symbols, common parts shared."""
-    names = {name: getattr(ca, name) for name in FUNCTIONS}
-    constants = {name: float(value) for name, value in CONSTANTS.items()} | {"e": float(sympy.E)}
-    function: Callable[..., list[Any]] = sympy.lambdify(
-        symbols, list(expressions), modules=[names | constants], cse=True
-    )
-    return function
+def _solved(ca: Any, ends: Ends, stages: StageSystem, step: Any) -> Any:
+    """The step with its equations solved, of the same arguments and results without the stages."""
+    symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
+    unknowns = symbols.pop("stages")
+    equations = {"x": unknowns, "p": ca.veccat(*symbols.values()), "g": step(**symbols, stages=unknowns)["residual"]}
+    given = {name: ca.MX.sym(name, *each.shape) for name, each in symbols.items()}
+    q, p, t, h, parameters = (given[name] for name in ("q", "p", "t", "h", "parameters"))
+    guess = ca.veccat(*straight(stages, q, ends.velocity(q, p, t, parameters), p, h))
+    found = ca.rootfinder("stages", "newton", equations)(guess, ca.veccat(*given.values()))
+    results = step(**given, stages=found)
+    names = [name for name in RESULTS if name != "residual"]
+    return ca.Function("step", [*given.values()], [results[name] for name in names], [*given], names)
 
 
 class _Written:
@@ -148,8 +157,7 @@ class _Written:
             )
         held = tuple(symbol(name) for name in system.inputs)
         around = (system.time, *own_parameters(system), *held)
-        seen = {each.name: each for each in (*known, *system.auxiliaries, *around)}
-        formulas = [parse_expression(text, seen) for text in texts]
+        formulas = read(texts, (*known, *system.auxiliaries, *around))
         columns, weights = [], []
         for family in families:
             values = numeric(self.ca, formulas, (*family.arguments, *around))

@@ -6,20 +6,18 @@ duration. Maps of one step keep the program small: CasADi differentiates a step,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import sympy
 
 from scvi_codegen.errors import MethodError, StateError, closest
-from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.frameworks.casadi_step import casadi_step, numeric, own_parameters
+from scvi_codegen.frameworks.casadi_ends import Ends
+from scvi_codegen.frameworks.casadi_step import casadi_step, straight
 from scvi_codegen.frameworks.controlled import ControlledMotion
-from scvi_codegen.frameworks.nonlinear_program import Program
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.frameworks.nonlinear_program import NonlinearProgram
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
@@ -55,7 +53,7 @@ class Task:
         """The bounds that are not those of inputs."""
         return {text: interval(text, value) for text, value in self.bounds.items() if text not in self.system.inputs}
 
-    def program(self) -> Program:
+    def program(self) -> NonlinearProgram:
         """The residuals of the steps first, whose multipliers are slopes of the cost."""
         ca, m, n, own = self.ca, self.system.dimension, self.steps, len(self.system.inputs)
         step = casadi_step(self.system, self.method, degree=self.degree, along=[self.cost, *self.between])
@@ -74,7 +72,7 @@ class Task:
         q1, p1, residual, along, integrals = step.map(n)(*given)
         first = (q[:, 0], ends[:, 0], p[:, 0], self.t, parameters)
         last = (q[:, -1], ends[:, 1], p[:, -1], self.t + duration, parameters)
-        return Program(
+        return NonlinearProgram(
             ca=ca,
             unknowns={"states": states, "stages": stages, "inputs": inputs, "velocities": ends, "duration": duration},
             limits={"inputs": self._input_limits(), "duration": self.duration},
@@ -85,7 +83,7 @@ class Task:
                 *self._at_end(last, self.end),
                 *((along[row, :], *self.between[text]) for row, text in enumerate(self.between, 1)),
             ],
-            cost=ca.sum2(integrals[0, :]) + self._formula(self.end_cost)(*last),
+            cost=ca.sum2(integrals[0, :]) + self.ends.formula(self.end_cost)(*last),
         )
 
     def _check_degree(self, points: int) -> None:
@@ -103,37 +101,14 @@ class Task:
 
     def _at_end(self, side: Sequence[Any], conditions: Conditions) -> Iterator[tuple[Any, float, float]]:
         """What binds velocities and momenta there, and the conditions."""
-        yield self._legendre(*side), 0.0, 0.0
+        yield self.ends.legendre(*side), 0.0, 0.0
         for text, value in conditions.items():
-            yield self._formula(text)(*side), *interval(text, value)
+            yield self.ends.formula(text)(*side), *interval(text, value)
 
     @cached_property
-    def _symbols(self) -> tuple[sympy.Symbol, ...]:
-        """What formulas at an end are functions of."""
-        system = self.system
-        return (*system.coordinates, *system.velocities, *system.momentum_symbols, system.time, *own_parameters(system))
-
-    def _formula(self, text: str) -> Any:
-        """A formula as a function of q, v, p, t and parameters."""
-        return self._function([parse_expression(text, {each.name: each for each in self._symbols})])
-
-    @cached_property
-    def _legendre(self) -> Any:
-        """P - L_v, or v - H_p, as such a function: what velocities and momenta at the ends are bound by."""
-        forms, system = forms_of(self.system), self.system
-        if system.auxiliaries:
-            return self._function(forms.constitutive)
-        bound = [p - own for p, own in zip(system.momentum_symbols, forms.momentum, strict=True)]
-        if any(each.free_symbols - {*self._symbols} for each in bound):
-            raise MethodError("momenta depend on an input, and would jump where it does: give forces that are inputs")
-        return self._function(bound)
-
-    def _function(self, expressions: Any) -> Any:
-        m, values = self.system.dimension, numeric(self.ca, expressions, self._symbols)
-        shapes = {"q": m, "v": m, "p": m, "t": 1, "parameters": len(self.parameters)}
-        given = [self.ca.SX.sym(name, size) for name, size in shapes.items()]
-        found = self.ca.vertcat(*values(*self.ca.vertsplit(self.ca.vertcat(*given))))
-        return self.ca.Function("at_end", given, [found])
+    def ends(self) -> Ends:
+        """Formulas at both ends."""
+        return Ends(self.ca, self.system)
 
     def first(self, guess: Mapping[str, Any]) -> dict[str, Any]:
         """Values of all unknowns: positions as guessed, momenta and stages as these move."""
@@ -145,11 +120,14 @@ class Task:
         times = self.t + fractions * duration
         q = np.array([_resampled(name, guess.get(name, self._between_ends(name)), fractions) for name in names])
         v = np.gradient(q, times, axis=1)
-        p = np.array([self._momentum(*each) for each in zip(q.T, v.T, times, strict=True)]).T
+        moving = zip(q.T, v.T, times, strict=True)
+        momenta = [self.ends.momentum(self.ca.DM(x), x_dot, t, self.parameters).full() for x, x_dot, t in moving]
+        p = np.hstack(momenta)
         spots = (np.arange(n)[:, np.newaxis] + (np.linspace(0.0, 1.0, self.degree + 1) if self.degree else 0.5)).ravel()
+        stages = discretise(system, self.method)
         return {
             "states": np.concatenate([q, p]),
-            "stages": self._straight(q, p, duration / n),
+            "stages": np.concatenate(straight(stages, q[:, :-1], np.diff(q) * n / duration, p[:, :-1], duration / n)),
             "inputs": np.array([_resampled(name, guess.get(name, 0.0), spots / n) for name in system.inputs]),
             "velocities": v[:, [0, -1]],
             "duration": duration,
@@ -161,34 +139,7 @@ class Task:
         known = [sum(limit) / 2 for limit in limits if np.isfinite(limit).all()]
         return known if len(known) == 2 else (known or [0.0]) * 2
 
-    @cached_property
-    def _momentum(self) -> Callable[..., Array]:
-        """P from (q, v, t): one of Newton's updates from 0, exact unless H is not quadratic in p."""
-        ca, m = self.ca, self.system.dimension
-        q, v, p, t = ca.SX.sym("q", m), ca.SX.sym("v", m), ca.SX.sym("p", m), ca.SX.sym("t")
-        residual = self._legendre(q, v, p, t, ca.DM(self.parameters))
-        slopes = ca.Function("slopes", [q, v, p, t], [residual, ca.jacobian(residual, p)])
-
-        def momentum(q: Array, v: Array, t: float) -> Array:
-            value, matrix = slopes(q, v, np.zeros(m), t)
-            return -np.linalg.solve(matrix.full(), value.full()[:, 0])
-
-        return momentum
-
-    def _straight(self, q: Array, p: Array, h: float) -> Array:
-        """(stages, n) of the straight lines."""
-        before, v = q[:, :-1], np.diff(q, axis=1) / h
-        blocks = discretise(self.system, self.method).blocks
-        return np.concatenate(
-            [
-                float(block.straight[0]) * before
-                + float(block.straight[1]) * h ** (1 - block.power) * v
-                + block.momentum * p[:, :-1]
-                for block in blocks
-            ]
-        )
-
-    def motion(self, program: Program, found: Any, stats: Mapping[str, Any]) -> ControlledMotion:
+    def motion(self, program: NonlinearProgram, found: Any, stats: Mapping[str, Any]) -> ControlledMotion:
         """What was found, with the multipliers of the steps' equations as slopes of the cost."""
         m, n = self.system.dimension, self.steps
         values = program.split(found["x"])

@@ -11,13 +11,13 @@ import numpy as np
 
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["Program"]
+__all__ = ["NonlinearProgram"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
 @dataclass(frozen=True)
-class Program:
+class NonlinearProgram:
     """Unknowns and constraints as symbols and expressions of CasADi, each a matrix.
 
     Attributes:

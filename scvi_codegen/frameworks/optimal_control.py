@@ -13,7 +13,7 @@ import numpy as np
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ControlError, MethodError, StateError
-from scvi_codegen.frameworks.casadi_step import own_parameters
+from scvi_codegen.frameworks.casadi_ends import own_parameters
 from scvi_codegen.frameworks.control_task import Conditions, Task, check_known, interval
 from scvi_codegen.frameworks.controlled import ControlledMotion
 from scvi_codegen.frameworks.flow import imported
