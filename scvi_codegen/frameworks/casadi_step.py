@@ -40,7 +40,7 @@ def casadi_step(
     """One step as equations, a ``casadi.Function``: constraints of a nonlinear program, or of a root finder.
 
     The step from (q, p) at t to t + h ends at q1 and p1 where the residual is 0; its unknowns are the stages. Nothing
-    is solved or compiled, everything has exact derivatives of any order, and IPOPT takes the Hessian as it is.
+    is solved or compiled; everything has exact derivatives of any order, and IPOPT takes the Hessian as it is.
 
     Args:
         system: a Lagrangian or a Hamiltonian.
@@ -49,7 +49,7 @@ def casadi_step(
         along: formulas in coordinates, velocities (momenta of a Hamiltonian, too), inputs, parameters and t, taken at
             the g points of the method's quadrature.
         solved: let CasADi's Newton iteration solve the equations at each call, to 1e-12: the step is then a map without
-            stages and residual, that has second derivatives, too.
+            stages and residual, that has second derivatives, too. A call fails where they are not solved.
 
     Returns:
         A ``casadi.Function`` by place or by name of q (m), p (m), stages (s), inputs (k, degree + 1) in Bernstein's
@@ -111,9 +111,8 @@ class _Written:
         self.ca, self.system, self.stages = ca, system, stages
         m, sizes = system.dimension, stages.block_sizes(system.dimension)
         lengths = ((m, 1), (m, 1), (sum(sizes), 1), (len(system.inputs), degree + 1), (len(own_parameters(system)), 1))
-        self.given = [
-            ca.SX.sym(name, *shape) for name, shape in zip(ARGUMENTS, (*lengths, (1, 1), (1, 1)), strict=True)
-        ]
+        shapes = (*lengths, (1, 1), (1, 1))
+        self.given = [ca.SX.sym(name, *shape) for name, shape in zip(ARGUMENTS, shapes, strict=True)]
         self.q, self.p, unknowns, self.inputs, self.parameters, self.t, self.h = self.given
         blocks = [unknowns[start:end] for start, end in pairwise(accumulate(sizes, initial=0))]
         powers = (block.power for block in stages.blocks)
@@ -175,10 +174,12 @@ class _Written:
         return numeric(self.ca, results, (*family.arguments, self.system.time, *self.system.parameters))
 
     def _arguments(self, family: PointFamily, n: int) -> list[Any]:
+        """Of the kernel of a family at its point n."""
         parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in family.gathers]
         return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
 
     def _gathered(self, table: Table, n: int, *, power: int, scale: float) -> Any:
+        """A line of a table times q and the stages."""
         terms = [
             scale * float(entry) * self.h ** (power + own) * values
             for entry, (own, values) in zip(table.entries[n], self.columns, strict=True)
@@ -201,12 +202,9 @@ class _Written:
         """Coefficients by power of time since the point c, of each input."""
         degree, differences, found = self.inputs.shape[1] - 1, self.inputs, []
         for power in range(HIGHEST + 1):
-            left = degree - power
-            weights = [comb(degree, power) * comb(left, j) * c**j * (1 - c) ** (left - j) for j in range(left + 1)]
-            scale = self.h**-power if power else 1
-            values = (
-                scale * (differences @ self.ca.SX(weights)) if weights else self.ca.SX.zeros(differences.shape[0], 1)
-            )
-            found.append(self.ca.vertsplit(values))
+            left, values = degree - power, self.ca.SX.zeros(self.inputs.shape[0], 1)
+            for j in range(left + 1):
+                values += comb(degree, power) * comb(left, j) * c**j * (1 - c) ** (left - j) * differences[:, j]
+            found.append(self.ca.vertsplit(values * self.h**-power))
             differences = differences[:, 1:] - differences[:, :-1] if left > 0 else differences
         return [list(parts) for parts in zip(*found, strict=True)]

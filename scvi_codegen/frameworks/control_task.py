@@ -61,12 +61,8 @@ class Task:
         states, stages = ca.MX.sym("states", 2 * m, n + 1), ca.MX.sym("stages", step.size1_in("stages"), n)
         inputs, ends = ca.MX.sym("inputs", own, n * (self.degree + 1)), ca.MX.sym("velocities", m, 2)
         duration = ca.MX.sym("duration")
-        q, p, times, parameters = (
-            states[:m, :],
-            states[m:, :],
-            self.t + ca.DM(range(n)).T * duration / n,
-            self.parameters,
-        )
+        q, p, parameters = states[:m, :], states[m:, :], self.parameters
+        times = self.t + ca.DM(range(n)).T * duration / n
         repeated = ca.repmat(ca.vertcat(parameters, duration / n), 1, n)
         given = (q[:, :-1], p[:, :-1], stages, inputs, repeated[:-1, :], times, repeated[-1, :])
         q1, p1, residual, along, integrals = step.map(n)(*given)
@@ -121,8 +117,7 @@ class Task:
         q = np.array([_resampled(name, guess.get(name, self._between_ends(name)), fractions) for name in names])
         v = np.gradient(q, times, axis=1)
         moving = zip(q.T, v.T, times, strict=True)
-        momenta = [self.ends.momentum(self.ca.DM(x), x_dot, t, self.parameters).full() for x, x_dot, t in moving]
-        p = np.hstack(momenta)
+        p = np.hstack([self.ends.momentum(self.ca.DM(x), x_dot, t, self.parameters).full() for x, x_dot, t in moving])
         spots = (np.arange(n)[:, np.newaxis] + (np.linspace(0.0, 1.0, self.degree + 1) if self.degree else 0.5)).ravel()
         stages = discretise(system, self.method)
         return {

@@ -30,7 +30,7 @@ def test_both_ways_find_one_cost_and_lead_where_they_say(name, steps, cost, apar
     assert (done.returncode, done.stderr) == (0, "")
     assert "not solved" not in done.stdout
     rows = {
-        line[:19].strip(): [float(word) for word in re.findall(NUMBER, line[19:])]
+        line[:19].strip(): [float(word) for word in line[19:].split() if word[0].isdigit()]
         for line in done.stdout.splitlines()[1:3]
     }
     ours, theirs = rows["discrete mechanics"], rows["collocation"]
