@@ -49,7 +49,7 @@ class ControlledMotion:
 
     @property
     def inputs(self) -> dict[str, PPoly]:
-        """The inputs as functions of time: what :meth:`Stepper.drive` takes."""
+        """The inputs as functions of time, which :meth:`Stepper.drive` takes."""
         from scipy.interpolate import BPoly, PPoly  # here: slow to import
 
         return {name: PPoly.from_bernstein_basis(BPoly(own.T, self.t)) for name, own in self.coefficients.items()}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
+from scipy.integrate import quad_vec
 
 from scvi_codegen import (
     SVI,
@@ -56,6 +57,25 @@ def test_least_effort_from_rest_to_rest_is_known_with_its_costates():
     assert_allclose(motion.inputs["u"](motion.t[:-1] + 0.05), 6 - 12 * (motion.t[:-1] + 0.05), atol=1e-8)
     assert_allclose(motion.costates, np.c_[np.full(5, -12.0), 12 * motion.t[1:] - 6], atol=1e-7)
     assert motion.iterations <= 2  # quadratic, with an exact Hessian
+
+
+@pytest.mark.parametrize("s", [2, 3])
+def test_cost_and_costates_have_the_order_of_the_method(s):
+    """Beside the Gramian of a spring that is pushed: inputs of degree s - 1 by Gauss's s points."""
+    spring = LagrangianSystem.from_text(
+        name="spring", coordinates=["x"], lagrangian="(x_dot**2 - x**2)/2", forces={"x": "u"}, inputs=["u"]
+    )
+    turned = np.array([[np.sin(1.0)], [np.cos(1.0)]])  # where a unit impulse leads, a unit of time later
+    gramian = quad_vec(lambda t: np.outer(v := [np.sin(t), np.cos(t)], v), 0.0, 3.0)[0]
+    costate = np.linalg.solve(gramian, [1.0, 0.0])
+    pushed = costate @ turned  # the input at t = 2
+    errors = []
+    for steps in (3, 6):
+        motion = optimal_control(spring, SVI(s), steps=steps, duration=3.0, cost="u**2/2", degree=s - 1, **REST)
+        at_2 = motion.costates[2 * steps // 3 - 1]
+        errors.append([motion.cost - costate[0] / 2, *(motion.costates[-1] + costate), at_2[1] + pushed.item()])
+    orders = np.log2(np.abs(np.divide(*errors)))
+    assert_allclose(orders, 2 * s, atol=0.3)
 
 
 def test_the_shortest_time_is_found_where_duration_is_free():
