@@ -95,7 +95,6 @@ def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> 
     """Expressions as a function of CasADi's symbols, common parts shared."""
     names = {name: getattr(ca, name) for name in FUNCTIONS}
     constants = {name: float(value) for name, value in CONSTANTS.items()} | {"e": float(sympy.E)}
-    function: Callable[..., list[Any]] = sympy.lambdify(
-        symbols, list(expressions), modules=[names | constants], cse=True
-    )
+    given: dict[str, Any] = {"modules": [names | constants], "cse": True, "dummify": True}  # a symbol may be called e
+    function: Callable[..., list[Any]] = sympy.lambdify(symbols, list(expressions), **given)
     return function

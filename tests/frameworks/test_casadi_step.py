@@ -78,6 +78,15 @@ def test_inputs_in_bernsteins_form_are_the_cubics_of_compiled_steps():
     )
 
 
+def test_names_of_constants_are_free():
+    system = LagrangianSystem.from_text(
+        name="e", coordinates=["x"], lagrangian="x_dot**2/2 - exp(1)*e*x**2/pi", parameters={"e": 0.25}
+    )
+    found = casadi_step(system, SVI(2), solved=True)(q=0.4, p=0.3, inputs=NO_INPUTS, parameters=0.25, t=0.0, h=0.1)
+    exact = compiled_equations(system, SVI(2))([0.4], [0.3], 0.1)
+    assert float(found["p1"]) == pytest.approx(float(exact.p[0]), abs=1e-13)
+
+
 def test_second_derivatives_of_a_flow_are_the_differences_of_its_gradients():
     system, steps, at = problem("planar-pendulum").system, 5, np.array([1.0, 0.3])
     values = list(system.defaults)
