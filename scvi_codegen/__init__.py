@@ -22,6 +22,9 @@ from scvi_codegen.version import __version__ as __version__
 _HOMES = {
     "advice.advice": ("Advice", "advise"),
     "frameworks.casadi": ("casadi_flow",),
+    "frameworks.casadi_step": ("casadi_step",),
+    "frameworks.controlled": ("ControlledMotion",),
+    "frameworks.optimal_control": ("optimal_control",),
     "frameworks.jax": ("JaxFlow", "jax_flow"),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper", "generate_source"),
@@ -44,6 +47,7 @@ _HOMES = {
         "ArgumentError",
         "BuildError",
         "CacheWarning",
+        "ControlError",
         "EventError",
         "ExpressionError",
         "FitError",

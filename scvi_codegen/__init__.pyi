@@ -12,6 +12,7 @@ from scvi_codegen.errors import AccuracyWarning as AccuracyWarning
 from scvi_codegen.errors import ArgumentError as ArgumentError
 from scvi_codegen.errors import BuildError as BuildError
 from scvi_codegen.errors import CacheWarning as CacheWarning
+from scvi_codegen.errors import ControlError as ControlError
 from scvi_codegen.errors import EventError as EventError
 from scvi_codegen.errors import ExpressionError as ExpressionError
 from scvi_codegen.errors import FitError as FitError
@@ -35,8 +36,11 @@ from scvi_codegen.files.cache import CacheInfo as CacheInfo
 from scvi_codegen.files.cache import cache_info as cache_info
 from scvi_codegen.files.cache import clear_cache as clear_cache
 from scvi_codegen.frameworks.casadi import casadi_flow as casadi_flow
+from scvi_codegen.frameworks.casadi_step import casadi_step as casadi_step
+from scvi_codegen.frameworks.controlled import ControlledMotion as ControlledMotion
 from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
 from scvi_codegen.frameworks.jax import jax_flow as jax_flow
+from scvi_codegen.frameworks.optimal_control import optimal_control as optimal_control
 from scvi_codegen.indexed_compiler import compile_indexed as compile_indexed
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem

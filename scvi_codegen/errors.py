@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 __all__ = [
     "AccuracyWarning",
     "ArgumentError",
     "BuildError",
     "CacheWarning",
+    "ControlError",
     "EventError",
     "ExpressionError",
     "FitError",
@@ -61,6 +63,14 @@ class ExpressionError(SystemDefinitionError):
         start = max(0, column - 50)
         window = text[start : column + 30].replace("\n", " ")
         super().__init__(f"{message}\n  {window}\n  {' ' * (column - start)}^ column {column + 1}")
+
+
+class ControlError(ScviCodegenError, ArithmeticError):
+    """No optimal control was found; ``motion`` is the last that was tried."""
+
+    def __init__(self, message: str, motion: Any = None) -> None:
+        self.motion = motion
+        super().__init__(message)
 
 
 class FitError(ScviCodegenError, ValueError):

@@ -1,1 +1,1 @@
-"""Steps as differentiable functions of other libraries: what JAX and CasADi call in C, without Python between."""
+"""Steps as functions of other libraries: what JAX and CasADi differentiate and call, and optimal control by these."""

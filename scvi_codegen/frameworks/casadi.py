@@ -23,7 +23,7 @@ def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> An
     It is an external function in compiled C, which CasADi calls without Python, with its Jacobian and its adjoint by
     CasADi's naming convention: ``jacobian``, ``gradient``, ``jtimes``, ``map`` and nonlinear programs take it like any
     other. Derivatives are exact, those of the computed map. There are no second ones: give IPOPT
-    ``{"ipopt.hessian_approximation": "limited-memory"}``.
+    ``{"ipopt.hessian_approximation": "limited-memory"}``, or steps as constraints (:func:`optimal_control`).
 
     Args:
         stepper: system and method.

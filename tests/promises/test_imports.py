@@ -57,7 +57,7 @@ OWNERS = {
     "mpmath": "benchmark display tables",
     "pandas": "files runtime",
     "platformdirs": "files",
-    "scipy": "benchmark lowering mechanics runtime",
+    "scipy": "benchmark frameworks lowering mechanics runtime",
     "tomli_w": "models",
     "xarray": "files runtime",
     "zarr": "files",

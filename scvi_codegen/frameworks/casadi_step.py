@@ -1,0 +1,210 @@
+"""A step for CasADi, not solved: its equations as constraints of a nonlinear program, differentiated by CasADi.
+
+The stage equations of a method (:mod:`scvi_codegen.methods.stage_system`) are kernels and tables; here they are written
+in CasADi's scalar symbols, so that Jacobians and Hessians of any order are exact and sparse, and its maps, root finders
+and code generation apply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import accumulate, pairwise
+from math import comb
+from typing import Any
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import ArgumentError, MethodError
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.frameworks.casadi_ends import Ends, numeric, own_parameters, read
+from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.kinds import SWITCH, TEXTS, takes
+from scvi_codegen.mechanics.inputs import PARTS
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_system import PointFamily, StageSystem, Table
+
+__all__ = ["casadi_step", "straight"]
+
+ARGUMENTS = ("q", "p", "stages", "inputs", "parameters", "t", "h")
+RESULTS = ("q1", "p1", "residual", "along", "integrals")
+HIGHEST = len(PARTS) - 2
+"""Degree of inputs, which are cubics in compiled steps."""
+
+
+@takes(ArgumentError, system=SYSTEM, along=TEXTS, solved=SWITCH)
+def casadi_step(
+    system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
+) -> Any:
+    """One step as equations, a ``casadi.Function``: constraints of a nonlinear program, or of a root finder.
+
+    The step from (q, p) at t to t + h ends at q1 and p1 where the residual is 0; its unknowns are the stages. Nothing
+    is solved or compiled; everything has exact derivatives of any order, and IPOPT takes the Hessian as it is.
+
+    Args:
+        system: a Lagrangian or a Hamiltonian.
+        method: or its name.
+        degree: of the inputs within the step, 0 (held) to 3.
+        along: formulas in coordinates, velocities (momenta of a Hamiltonian, too), inputs, parameters and t, taken at
+            the g points of the method's quadrature.
+        solved: let CasADi's Newton iteration solve the equations at each call, to 1e-12: the step is then a map without
+            stages and residual, that has second derivatives, too. A call fails where they are not solved.
+
+    Returns:
+        A ``casadi.Function`` by place or by name of q (m), p (m), stages (s), inputs (k, degree + 1) in Bernstein's
+        form (a polynomial stays between the least and the largest of its coefficients, the first and last of which are
+        its values at the ends), parameters (those that are no parts of inputs), t and h. Its values are q1 (m), p1 (m),
+        residual (s), along (texts, g), and integrals (texts), their quadratures over the step.
+
+    Raises:
+        ExpressionError: for a formula outside the grammar.
+        MethodError: for a method that does not serve the system, or that has no quadrature along a curve where
+            formulas are to be taken; for a system in transformed time, for degrees above 3.
+        MissingLibraryError: without CasADi (extra ``casadi``).
+
+    Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, ESAIM: COCV 17 (2011) 322; C. M. Campos, S. Ober-Bloebaum,
+    E. Trelat, Discrete and Continuous Dynamical Systems 35 (2015) 4193.
+    """
+    ca = imported("casadi", "casadi")
+    if system.clock:
+        raise MethodError(f"'{system.name}' moves in transformed time: give the system as it was before")
+    if checked_count(degree, "degree", least=0) > HIGHEST:
+        raise MethodError(f"inputs are polynomials of degree {HIGHEST} at most, not {degree}")
+    stages = discretise(system, as_method(method, system))
+    written = _Written(ca, system, stages, degree)
+    *rows, p1 = written.rows()
+    values, weights = written.along(along) if along else (ca.SX(0, 0), ca.SX(0, 1))
+    found = [written.end_position(), p1, ca.vertcat(*rows), values, written.h * values @ weights]
+    step = ca.Function("step", written.given, found, [*ARGUMENTS], [*RESULTS])
+    return _solved(ca, Ends(ca, system), stages, step) if solved else step
+
+
+def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
+    """A guess of each block of unknowns: the straight line from (q, p) with a velocity."""
+    return [
+        float(block.straight[0]) * q + float(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
+        if block.size is None
+        else 0 * q[: block.size]
+        for block in stages.blocks
+    ]
+
+
+def _solved(ca: Any, ends: Ends, stages: StageSystem, step: Any) -> Any:
+    """The step with its equations solved, of the same arguments and results without the stages."""
+    symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
+    unknowns = symbols.pop("stages")
+    equations = {"x": unknowns, "p": ca.veccat(*symbols.values()), "g": step(**symbols, stages=unknowns)["residual"]}
+    given = {name: ca.MX.sym(name, *each.shape) for name, each in symbols.items()}
+    q, p, t, h, parameters = (given[name] for name in ("q", "p", "t", "h", "parameters"))
+    guess = ca.veccat(*straight(stages, q, ends.velocity(q, p, t, parameters), p, h))
+    found = ca.rootfinder("stages", "newton", equations)(guess, ca.veccat(*given.values()))
+    results = step(**given, stages=found)
+    names = [name for name in RESULTS if name != "residual"]
+    return ca.Function("step", [*given.values()], [results[name] for name in names], [*given], names)
+
+
+class _Written:
+    """A stage system in symbols of CasADi: gathered into arguments, these into kernels, results into rows."""
+
+    def __init__(self, ca: Any, system: MechanicalSystem, stages: StageSystem, degree: int) -> None:
+        self.ca, self.system, self.stages = ca, system, stages
+        m, sizes = system.dimension, stages.block_sizes(system.dimension)
+        lengths = ((m, 1), (m, 1), (sum(sizes), 1), (len(system.inputs), degree + 1), (len(own_parameters(system)), 1))
+        shapes = (*lengths, (1, 1), (1, 1))
+        self.given = [ca.SX.sym(name, *shape) for name, shape in zip(ARGUMENTS, shapes, strict=True)]
+        self.q, self.p, unknowns, self.inputs, self.parameters, self.t, self.h = self.given
+        blocks = [unknowns[start:end] for start, end in pairwise(accumulate(sizes, initial=0))]
+        powers = (block.power for block in stages.blocks)
+        self.columns = ((0, self.q), *zip(powers, blocks, strict=True))
+
+    def rows(self) -> list[Any]:
+        """The residuals of all rows, and p1."""
+        sizes = self.stages.row_sizes(self.system.dimension)
+        momenta = (*(row.momentum for row in self.stages.rows), self.stages.end_momentum)
+        powers = (*(row.power for row in self.stages.rows), 0)
+        rows = [float(c) * self.p if c else self.ca.SX(size, 1) for c, size in zip(momenta, sizes, strict=True)]
+        for family in self.stages.families:
+            kernel = self._kernel(family)
+            for n, weight in enumerate(family.weights):
+                results = iter(kernel(*self._arguments(family, n), *self._surroundings(family.abscissae[n])))
+                for scatter in family.scatters:
+                    values = self.ca.vertcat(*(next(results) for _ in scatter.results))
+                    for r, entry in enumerate(scatter.table.entries[n]):
+                        if entry:
+                            factor = float(scatter.scale * weight * entry)
+                            rows[r] += factor * self.h ** (scatter.power + powers[r]) * values
+        return rows
+
+    def end_position(self) -> Any:
+        """q1."""
+        return self._gathered(self.stages.end_position, 0, power=0, scale=1.0)
+
+    def along(self, texts: Sequence[str]) -> tuple[Any, Any]:
+        """Values of formulas at the points of the quadrature, and its weights.
+
+        Raises:
+            MethodError: where the action is no quadrature of L along a curve.
+        """
+        system = self.system
+        families = [family for family in self.stages.families if family.in_action]
+        known = {*system.coordinates, *system.velocities}
+        if not families or any(family.scalar_power or not known <= {*family.arguments} for family in families):
+            raise MethodError(
+                "this method has no quadrature of functions along its curve: take an SVI, an SCVI or a Gauss method, "
+                "whose discrete Lagrangian is one"
+            )
+        held = tuple(symbol(name) for name in system.inputs)
+        around = (system.time, *own_parameters(system), *held)
+        formulas = read(texts, (*known, *system.auxiliaries, *around))
+        columns, weights = [], []
+        for family in families:
+            values = numeric(self.ca, formulas, (*family.arguments, *around))
+            for n, (c, weight) in enumerate(zip(family.abscissae, family.weights, strict=True)):
+                pushed = [parts[0] for parts in self._input_parts(float(c))]
+                own = (*self._arguments(family, n), self._time(c), *self.ca.vertsplit(self.parameters), *pushed)
+                columns.append(self.ca.vertcat(*values(*own)))
+                weights.append(float(weight))
+        return self.ca.horzcat(*columns), self.ca.SX(weights)
+
+    def _kernel(self, family: PointFamily) -> Callable[..., list[Any]]:
+        """Results by arguments, time and all parameters, inputs counted from the time of the point itself."""
+        from_here = {symbol(f"{name}_t"): self.system.time for name in self.system.inputs}
+        results = [result.xreplace(from_here) for result in family.results]
+        return numeric(self.ca, results, (*family.arguments, self.system.time, *self.system.parameters))
+
+    def _arguments(self, family: PointFamily, n: int) -> list[Any]:
+        """Of the kernel of a family at its point n."""
+        parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in family.gathers]
+        return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
+
+    def _gathered(self, table: Table, n: int, *, power: int, scale: float) -> Any:
+        """A line of a table times q and the stages."""
+        terms = [
+            scale * float(entry) * self.h ** (power + own) * values
+            for entry, (own, values) in zip(table.entries[n], self.columns, strict=True)
+            if entry
+        ]
+        return sum(terms[1:], terms[0])
+
+    def _time(self, abscissa: Any) -> Any:
+        return self.t + float(abscissa) * self.h
+
+    def _surroundings(self, abscissa: Any) -> list[Any]:
+        """Time at a point of the step, and all parameters of the system there."""
+        time = self._time(abscissa)
+        values = dict(zip(own_parameters(self.system), self.ca.vertsplit(self.parameters), strict=True))
+        for name, parts in zip(self.system.inputs, self._input_parts(float(abscissa)), strict=True):
+            values |= dict(zip((symbol(f"{name}_{part}") for part in PARTS), (*parts, time), strict=True))
+        return [time, *(values[name] for name in self.system.parameters)]
+
+    def _input_parts(self, c: float) -> list[list[Any]]:
+        """Coefficients by power of time since the point c, of each input."""
+        degree, differences, found = self.inputs.shape[1] - 1, self.inputs, []
+        for power in range(HIGHEST + 1):
+            left, values = degree - power, self.ca.SX.zeros(self.inputs.shape[0], 1)
+            for j in range(left + 1):
+                values += comb(degree, power) * comb(left, j) * c**j * (1 - c) ** (left - j) * differences[:, j]
+            found.append(self.ca.vertsplit(values * self.h**-power))
+            differences = differences[:, 1:] - differences[:, :-1] if left > 0 else differences
+        return [list(parts) for parts in zip(*found, strict=True)]

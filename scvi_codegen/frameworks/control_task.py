@@ -1,0 +1,189 @@
+"""A task of optimal control as a nonlinear program: what is unknown, what binds it, and what it is at first.
+
+Unknown are the states (q, p) between steps, the stages and inputs of each step, the velocities at both ends, and the
+duration. Maps of one step keep the program small: CasADi differentiates a step, not the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import MethodError, StateError, closest
+from scvi_codegen.frameworks.casadi_ends import Ends
+from scvi_codegen.frameworks.casadi_step import casadi_step, straight
+from scvi_codegen.frameworks.controlled import ControlledMotion
+from scvi_codegen.frameworks.nonlinear_program import NonlinearProgram
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.inputs import Array
+
+__all__ = ["Conditions", "Task", "check_known", "interval"]
+
+Conditions = Mapping[str, Any]
+"""Formulas, and the number that each is, or the least and the largest, ``None`` where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What is asked for (:func:`~scvi_codegen.frameworks.optimal_control.optimal_control` says what each is)."""
+
+    ca: Any
+    system: MechanicalSystem
+    method: Method
+    steps: int
+    duration: tuple[float, float]
+    cost: str
+    bounds: Conditions
+    degree: int
+    t: float
+    parameters: Array
+    start: Conditions
+    end: Conditions
+    end_cost: str
+
+    @property
+    def between(self) -> dict[str, tuple[float, float]]:
+        """The bounds that are not those of inputs."""
+        return {text: interval(text, value) for text, value in self.bounds.items() if text not in self.system.inputs}
+
+    def program(self) -> NonlinearProgram:
+        """The residuals of the steps first, whose multipliers are slopes of the cost."""
+        ca, m, n, own = self.ca, self.system.dimension, self.steps, len(self.system.inputs)
+        step = casadi_step(self.system, self.method, degree=self.degree, along=[self.cost, *self.between])
+        self._check_degree(step.size2_out("along"))
+        states, stages = ca.MX.sym("states", 2 * m, n + 1), ca.MX.sym("stages", step.size1_in("stages"), n)
+        inputs, ends = ca.MX.sym("inputs", own, n * (self.degree + 1)), ca.MX.sym("velocities", m, 2)
+        duration = ca.MX.sym("duration")
+        q, p, parameters = states[:m, :], states[m:, :], self.parameters
+        times = self.t + ca.DM(range(n)).T * duration / n
+        repeated = ca.repmat(ca.vertcat(parameters, duration / n), 1, n)
+        given = (q[:, :-1], p[:, :-1], stages, inputs, repeated[:-1, :], times, repeated[-1, :])
+        q1, p1, residual, along, integrals = step.map(n)(*given)
+        first = (q[:, 0], ends[:, 0], p[:, 0], self.t, parameters)
+        last = (q[:, -1], ends[:, 1], p[:, -1], self.t + duration, parameters)
+        return NonlinearProgram(
+            ca=ca,
+            unknowns={"states": states, "stages": stages, "inputs": inputs, "velocities": ends, "duration": duration},
+            limits={"inputs": self._input_limits(), "duration": self.duration},
+            constraints=[
+                (states[:, 1:] - ca.vertcat(q1, p1), 0.0, 0.0),
+                (residual, 0.0, 0.0),
+                *self._at_end(first, self.start),
+                *self._at_end(last, self.end),
+                *((along[row, :], *self.between[text]) for row, text in enumerate(self.between, 1)),
+            ],
+            cost=ca.sum2(integrals[0, :]) + self.ends.formula(self.end_cost)(*last),
+        )
+
+    def _check_degree(self, points: int) -> None:
+        """A quadrature of so many points must see all of an input's coefficients."""
+        if self.degree >= points:
+            raise MethodError(
+                f"inputs of degree {self.degree} have {self.degree + 1} coefficients a step, which the {points} points "
+                f"of the quadrature of {self.method.name} cannot tell: take degree {points - 1} at most, or more points"
+            )
+
+    def _input_limits(self) -> tuple[Array, Array]:
+        """Least and largest, a line an input."""
+        found = [interval(name, self.bounds.get(name, (None, None))) for name in self.system.inputs]
+        return np.array([[least] for least, _ in found]), np.array([[largest] for _, largest in found])
+
+    def _at_end(self, side: Sequence[Any], conditions: Conditions) -> Iterator[tuple[Any, float, float]]:
+        """What binds velocities and momenta there, and the conditions."""
+        yield self.ends.legendre(*side), 0.0, 0.0
+        for text, value in conditions.items():
+            yield self.ends.formula(text)(*side), *interval(text, value)
+
+    @cached_property
+    def ends(self) -> Ends:
+        """Formulas at both ends."""
+        return Ends(self.ca, self.system)
+
+    def first(self, guess: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of all unknowns: positions as guessed, momenta and stages as these move."""
+        system, n = self.system, self.steps
+        names = [q.name for q in system.coordinates]
+        check_known(guess, (*names, *system.inputs, "duration"), "coordinate or input")
+        duration = checked_number(guess.get("duration", sum(self.duration) / 2), "the duration guessed")
+        fractions = np.linspace(0.0, 1.0, n + 1)
+        times = self.t + fractions * duration
+        q = np.array([_resampled(name, guess.get(name, self._between_ends(name)), fractions) for name in names])
+        v = np.gradient(q, times, axis=1)
+        moving = zip(q.T, v.T, times, strict=True)
+        p = np.hstack([self.ends.momentum(self.ca.DM(x), x_dot, t, self.parameters).full() for x, x_dot, t in moving])
+        spots = (np.arange(n)[:, np.newaxis] + (np.linspace(0.0, 1.0, self.degree + 1) if self.degree else 0.5)).ravel()
+        stages = discretise(system, self.method)
+        return {
+            "states": np.concatenate([q, p]),
+            "stages": np.concatenate(straight(stages, q[:, :-1], np.diff(q) * n / duration, p[:, :-1], duration / n)),
+            "inputs": np.array([_resampled(name, guess.get(name, 0.0), spots / n) for name in system.inputs]),
+            "velocities": v[:, [0, -1]],
+            "duration": duration,
+        }
+
+    def _between_ends(self, name: str) -> list[float]:
+        """Of a coordinate at both ends as far as conditions tell, else the same as at the other, or 0."""
+        limits = [interval(name, side[name]) for side in (self.start, self.end) if name in side]
+        known = [sum(limit) / 2 for limit in limits if np.isfinite(limit).all()]
+        return known if len(known) == 2 else (known or [0.0]) * 2
+
+    def motion(self, program: NonlinearProgram, found: Any, stats: Mapping[str, Any]) -> ControlledMotion:
+        """What was found, with the multipliers of the steps' equations as slopes of the cost."""
+        m, n = self.system.dimension, self.steps
+        values = program.split(found["x"])
+        slopes = -np.asarray(found["lam_g"]).ravel()[: 2 * m * n].reshape(n, 2 * m)
+        inputs = values["inputs"].reshape(len(self.system.inputs), n, self.degree + 1)
+        return ControlledMotion(
+            t=self.t + np.linspace(0.0, values["duration"].item(), n + 1),
+            q=values["states"][:m].T,
+            p=values["states"][m:].T,
+            coefficients=dict(zip(self.system.inputs, inputs, strict=True)),
+            coordinates=tuple(each.name for each in self.system.coordinates),
+            cost=float(found["f"]),
+            costates=slopes,
+            iterations=int(stats["iter_count"]),
+            status=str(stats["return_status"]),
+            solved=bool(stats["success"]),
+            unknowns=program.x.numel(),
+            equations=program.residual.numel(),
+        )
+
+
+def interval(name: str, value: Any) -> tuple[float, float]:
+    """Least and largest of a condition or bound.
+
+    Raises:
+        StateError: for anything but a number or two in order.
+    """
+    if not isinstance(value, tuple | list):
+        number = checked_number(value, name)
+        return number, number
+    if len(value) != 2:
+        raise StateError(f"{name} is a number or two, the least and the largest, not {value!r}")
+    ends = zip(value, (-np.inf, np.inf), strict=True)
+    least, largest = (none if end is None else checked_number(end, name) for end, none in ends)
+    if least > largest:
+        raise StateError(f"{name} has no number between {least:g} and {largest:g}")
+    return least, largest
+
+
+def check_known(given: Mapping[str, Any], known: Sequence[str], what: str) -> None:
+    """Raise :class:`StateError` for a name that is not among those known."""
+    for name in given:
+        if name not in known:
+            raise StateError(f"there is no {what} '{name}'{closest(name, known)} There are: {', '.join(known)}")
+
+
+def _resampled(name: str, values: Any, at: Array) -> Array:
+    """Values at equal times of [0, 1], or one for all, at others by lines."""
+    own = np.atleast_1d(real_array(values, f"the guess of {name}"))
+    if own.ndim != 1 or not np.isfinite(own).all():
+        raise StateError(f"the guess of {name} is a finite number, or a list of them from start to end")
+    return np.interp(at, np.linspace(0.0, 1.0, len(own)), own) if len(own) > 1 else np.full(len(at), own[0])

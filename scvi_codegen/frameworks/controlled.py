@@ -1,0 +1,68 @@
+"""What optimal control gives: a motion of the integrator, the inputs that steer it, and what they cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scvi_codegen.runtime.inputs import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
+
+__all__ = ["ControlledMotion"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlledMotion:
+    """A motion of n steps and its inputs.
+
+    Attributes:
+        t, q, p: (n + 1,), (n + 1, m), (n + 1, m) times and states, those of the integrator with these inputs.
+        coefficients: (n, degree + 1) of each input by name, in Bernstein's form, one line a step.
+        coordinates: names.
+        cost: what was least: the integral and the cost of the end.
+        costates: (n, 2 m) slopes of the cost that is still to come by q and p, at all times but the first.
+        iterations, status, solved: of IPOPT, and what it said.
+        unknowns, equations: how many the nonlinear program has, inequalities and conditions of the ends among these.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    coefficients: dict[str, Array]
+    coordinates: tuple[str, ...]
+    cost: float
+    costates: Array
+    iterations: int
+    status: str
+    solved: bool
+    unknowns: int
+    equations: int
+
+    @property
+    def h(self) -> float:
+        """The length of the steps."""
+        return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))
+
+    @property
+    def inputs(self) -> dict[str, PPoly]:
+        """The inputs as functions of time, which :meth:`Stepper.drive` takes."""
+        from scipy.interpolate import BPoly, PPoly  # here: slow to import
+
+        return {name: PPoly.from_bernstein_basis(BPoly(own.T, self.t)) for name, own in self.coefficients.items()}
+
+    @property
+    def guess(self) -> dict[str, Any]:
+        """Positions, inputs (their means over steps) and duration, to begin with when more is asked for."""
+        found: dict[str, Any] = dict(zip(self.coordinates, self.q.T, strict=True))
+        found |= {name: own.mean(axis=1) for name, own in self.coefficients.items()}
+        return {**found, "duration": float(self.t[-1] - self.t[0])}
+
+    def __repr__(self) -> str:
+        shown = np.format_float_scientific(self.cost, precision=6, trim="-") if self.cost else "0"
+        return (
+            f"<motion of {len(self.t) - 1} steps to t = {self.t[-1]:.6g}, cost {shown}, {self.iterations} iterations>"
+        )

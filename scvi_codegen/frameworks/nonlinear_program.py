@@ -1,0 +1,72 @@
+"""A nonlinear program for IPOPT: unknowns by name, what they and the constraints are between, and what is least."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.runtime.inputs import Array
+
+__all__ = ["NonlinearProgram"]
+
+QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
+
+
+@dataclass(frozen=True)
+class NonlinearProgram:
+    """Unknowns and constraints as symbols and expressions of CasADi, each a matrix.
+
+    Attributes:
+        ca: CasADi.
+        unknowns: by name.
+        limits: of unknowns by name, the least and the largest; no others are bounded.
+        constraints: expression, least, largest.
+        cost: what is least.
+    """
+
+    ca: Any
+    unknowns: dict[str, Any]
+    limits: dict[str, tuple[Any, Any]]
+    constraints: list[tuple[Any, float, float]]
+    cost: Any
+
+    def solved(self, first: Mapping[str, Any], options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
+        """What IPOPT finds from first values by name, and what it says of that."""
+        program = {"x": self.x, "f": self.cost, "g": self.residual}
+        solver = self.ca.nlpsol("program", "ipopt", program, {**QUIET, **options})
+        low, high = (self._vector(self._limits(side)) for side in (0, 1))
+        least, largest = (self._spread(side) for side in (1, 2))
+        found = solver(x0=self._vector(first), lbx=low, ubx=high, lbg=least, ubg=largest)
+        return found, solver.stats()
+
+    def split(self, vector: Any) -> dict[str, Array]:
+        """Values of the unknowns by name, each of its shape."""
+        flat, found, begin = np.asarray(vector).ravel(), {}, 0
+        for name, each in self.unknowns.items():
+            found[name] = flat[begin : begin + each.numel()].reshape(each.shape, order="F")
+            begin += each.numel()
+        return found
+
+    @cached_property
+    def x(self) -> Any:
+        """All unknowns, one after the other."""
+        return self.ca.veccat(*self.unknowns.values())
+
+    @cached_property
+    def residual(self) -> Any:
+        """All constraints."""
+        return self.ca.veccat(*(expression for expression, _, _ in self.constraints))
+
+    def _limits(self, side: int) -> dict[str, Any]:
+        return {name: self.limits.get(name, (-np.inf, np.inf))[side] for name in self.unknowns}
+
+    def _vector(self, values: Mapping[str, Any]) -> Array:
+        parts = [np.broadcast_to(values[name], each.shape).ravel("F") for name, each in self.unknowns.items()]
+        return np.concatenate(parts)
+
+    def _spread(self, side: int) -> Array:
+        return np.concatenate([np.full(each[0].numel(), each[side]) for each in self.constraints])

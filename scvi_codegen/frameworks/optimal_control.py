@@ -1,0 +1,126 @@
+"""Optimal control by discrete mechanics: the equations of the steps are the constraints of a nonlinear program.
+
+Unknown are the states (q, p) between steps, the stages and inputs of each step, and, where it is free, the duration.
+What is found is a motion of the variational integrator, step for step: momenta that no input touches are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import ControlError, MethodError, StateError
+from scvi_codegen.frameworks.casadi_ends import own_parameters
+from scvi_codegen.frameworks.control_task import Conditions, Task, check_known, interval
+from scvi_codegen.frameworks.controlled import ControlledMotion
+from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.kinds import MAPPING, TEXT, takes
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.runtime.inputs import Array
+
+__all__ = ["optimal_control"]
+
+
+@takes(
+    StateError,
+    system=SYSTEM,
+    start=MAPPING,
+    end=MAPPING,
+    cost=TEXT,
+    end_cost=TEXT,
+    bounds=MAPPING,
+    parameters=MAPPING,
+    guess=MAPPING,
+    options=MAPPING,
+)
+def optimal_control(
+    system: MechanicalSystem,
+    method: Method | str,
+    *,
+    steps: int,
+    duration: float | tuple[float, float],
+    start: Conditions,
+    end: Conditions,
+    cost: str = "0",
+    end_cost: str = "0",
+    bounds: Conditions | None = None,
+    degree: int = 0,
+    t: float = 0.0,
+    parameters: Mapping[str, float] | None = None,
+    guess: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> ControlledMotion:
+    """The inputs, and the motion, of least cost among those that fulfil conditions at both ends and bounds between.
+
+    A nonlinear program with exact sparse Hessian is given to IPOPT (by CasADi, extra ``casadi``). Conditions are
+    ``{formula: number}`` or ``{formula: (least, largest)}``, with ``None`` for no bound.
+
+    Args:
+        system: with inputs.
+        method: whose steps are taken, an SVI, SCVI or Gauss method, or its name.
+        steps: how many, equally long.
+        duration: of the motion; two numbers if it is to be found between them.
+        start, end: conditions in coordinates, velocities, momenta (``p_`` and the coordinate), t and parameters.
+        cost: formula in coordinates, velocities, inputs, parameters and t, integrated by the method's quadrature.
+        end_cost: the same without inputs, with momenta, of the end, added to the integral.
+        bounds: by name of an input, everywhere; of formulas as for the cost, at the points of the quadrature.
+        degree: of inputs within a step, 0 (held) to 3.
+        t: the time at the start.
+        parameters: values by name, others keeping their defaults.
+        guess: a number, or values at equal times from start to end, by name of a coordinate or an input; also for
+            ``"duration"``. Coordinates are else guessed between their conditions, inputs 0, the duration halfway. A
+            :attr:`ControlledMotion.guess` is one, with other steps, too.
+        options: of ``casadi.nlpsol``, as ``{"ipopt.max_iter": 500}``.
+
+    Raises:
+        ControlError: if IPOPT finds none; its ``motion`` is the last that was tried.
+        ExpressionError: for a formula outside the grammar.
+        MethodError: for systems with constraints or without inputs, methods without a quadrature along a curve.
+        MissingLibraryError: without CasADi.
+        StateError: for names that there are not, or bounds that are none.
+
+    Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, ESAIM: COCV 17 (2011) 322; C. M. Campos, S. Ober-Bloebaum,
+    E. Trelat, Discrete and Continuous Dynamical Systems 35 (2015) 4193.
+    """
+    ca = imported("casadi", "casadi")
+    if system.constraints or not system.inputs:
+        lacks = "has constraints" if system.constraints else "has no inputs"
+        raise MethodError(f"'{system.name}' {lacks}: give inputs=[..] and independent coordinates, or use casadi_step")
+    task = Task(
+        ca=ca,
+        system=system,
+        method=as_method(method, system),
+        steps=checked_count(steps, "steps", least=1),
+        duration=interval("duration", duration),
+        start=start,
+        end=end,
+        cost=cost,
+        end_cost=end_cost,
+        bounds=bounds or {},
+        degree=degree,
+        t=checked_number(t, "the time t"),
+        parameters=_parameter_values(system, parameters or {}),
+    )
+    if not 0 < task.duration[0] <= task.duration[1] < np.inf:
+        raise StateError(f"a duration is a positive number, or two from the shortest to the longest, not {duration}")
+    program = task.program()
+    motion = task.motion(program, *program.solved(task.first(guess or {}), options or {}))
+    if not motion.solved:
+        raise ControlError(
+            f"no optimal control was found: IPOPT says {motion.status} after {motion.iterations} iterations; try a "
+            "better guess, a longer duration or wider bounds",
+            motion,
+        )
+    return motion
+
+
+def _parameter_values(system: MechanicalSystem, given: Mapping[str, float]) -> Array:
+    values = {name.name: value for name, value in own_parameters(system).items()}
+    check_known(given, tuple(values), "parameter")
+    return np.array([checked_number(value, name) for name, value in {**values, **given}.items()])

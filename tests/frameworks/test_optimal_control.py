@@ -1,0 +1,162 @@
+"""Optimal control by discrete mechanics: against closed forms, the stepper with the inputs found, the Hamiltonian."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS
+from scipy.integrate import quad_vec
+
+from scvi_codegen import (
+    SVI,
+    ControlError,
+    LagrangianSystem,
+    MethodError,
+    RadauIIA,
+    StateError,
+    compile_stepper,
+    hamiltonian_of,
+    optimal_control,
+    problem,
+)
+
+pytest.importorskip("casadi", reason="needs the extra 'casadi'")
+
+POINT = LagrangianSystem.from_text(
+    name="point", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u"}, inputs=["u"]
+)
+SWING = LagrangianSystem.from_text(
+    name="swing",
+    coordinates=["q"],
+    lagrangian="(1 + a)*q_dot**2/2 + cos(q)",
+    parameters={"a": 0.5},
+    forces={"q": "u"},
+    inputs=["u"],
+)
+ROTORS = LagrangianSystem.from_text(
+    name="rotors",
+    coordinates=["theta", "a"],
+    lagrangian="theta_dot**2 + (theta_dot + a_dot)**2*(2 + cos(a))/2",
+    forces={"a": "u"},
+    inputs=["u"],
+)
+REST = {"start": {"x": 0.0, "x_dot": 0.0}, "end": {"x": 1.0, "x_dot": 0.0}}
+UP = {
+    "steps": 12,
+    "duration": 5.0,
+    "start": {"q": 0.0, "q_dot": 0.0},
+    "end": {"q": np.pi, "q_dot": 0.0},
+    "cost": "u**2",
+    "bounds": {"u": (-1.0, 1.0)},
+}
+
+
+def test_least_effort_from_rest_to_rest_is_known_with_its_costates():
+    """u = 6 - 12 t; the slopes of the cost to come are -12 by x and 12 t - 6 by p."""
+    motion = optimal_control(POINT, SVI(2), steps=5, duration=1.0, cost="u**2/2", degree=1, **REST)
+    assert motion.cost == pytest.approx(6.0, rel=1e-9)
+    assert_allclose(motion.inputs["u"](motion.t[:-1] + 0.05), 6 - 12 * (motion.t[:-1] + 0.05), atol=1e-8)
+    assert_allclose(motion.costates, np.c_[np.full(5, -12.0), 12 * motion.t[1:] - 6], atol=1e-7)
+    assert motion.iterations <= 2  # quadratic, with an exact Hessian
+
+
+@pytest.mark.parametrize("s", [2, 3])
+def test_cost_and_costates_have_the_order_of_the_method(s):
+    """Beside the Gramian of a spring that is pushed: inputs of degree s - 1 by Gauss's s points."""
+    spring = LagrangianSystem.from_text(
+        name="spring", coordinates=["x"], lagrangian="(x_dot**2 - x**2)/2", forces={"x": "u"}, inputs=["u"]
+    )
+    turned = np.array([[np.sin(1.0)], [np.cos(1.0)]])  # where a unit impulse leads, a unit of time later
+    gramian = quad_vec(lambda t: np.outer(v := [np.sin(t), np.cos(t)], v), 0.0, 3.0)[0]
+    costate = np.linalg.solve(gramian, [1.0, 0.0])
+    pushed = costate @ turned  # the input at t = 2
+    errors = []
+    for steps in (3, 6):
+        motion = optimal_control(spring, SVI(s), steps=steps, duration=3.0, cost="u**2/2", degree=s - 1, **REST)
+        at_2 = motion.costates[2 * steps // 3 - 1]
+        errors.append([motion.cost - costate[0] / 2, *(motion.costates[-1] + costate), at_2[1] + pushed.item()])
+    orders = np.log2(np.abs(np.divide(*errors)))
+    assert_allclose(orders, 2 * s, atol=0.3)
+
+
+def test_the_shortest_time_is_found_where_duration_is_free():
+    motion = optimal_control(
+        POINT, SVI(1), steps=6, duration=(0.1, 9.0), cost="1", bounds={"u": (-1, 1)}, t=3.0, **REST
+    )
+    assert motion.t[-1] - 3.0 == pytest.approx(2.0, abs=1e-6)
+    assert_allclose(motion.coefficients["u"][:, 0], np.repeat([1.0, -1.0], 3), atol=1e-5)
+
+
+def test_what_the_end_costs_counts():
+    """Far for little: x(1) less the integral of u^2 / 2 is most for u = 1 - t."""
+    motion = optimal_control(
+        POINT, SVI(2), steps=3, duration=1.0, start=REST["start"], end={}, cost="u**2/2", end_cost="-x", degree=1
+    )
+    assert motion.cost == pytest.approx(-1 / 6, rel=1e-8)
+
+
+def test_the_motion_is_that_of_the_stepper_and_inputs_keep_their_bounds():
+    motion = optimal_control(SWING, SVI(3), degree=2, parameters={"a": 0.4}, **UP)
+    stepper = compile_stepper(SWING, SVI(3), flags=QUICK_FLAGS)
+    given = {"inputs": motion.inputs, "h": motion.h, "t_end": 5.0, "parameters": {"a": 0.4}}
+    again = stepper.drive(motion.q[0], motion.p[0], **given)
+    assert_allclose(again.q, motion.q, atol=1e-6)
+    assert abs(motion.inputs["u"](np.linspace(0.0, 5.0, 999))).max() < 1.0 + 1e-7
+    assert abs(motion.coefficients["u"]).max() > 0.999  # they bind
+    finer = optimal_control(SWING, SVI(3), parameters={"a": 0.4}, **{**UP, "steps": 24}, guess=motion.guess)
+    assert finer.cost == pytest.approx(motion.cost, rel=0.05)
+
+
+def test_bounds_between_hold_at_the_points_of_the_quadrature():
+    motion = optimal_control(POINT, SVI(2), steps=8, duration=1.0, cost="u**2", bounds={"x_dot": (None, 1.2)}, **REST)
+    assert motion.p.max() < 1.3
+    free = optimal_control(POINT, SVI(2), steps=8, duration=1.0, cost="u**2", **REST)
+    assert free.p.max() > 1.4
+    assert free.cost < motion.cost
+
+
+def test_a_hamiltonian_has_the_same_answer():
+    motions = [optimal_control(system, SVI(2), **UP) for system in (SWING, hamiltonian_of(SWING))]
+    assert_allclose(motions[1].q, motions[0].q, atol=1e-6)
+    assert motions[1].cost == pytest.approx(motions[0].cost, rel=1e-8)
+
+
+def test_a_momentum_that_no_input_touches_stays_what_it_was():
+    at_rest = {"a": 0.0, "theta_dot": 0.0, "a_dot": 0.0}
+    motion = optimal_control(
+        ROTORS,
+        SVI(2),
+        steps=10,
+        duration=4.0,
+        start={"theta": 0.0, **at_rest},
+        end={"theta": 1.0, "theta_dot": 0.0, "a_dot": 0.0},
+        cost="u**2",
+    )
+    assert abs(motion.p[:, 0]).max() < 1e-14
+    assert abs(motion.q[-1, 0] - 1.0) < 1e-8
+
+
+def test_an_end_that_cannot_be_reached_is_an_error_with_the_last_try():
+    with pytest.raises(ControlError, match=r"no optimal control was found: IPOPT says .* after") as raised:
+        optimal_control(POINT, SVI(1), steps=4, duration=1.0, bounds={"u": (-0.1, 0.1)}, **REST)
+    assert raised.value.motion.q.shape == (5, 1)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "said"),
+    [
+        ({"bounds": {"u": (1, -1)}}, StateError, "u has no number between 1 and -1"),
+        ({"bounds": {"u": (1, 2, 3)}}, StateError, "u is a number or two"),
+        ({"duration": (0.0, 1.0)}, StateError, "a duration is a positive number"),
+        ({"parameters": {"b": 1.0}}, StateError, "there is no parameter 'b'.* There are: a"),
+        ({"guess": {"u_0": 1.0}}, StateError, "there is no coordinate or input 'u_0'"),
+        ({"guess": {"q": [0.0, np.nan]}}, StateError, "the guess of q is a finite number, or a list"),
+        ({"degree": 2}, MethodError, "take degree 1 at most"),
+        ({"method": RadauIIA(2)}, MethodError, "no quadrature"),
+        ({"system": problem("kepler").system}, MethodError, "'Kepler problem' has no inputs"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_what_makes_no_sense_is_said(changed, error, said):
+    asked = {"system": SWING, "method": SVI(2), **UP, **changed}
+    with pytest.raises(error, match=said):
+        optimal_control(**asked)
