@@ -18,7 +18,7 @@ from pathlib import Path
 
 from scvi_codegen.errors import BuildError
 from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed
-from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS, compiler_title, find_compiler
+from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS, compiler_title, find_compiler, from_wheel
 from scvi_codegen.native.processes import running
 
 __all__ = ["FAILS", "LACKS", "OK", "Equipment", "examine"]
@@ -138,7 +138,10 @@ def _compilation() -> Iterator[Equipment]:
     except (BuildError, OSError, subprocess.TimeoutExpired) as error:
         yield Equipment(name="compiler", status=FAILS, found="none", remedy=str(error))
         return
-    yield Equipment(name="compiler", status=OK, found=f"{' '.join(command)}: {title}")
+    why = (
+        "" if not from_wheel(command) or os.environ.get("CC") else " (extra compiler: the PATH has no cc, gcc or clang)"
+    )
+    yield Equipment(name="compiler", status=OK, found=f"{' '.join(command)}: {title}{why}")
     own = os.environ.get(FLAGS_VARIABLE, "")
     yield Equipment(
         name="flags", status=OK, found=" ".join([*TUNED_FLAGS, *([own, f"({FLAGS_VARIABLE})"] if own else [])])
