@@ -23,6 +23,7 @@ _HOMES = {
     "advice.advice": ("Advice", "advise"),
     "frameworks.casadi": ("casadi_flow",),
     "frameworks.jax": ("JaxFlow", "jax_flow"),
+    "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper", "generate_source"),
     "runtime.ensemble_trajectory": ("EnsembleTrajectory",),

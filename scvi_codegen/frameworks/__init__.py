@@ -1,1 +1,1 @@
-"""Steps as differentiable functions of other libraries: what JAX and CasADi call in C, without Python between."""
+"""What other libraries take: steps as functions that JAX and CasADi call in C, bodies for REBOUND."""

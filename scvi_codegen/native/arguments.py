@@ -22,6 +22,11 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
     Raises:
         StateError: for anything but real numbers, and where entries are masked.
     """
+    unit = getattr(value, "unit", None) or getattr(value, "units", None)  # of astropy, of pint
+    if unit is not None and str(unit) not in ("", "dimensionless"):
+        raise StateError(
+            f"{name} has the unit {unit}, which L does not know: give numbers in the units of its parameters"
+        )
     try:
         given = np.asanyarray(value)
         rows = value if isinstance(value, list | tuple) else ()

@@ -58,6 +58,7 @@ OWNERS = {
     "mpmath": "benchmark display tables",
     "pandas": "files runtime",
     "platformdirs": "files",
+    "rebound": "benchmark frameworks",
     "scipy": "benchmark lowering mechanics runtime",
     "tomli_w": "models",
     "xarray": "files runtime",

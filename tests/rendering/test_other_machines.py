@@ -68,10 +68,10 @@ def test_a_folder_becomes_a_program_of_another_machine(target, tmp_path):
         ("kepler", StoermerVerlet()),
         ("double-pendulum", SVI(8)),
         ("planar-pendulum", SCVI(3)),
-        ("driven-duffing", SVI(6)),
+        ("duffing", SVI(6)),
         ("outer-solar-system", SVI(8)),
     ],
-    ids=str,
+    ids=lambda each: each if isinstance(each, str) else type(each).__name__,
 )
 def test_an_arm_processor_computes_the_same_bits(name, method, tmp_path):
     """One libm, roundings fixed by flags: 17 digits of every state, and steps of their own lengths, too."""
