@@ -12,9 +12,24 @@ from scvi_codegen.native.arguments import checked_number, real_array
 
 
 class WithUnit(np.ndarray):
-    """An array as astropy makes it (``unit``); pint's have ``units``."""
+    """An array as astropy makes it."""
 
-    unit: object
+    unit: object = None
+
+
+class OfPint(SimpleNamespace):
+    """A number as pint makes it."""
+
+    units = "second"
+
+
+class Labelled(np.ndarray):
+    """An array whose attributes are what users call its rows."""
+
+    def __getattr__(self, name: str) -> str:
+        if name not in ("unit", "units"):
+            raise AttributeError(name)
+        return "a row"
 
 
 def with_unit(unit: object) -> WithUnit:
@@ -27,7 +42,11 @@ def test_arrays_with_a_unit_are_refused_by_its_name():
     with pytest.raises(StateError, match="q has the unit km, which L does not know"):
         real_array(with_unit("km"), "q")
     with pytest.raises(StateError, match="h has the unit second"):
-        checked_number(SimpleNamespace(units="second"), "h")
+        checked_number(OfPint(), "h")
+
+
+def test_labels_are_no_units():
+    assert real_array(np.array([1.0]).view(Labelled), "q").tolist() == [1.0]
 
 
 @pytest.mark.parametrize("unit", ["", "dimensionless", None])
