@@ -41,6 +41,9 @@ from scvi_codegen.frameworks.controlled import ControlledMotion as ControlledMot
 from scvi_codegen.frameworks.jax import JaxFlow as JaxFlow
 from scvi_codegen.frameworks.jax import jax_flow as jax_flow
 from scvi_codegen.frameworks.optimal_control import optimal_control as optimal_control
+from scvi_codegen.frameworks.rebound import GravitatingBodies as GravitatingBodies
+from scvi_codegen.frameworks.rebound import from_rebound as from_rebound
+from scvi_codegen.frameworks.rebound import to_rebound as to_rebound
 from scvi_codegen.indexed_compiler import compile_indexed as compile_indexed
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem

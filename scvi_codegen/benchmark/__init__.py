@@ -17,6 +17,7 @@
     compile_times the same for larger systems (in compile_systems), by what takes the time
     mechanisms    from SymPy's bodies and loads to a motion, beside lambdify and PyDy (in multibody)
     sums          sums over indices at equal error, beside C by hand (lattices.c), SciPy and REBOUND; and how time grows
+    builds        the same text by several compilers, and for several processors
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation we know of, which are named; no step or tolerance chosen with the answer known, but whole curves.
@@ -33,6 +34,7 @@ from typing import Any
 
 from scvi_codegen.benchmark.adaptive import run_adaptive
 from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
+from scvi_codegen.benchmark.builds import run_builds
 from scvi_codegen.benchmark.cases import CASES
 from scvi_codegen.benchmark.compile_times import run_compile_times
 from scvi_codegen.benchmark.compositions import run_compositions
@@ -68,6 +70,7 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "mechanisms": run_mechanisms,
     "sums": run_sums,
     "growth": run_growth,
+    "builds": run_builds,
 }
 """All that can be measured: name on the command line -> function that does it."""
 

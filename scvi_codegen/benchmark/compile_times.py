@@ -48,7 +48,7 @@ QUICK = ("Kepler", "double pendulum")
 LONGEST = 1800
 
 FIRST_STEP = """
-import json, resource, sys, time
+import json, os, sys, time
 began = time.perf_counter()
 import scvi_codegen as sc
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
@@ -62,10 +62,8 @@ marks.append(time.perf_counter())
 stepper = sc.compile_stepper(system, getattr(sc, method[0])(*method[1]))
 stepper.step(start, [0.0] * len(start), 1e-3)
 done = time.perf_counter()
-python, compiler = (
-    (use := resource.getrusage(who)).ru_utime + use.ru_stime
-    for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-)
+used = os.times()
+python, compiler = used.user + used.system, used.children_user + used.children_system
 lines = stepper.source.code.count("\\n")
 print(json.dumps([done - began, marks[1] - marks[0], marks[2] - marks[1], python, compiler, lines]))
 """

@@ -139,9 +139,9 @@ def complete_method(context: click.Context, parameter: click.Parameter, incomple
 
 
 def complete_model(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of the catalogue, and files, for a shell."""
+    """Names of the catalogue, and files, for a shell; bash forgets what it was told before it is sent to files."""
     names = [CompletionItem(name) for name in PROBLEMS if name.startswith(incomplete)]
-    return [*names, CompletionItem(incomplete, type="file")]
+    return [CompletionItem(incomplete, type="file"), *names]
 
 
 METHOD_OPTIONS = (

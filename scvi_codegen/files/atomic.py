@@ -63,7 +63,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
+    if path.is_dir() and os.name != "posix":
+        return  # folders are not opened there
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # to read alone is too little on Windows
     try:
         os.fsync(handle)
     finally:

@@ -1,1 +1,1 @@
-"""Steps as functions of other libraries: what JAX and CasADi differentiate and call, and optimal control by these."""
+"""What other libraries take: steps as functions of JAX and CasADi, optimal control by these, bodies for REBOUND."""

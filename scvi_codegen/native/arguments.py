@@ -22,6 +22,12 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
     Raises:
         StateError: for anything but real numbers, and where entries are masked.
     """
+    for word in ("unit", "units"):  # of astropy, of pint; not the label of a row or a column
+        unit = getattr(value, word) if hasattr(type(value), word) else None
+        if unit is not None and str(unit) not in ("", "dimensionless"):
+            raise StateError(
+                f"{name} has the unit {unit}, which L does not know: give numbers in those of its parameters"
+            )
     try:
         given = np.asanyarray(value)
         rows = value if isinstance(value, list | tuple) else ()

@@ -57,6 +57,7 @@ __all__ = [
     "compiler_title",
     "find_compiler",
     "fingerprint",
+    "from_wheel",
     "load",
 ]
 
@@ -76,6 +77,7 @@ become a heap of scalars (leapfrog of 8 masses: half as long again). The lanes o
 
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
+WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
 COMPILE_SECONDS = 600
 NOT_RUN = (126, 127)
 ATTEMPTS = 3
@@ -114,8 +116,13 @@ def find_compiler() -> tuple[str, ...]:
         return (sys.executable, "-m", "ziglang", "cc")
     raise BuildError(
         "no C compiler was found; install one (Debian, Ubuntu: apt install gcc libc6-dev; "
-        "macOS: xcode-select --install), or take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
+        f"macOS: xcode-select --install), or {WHEEL}"
     )
+
+
+def from_wheel(compiler: tuple[str, ...]) -> bool:
+    """Whether a command is the compiler of the extra ``compiler``."""
+    return "ziglang" in compiler
 
 
 def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
@@ -283,7 +290,8 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
 def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
     level = [flag for flag in flags if flag.startswith("-O")]
     command = " ".join([Path(compiler[0]).name, *compiler[1:], *level])
-    return f"compiling {source.code.count(chr(10)):,} lines of C with {command}"
+    first = ", whose first use takes longest" if from_wheel(compiler) else ""
+    return f"compiling {source.code.count(chr(10)):,} lines of C with {command}{first}"
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
@@ -354,7 +362,14 @@ def _finished(command: list[str], folder: Path) -> Iterator[None]:
         except subprocess.TimeoutExpired as error:
             raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
     if process.returncode in NOT_RUN:
-        raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}")
+        raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}{_another(command)}")
     if process.returncode:
         shown = "\n".join(errors.splitlines()[:30])
-        raise BuildError(f"the C compiler refused the text\n{' '.join(command)}\n{shown}")
+        raise BuildError(f"the C compiler refused the text\n{' '.join(command)}\n{shown}{_another(command)}")
+
+
+def _another(command: list[str]) -> str:
+    """What to try where this compiler, its headers or its linker are not whole."""
+    if from_wheel(tuple(command)):
+        return ""
+    return f"\nif this compiler is not whole, {WHEEL}, and set CC='python -m ziglang cc'"

@@ -9,6 +9,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from scvi_codegen.errors import BuildError
+
 __all__ = ["running"]
 
 GUARDED = 'exec 3<&0 </dev/null; (read -r end <&3; kill -KILL 0) >/dev/null 2>&1 & exec 3<&-; exec "$@"'
@@ -20,21 +22,32 @@ where Python is killed."""
 def running(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A program in a folder, its temporary files there too; ended with all its children when the context is left.
 
-    A program that cannot be run has the status 126 or 127, as of a shell.
+    A program that cannot be run has the status 126 or 127, as of a shell. Without POSIX it is the program alone that is
+    ended, and not where Python is killed.
     """
+    with (_guarded if os.name == "posix" else _alone)(command, folder) as process:
+        yield process
+
+
+def _started(command: Sequence[str], folder: Path, stdin: int, *, session: bool) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env={**os.environ, **dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(folder))},
+        stdin=stdin,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=session,
+    )
+
+
+@contextmanager
+def _guarded(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
     held, pipe = os.pipe()
     try:
-        with subprocess.Popen(
-            ["/bin/sh", "-c", GUARDED, "sh", *command],
-            cwd=folder,
-            env={**os.environ, "TMPDIR": str(folder)},
-            stdin=held,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-        ) as process:
+        with _started(["/bin/sh", "-c", GUARDED, "sh", *command], folder, held, session=True) as process:
             try:
                 yield process
             finally:
@@ -43,3 +56,16 @@ def running(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[s
     finally:
         os.close(held)
         os.close(pipe)
+
+
+@contextmanager
+def _alone(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
+    try:
+        started = _started(command, folder, subprocess.DEVNULL, session=False)
+    except OSError as error:
+        raise BuildError(f"the program {command[0]!r} does not run: {error}") from error
+    with started as process:
+        try:
+            yield process
+        finally:
+            process.kill()

@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from mpmath import mp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import (
+    builds,
     cases,
     compile_systems,
     compile_times,
@@ -480,6 +483,15 @@ class TestTables:
         rows = sums.run_growth(bench.Plan(quick=True), lambda text: None).rows
         assert [row["coordinates"] for row in rows] == [100, 100_000] * 3
         assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::2], rows[1::2], strict=True))
+
+    @pytest.mark.full
+    def test_compilers_and_processors_are_measured(self, monkeypatch):
+        monkeypatch.setattr(builds, "PROBLEMS", ("kepler",))
+        monkeypatch.setenv("CC", "cc")
+        table = builds.run_builds(bench.Plan(quick=True), lambda text: None)
+        assert {row["build"] for row in table.rows} >= {f"{name}, portable" for name in ("gcc",) if shutil.which(name)}
+        assert all(0.0 < row[f"kepler, SVI({degree})"] < 1e3 for row in table.rows for degree in (4, 8))
+        assert os.environ["CC"] == "cc"
 
     def test_start_up(self):
         cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows

@@ -16,7 +16,7 @@ import pytest
 from scvi_codegen.errors import BuildError
 from scvi_codegen.native import building, waiting
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.native.processes import running
+from scvi_codegen.native.processes import _alone, running
 from scvi_codegen.rendering.source import Source
 
 SLOW_COMPILER = """#!/bin/sh
@@ -92,6 +92,18 @@ def test_output_status_and_temporary_files_are_those_of_the_program(tmp_path):
     with running(["sh", "-c", 'echo "$TMPDIR"; echo no >&2; exit 3', "name"], tmp_path) as process:
         assert process.communicate(timeout=10) == (f"{tmp_path}\n", "no\n")
     assert process.returncode == 3
+
+
+def test_where_there_is_no_shell_the_program_is_started_alone(tmp_path):
+    told = [sys.executable, "-c", "import os, sys; print(os.environ['TEMP']); sys.exit('no')"]
+    with _alone(told, tmp_path) as process:
+        assert process.communicate(timeout=30) == (f"{tmp_path}\n", "no\n")
+    assert process.returncode == 1
+    with _alone([sys.executable, "-c", "import time; time.sleep(60)"], tmp_path) as process:
+        pass
+    assert process.returncode is not None
+    with pytest.raises(BuildError, match="'no-such-compiler' does not run"), _alone(["no-such-compiler"], tmp_path):
+        pass
 
 
 MEETING_COMPILER = """#!/bin/sh

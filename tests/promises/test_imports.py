@@ -47,6 +47,7 @@ OWNERS = {
     "cffi": "native",
     "click": "cli",
     "distributed": "runtime",
+    "filelock": "results",
     "h5netcdf": "files",
     "h5py": "files",
     "jax": "frameworks",
@@ -57,6 +58,7 @@ OWNERS = {
     "mpmath": "benchmark display tables",
     "pandas": "files runtime",
     "platformdirs": "files",
+    "rebound": "benchmark frameworks",
     "scipy": "benchmark frameworks lowering mechanics runtime",
     "tomli_w": "models",
     "xarray": "files runtime",
@@ -144,6 +146,13 @@ def test_a_circle_would_be_found():
 def test_a_third_party_library_has_its_rooms(library):
     users = {room_of(m) for m, tree in MODULES.items() if library in {name.split(".")[0] for name in imports(tree)}}
     assert users <= set(OWNERS[library].split())
+
+
+POSIX = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
+
+
+def test_no_module_of_one_kind_of_system_is_imported():
+    assert {m for m, tree in MODULES.items() if POSIX & {name.split(".")[0] for name in imports(tree)}} == set()
 
 
 HEAVY = ("sympy", "mpmath", "jinja2", "scipy", "matplotlib", "click", "tomli_w", "pycparser", "h5py", "zarr", "pandas")

@@ -156,6 +156,7 @@ WITHOUT_RIGHTS = """
 for path in (*Path("a.run").iterdir(), Path("a.run"), Path()):
     path.chmod(0o555 if path.is_dir() else 0o444)
 "zip".encode("cp437")  # loaded now: the interpreter's own files may be out of reach afterwards
+import filelock
 if os.geteuid() == 0:
     os.setegid(65534)
     os.seteuid(65534)

@@ -343,6 +343,7 @@ class TestFiles:
         assert list(dataset.symmetry.values) == list(kepler.momentum_map_names)
 
     def test_what_cannot_be_computed_is_not_a_number(self, kepler):
+        pytest.importorskip("xarray")
         run = kepler.integrate(**STATE, h=H, steps=9)
         q = run.q.copy()
         q[4] = 0.0

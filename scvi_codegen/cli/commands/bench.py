@@ -31,8 +31,8 @@ def bench(
     length, beside fixed steps, transformed time, heyoka and IAS15: adaptive:kepler:0.9, ..), drift (the energy over ten
     million steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up, compile
     (larger systems, from text to first step), mechanisms (of SymPy, beside lambdify and PyDy), sums (over indices:
-    lattices, fields, many bodies) or growth (with their number of coordinates); by default all; kepler is both of its
-    kind.
+    lattices, fields, many bodies), growth (with their number of coordinates) or builds (other compilers and
+    processors); by default all; kepler is both of its kind.
     Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
 
     \b

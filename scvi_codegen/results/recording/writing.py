@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shlex
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["record_run", "resume_run"]
 
+LOCK = ".lock"
 CHECKPOINT_SECONDS = 10.0
 SHORTEST_PORTION, LONGEST_PORTION = 0.01, 0.1
 """Seconds between looks at the clock: a run is never further from its last consistent state."""
@@ -338,7 +338,7 @@ def _prepare(folder: Path) -> None:
             f"'{folder}' holds a run already: go on with it ('scvi-codegen run --resume "
             f"{shlex.quote(str(folder))}', resume_run), or choose another folder"
         )
-    own = {*chunk_paths(folder), *unfinished(folder)}
+    own = {*chunk_paths(folder), *unfinished(folder), folder / LOCK}
     for path in folder.iterdir():
         if path not in own:
             raise RecordingError(f"'{folder}' is not empty (it has '{path.name}'): choose another folder")
@@ -359,21 +359,22 @@ def _remove(paths: Iterable[Path]) -> None:
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Hold the folder, so that no two processes record into it; the system lets go of it however the process ends."""
-    handle = os.open(folder, os.O_RDONLY)
+    from filelock import FileLock, Timeout  # loads asyncio
+
+    lock = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False)
     try:
-        _lock(handle, folder)
+        lock.acquire()
+    except Timeout as error:
+        raise RecordingError(f"another process is recording into '{folder}': wait for it, or end it") from error
+    except OSError:  # some network disks have no locks; where nothing can be written, the first state will tell
+        yield
+        return
+    try:
         yield
     finally:
-        os.close(handle)
-
-
-def _lock(handle: int, folder: Path) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise RecordingError(f"another process is recording into '{folder}': wait for it, or end it") from error
-    except OSError:
-        return  # some network disks have no locks
+        with suppress(OSError):  # Windows removes it when it is let go
+            (folder / LOCK).unlink()
+        lock.release()
 
 
 def _warn_of_another_build(before: Build, now: Build) -> None:

@@ -1,0 +1,115 @@
+"""Steps of the same text by several compilers, and for several processors, in turn."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.methods import SVI
+from scvi_codegen.models.problems import problem
+from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
+
+__all__ = ["run_builds"]
+
+PROBLEMS = ("kepler", "outer-solar-system")
+DEGREES = (4, 8)
+STEPS = 4000
+LEVELS: Mapping[str, tuple[str, str]] = {
+    "x86-64": ("plain x86-64", ""),
+    "x86-64-v3": ("AVX2", "avx2"),
+    "x86-64-v4": ("AVX-512", "avx512f"),
+}
+"""Of x86-64: what gcc and clang call it, its title, and the flag of processors that have it."""
+
+Step = Callable[[], object]
+
+
+def run_builds(plan: Plan, say: Say) -> ResultTable:
+    """Microseconds a step: minima of processor time, all builds in turn, round after round."""
+    steps = max(1, int(STEPS * plan.share))
+    builds = _builds()
+    rows: dict[str, dict[str, Any]] = {build: {"build": build} for build in builds}
+    for name in PROBLEMS:
+        for degree in DEGREES:
+            column = f"{name}, SVI({degree})"
+            say(f"builds: {column}")
+            runs = {build: _runner(name, degree, steps, *how) for build, how in builds.items()}
+            for build, seconds in _fastest(runs, plan.rounds).items():
+                rows[build][column] = 1e6 * seconds / steps
+    columns = [key for key in next(iter(rows.values()), {}) if key != "build"]
+    return ResultTable(
+        name="builds",
+        title="microseconds a step, by compiler and flags",
+        columns={"build": ""} | dict.fromkeys(columns, ".2f"),
+        rows=tuple(rows.values()),
+        remarks=("minima of processor time, builds in turn; compilers and levels that are not there are left out",),
+    )
+
+
+def _builds() -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Compiler and flags by title, of what is there."""
+    found = {name: name for name in ("gcc", "clang") if shutil.which(name)}
+    if importlib.util.find_spec("ziglang"):
+        found["ziglang"] = f"{sys.executable} -m ziglang cc"
+    builds: dict[str, tuple[str, tuple[str, ...]]] = {}
+    for title, command in found.items():
+        builds[f"{title}, this processor"] = (command, TUNED_FLAGS)
+        for level in _levels():
+            flags = tuple(f"-march={level}" if flag == "-march=native" else flag for flag in TUNED_FLAGS)
+            if title != "ziglang":  # a clang, which calls them by other names
+                builds[f"{title}, {LEVELS[level][0]}"] = (command, flags)
+        builds[f"{title}, portable"] = (command, PORTABLE_FLAGS)
+    return builds
+
+
+def _levels() -> Iterator[str]:
+    """Those of x86-64 that this processor has."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return
+    description = Path("/proc/cpuinfo")
+    has = description.read_text(encoding="utf-8").split() if description.exists() else []
+    yield from (level for level, (_, flag) in LEVELS.items() if not flag or flag in has)
+
+
+def _runner(name: str, degree: int, steps: int, command: str, flags: tuple[str, ...]) -> Step:
+    """Many steps by one build."""
+    chosen = problem(name)
+    with _compiled_by(command):
+        stepper = compile_stepper(chosen.system, SVI(degree), flags=flags)
+    stepper.prepare()
+    start: dict[str, Any] = {"q": chosen.q, "velocity": chosen.velocity, "p": chosen.p}
+    return lambda: stepper.integrate(**start, h=chosen.step, steps=steps, every=steps)
+
+
+@contextmanager
+def _compiled_by(command: str) -> Iterator[None]:
+    before = os.environ.get("CC")
+    os.environ["CC"] = command
+    try:
+        yield
+    finally:
+        del os.environ["CC"]
+        if before is not None:
+            os.environ["CC"] = before
+
+
+def _fastest(runs: Mapping[str, Step], rounds: int) -> dict[str, float]:
+    """Seconds of each."""
+    found = dict.fromkeys(runs, float("inf"))
+    for _ in range(rounds):
+        for build, run in runs.items():
+            began = time.process_time()
+            run()
+            found[build] = min(found[build], time.process_time() - began)
+    return found

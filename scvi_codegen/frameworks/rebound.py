@@ -1,0 +1,174 @@
+"""Bodies that attract each other, from REBOUND and to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError, SystemDefinitionError
+from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.kinds import of, takes
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.native.arguments import checked_number, real_array
+
+__all__ = ["GravitatingBodies", "from_rebound", "to_rebound"]
+
+AXES = "xyz"
+NEWTON = ("basic", "compensated")
+"""What REBOUND calls plain attraction, summed over pairs."""
+AGREES = 1e-11
+"""Relative, of an attraction at places drawn at random."""
+
+Array = NDArray[np.float64]
+
+
+class GravitatingBodies(NamedTuple):
+    """What :func:`from_rebound` gives.
+
+    Attributes:
+        system: of n bodies in 3n Cartesian coordinates x0, y0, z0, x1, ..; parameters G, m0, m1, ..
+        q, velocity: (3n,) in the frame and the units of the simulation.
+        t: the time there.
+        units: names of the units of length, mass and time, empty where the simulation names none.
+    """
+
+    system: LagrangianSystem
+    q: Array
+    velocity: Array
+    t: float
+    units: dict[str, str]
+
+
+def from_rebound(simulation: Any) -> GravitatingBodies:
+    """The bodies of a ``rebound.Simulation`` as a system of Newton's attraction, with their state.
+
+    The value of G is the simulation's; numbers are taken as they are, in its inertial frame and its units. Names, radii
+    and the choice of an integrator are left behind.
+
+    Raises:
+        SystemDefinitionError: for what is not attraction between masses: bodies without mass, softening, other forces,
+            boundaries, collisions, variational particles.
+    """
+    imported("rebound", "rebound")
+    _check_plain(simulation)
+    particles = simulation.particles[: simulation.N]
+    masses = [particle.m for particle in particles]
+    names = range(len(masses))
+    kinetic = " + ".join(f"m{i}*({' + '.join(f'{axis}{i}_dot**2' for axis in AXES)})/2" for i in names)
+    attraction = "".join(
+        f" + G*m{i}*m{j}/sqrt({' + '.join(f'({axis}{i} - {axis}{j})**2' for axis in AXES)})"
+        for i, j in combinations(names, 2)
+    )
+    system = LagrangianSystem.from_text(
+        name=f"{len(masses)} bodies",
+        coordinates=[f"{axis}{i}" for i in names for axis in AXES],
+        lagrangian=kinetic + attraction,
+        parameters={"G": simulation.G} | {f"m{i}": mass for i, mass in enumerate(masses)},
+    )
+    q = np.array([[particle.x, particle.y, particle.z] for particle in particles]).ravel()
+    velocity = np.array([[particle.vx, particle.vy, particle.vz] for particle in particles]).ravel()
+    units = {kind: name for kind, name in simulation.units.items() if name}
+    return GravitatingBodies(system, q, velocity, float(simulation.t), units)
+
+
+@takes(SystemDefinitionError, system=of("a LagrangianSystem", LagrangianSystem))
+def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t: float = 0.0) -> Any:
+    """A ``rebound.Simulation`` of bodies that attract each other by Newton's law.
+
+    G and the masses are read from the Lagrangian, at the values of its parameters (``system.with_parameters``),
+    whatever they are called there, to round-off. The simulation has IAS15, REBOUND's default, and no names of units:
+    they are the system's.
+
+    Args:
+        system: in Cartesian coordinates, body after body, of three axes, or two.
+        q, velocity: (3n,) or (2n,) of the bodies.
+        t: the time.
+
+    Raises:
+        SystemDefinitionError: for any other system.
+        StateError: for states that do not fit it.
+    """
+    rebound = imported("rebound", "rebound")
+    axes, G, masses = _attraction(system)
+    states = [_padded(value, name, len(masses), axes) for name, value in (("q", q), ("velocity", velocity))]
+    simulation = rebound.Simulation()
+    simulation.G, simulation.t = G, checked_number(t, "t")
+    for mass, place, motion in zip(masses, *states, strict=True):
+        simulation.add(
+            m=mass, **dict(zip(AXES, place, strict=True)), **dict(zip(("vx", "vy", "vz"), motion, strict=True))
+        )
+    return simulation
+
+
+def _check_plain(simulation: Any) -> None:
+    """SystemDefinitionError for what no Lagrangian of attraction between masses has."""
+    particles = simulation.particles[: simulation.N]
+    massless = [i for i, particle in enumerate(particles) if not particle.m > 0.0]
+    oddities = {
+        "fewer than two bodies": len(particles) < 2,
+        f"body {massless[:1]} without mass: leave it out, or give it one": bool(massless),
+        f"softening = {simulation.softening}": simulation.softening != 0.0,
+        f"gravity = {simulation.gravity!r}": simulation.gravity not in NEWTON,
+        f"boundary = {simulation.boundary!r}": simulation.boundary != "none",
+        f"collision = {simulation.collision!r}": simulation.collision != "none",
+        "variational particles": bool(simulation.N_var),
+        "additional forces: write them as terms of L, or forces=": bool(simulation._additional_forces),
+    }
+    found = [what for what, there in oddities.items() if there]
+    if found:
+        raise SystemDefinitionError(f"only masses that attract each other are taken; this simulation has {found[0]}")
+
+
+def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
+    """(n, 3) of a flat state; the third axis of two is 0."""
+    array = real_array(value, name)
+    if array.shape != (bodies * axes,):
+        raise StateError(f"{name} must have {bodies * axes} entries, {axes} a body, not the shape {array.shape}")
+    return np.pad(array.reshape(bodies, axes), ((0, 0), (0, 3 - axes)))
+
+
+def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
+    """Axes of a body, G and the masses; SystemDefinitionError for a Lagrangian that is not theirs.
+
+    They are what L is at some places with unit velocities and at rest, and hold if L is of that form at others, too.
+    """
+    known = {*system.coordinates, *system.velocities, *system.constants}
+    forced = system.forces or system.inputs or system.constraints
+    if not forced and system.lagrangian.free_symbols <= known:
+        at = [system.coordinates, system.velocities]
+        formula = sympy.lambdify(at, system.lagrangian.subs(system.constants), "numpy")
+        for axes in (3, 2):
+            if system.dimension % axes == 0 and system.dimension > axes:
+                G, masses = _fitted(formula, system.dimension, axes)
+                if G > 0.0:
+                    return axes, G, masses.tolist()
+    raise SystemDefinitionError(
+        f"'{system.name}' is not of bodies that attract each other by Newton's law, in Cartesian coordinates, one body "
+        "after the other"
+    )
+
+
+def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tuple[float, Array]:
+    """G and the masses; a G of 0 where L has another form."""
+    places, motions = np.random.default_rng(1).normal(size=(2, 4, m))
+    rest = np.zeros(m)
+    masses = np.array([2.0 * (formula(places[0], v) - formula(places[0], rest)) for v in np.eye(m)[::axes]])
+    if not np.all(masses > 0.0):
+        return 0.0, masses
+    shapes = np.array([_inverse_distances(q.reshape(-1, axes), masses) for q in places])
+    G = formula(places[0], rest) / shapes[0]
+    kinetic = 0.5 * motions**2 @ np.repeat(masses, axes)
+    found = [[formula(q, rest), formula(q, v)] for q, v in zip(places, motions, strict=True)]
+    agrees = np.allclose(found, np.transpose([G * shapes, kinetic + G * shapes]), rtol=AGREES, atol=0.0)
+    return float(G) if agrees else 0.0, masses
+
+
+def _inverse_distances(places: Array, masses: Array) -> float:
+    """The sum over pairs of m m' / r."""
+    pairs = combinations(range(len(masses)), 2)
+    return sum(float(masses[i] * masses[j] / np.linalg.norm(places[i] - places[j])) for i, j in pairs)

@@ -1,0 +1,104 @@
+"""Machines without a compiler, and without the headers of Python."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+from scvi_codegen.errors import BuildError
+from scvi_codegen.native import building
+from scvi_codegen.rendering.source import Source
+
+needs_wheel = pytest.mark.skipif(
+    importlib.util.find_spec("ziglang") is None, reason="pip install 'scvi-codegen[compiler]'"
+)
+
+RUN = """
+import scvi_codegen as sc
+kepler = sc.problem("kepler")
+run = sc.compile_stepper(kepler.system, "svi:4").integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=1000)
+print(abs(run.energy() / run.energy()[0] - 1).max())
+"""
+
+
+def bare_machine(tmp_path: Path) -> dict[str, str]:
+    """An environment whose PATH leads to a shell alone."""
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    (tools / "sh").symlink_to("/bin/sh")
+    home = os.environ.get("HOME", str(tmp_path))  # where zig keeps the libraries that it made at its first use
+    return {"PATH": str(tools), "HOME": home, building.CACHE_VARIABLE: str(tmp_path / "cache")}
+
+
+def in_python(environment: dict[str, str], *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=400)
+
+
+@pytest.mark.full
+@needs_wheel
+def test_a_machine_without_a_compiler_takes_the_one_from_the_wheel(tmp_path):
+    environment = bare_machine(tmp_path)
+    assert not any(shutil.which(name, path=environment["PATH"]) for name in ("cc", "gcc", "clang"))
+    ran = in_python(environment, "-c", RUN)
+    assert ran.returncode == 0, ran.stderr
+    assert float(ran.stdout) < 1e-6
+    told = in_python(environment, "-m", "scvi_codegen", "doctor")
+    assert told.returncode == 0, told.stdout + told.stderr
+    assert re.search(
+        r"^ok +compiler .*-m ziglang cc: .*\(extra compiler: the PATH has no cc, gcc or clang\)$", told.stdout, re.M
+    )
+    assert re.search(r"^ok +trial ", told.stdout, re.M)
+
+
+def broken(code: str) -> str:
+    with pytest.raises(BuildError) as error:
+        building.load(Source(prefix="tiny", header="", code=code, declarations="int tiny(void);\n"), flags=("-O0",))
+    return str(error.value)
+
+
+def test_a_compiler_without_its_headers_leads_to_the_one_from_the_wheel(tmp_path, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
+    said = broken("#include <no_such_header.h>\n")
+    assert "no_such_header.h" in said
+    assert "pip install 'scvi-codegen[compiler]' (ziglang), and set CC='python -m ziglang cc'" in said
+
+
+def test_the_compiler_from_the_wheel_does_not_recommend_itself(tmp_path, monkeypatch):
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setenv("CC", f"{sys.executable} -c exit('refused') ziglang")
+    said = broken("")
+    assert "refused" in said
+    assert "pip install" not in said
+
+
+WATCHED = """#!/bin/sh
+echo "$@" >> {folder}/commands
+exec {compiler} -MD -MF {folder}/$$.d "$@"
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the script calls cc")
+def test_no_header_of_python_is_read(tmp_path, monkeypatch):
+    """Of all files that the compiler opens none is Python's, and it is not told where these are."""
+    script = tmp_path / "watched-cc"
+    script.write_text(WATCHED.format(folder=tmp_path, compiler=shutil.which("cc")))
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path / "cache"))
+    code = "#include <math.h>\nint tiny(void);\nint tiny(void)\n{\n  return (int)floor(7.5);\n}\n"
+    source = Source(prefix="tiny", header="", code=code, declarations="int tiny(void);\n")
+    assert building.load(source, flags=("-O0",)).lib.tiny() == 7
+    read = "".join(path.read_text() for path in tmp_path.glob("*.d"))
+    assert "math.h" in read
+    assert "Python.h" not in read
+    paths = sysconfig.get_paths()
+    assert not any(paths[kind] in (tmp_path / "commands").read_text() + read for kind in ("include", "platinclude"))
