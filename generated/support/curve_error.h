@@ -16,11 +16,13 @@ static inline double curve_error(const step_data *step, const sweep_data *data, 
   added = share * largest_number(size) + DBL_MIN;
   for (int i = 0; i < M; i++) {
     const double *x = memory + i * LANES;
-    lanes all;
-    memcpy(&all, x, sizeof all);
-    top[i] = lanes_total(HIGHEST * all);
     bend[i] =
         KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0]) : fabs(x[0]) + fabs(x[KEPT - 1]);
+  }
+  for (int i = 0; i < M; i++) {
+    lanes all;
+    memcpy(&all, memory + i * LANES, sizeof all);
+    top[i] = lanes_total(HIGHEST * all);
   }
   for (int i = 0; i < M; i++) {
     size[i] += added;
