@@ -14,14 +14,18 @@ static inline double smaller(double a, double b)
   return a < b ? a : b;
 }
 
-/* What all that follows a sweep would change the points by, with a margin: change r / (1 - r), r being the rate of
- * contraction from the sweep before, whose change is infinite before the first. Squared, 1 / (1 - r) is at most
- * 2 / (1 - r^2); the 4 is in the margin. */
-static inline double expected_change(double change, double last, int absolute)
+/* Whether all that follows a sweep would change the points by less than the tolerance, with a margin: by change r /
+ * (1 - r), r being the rate of contraction from the sweep before, whose change is infinite before the first. Squared,
+ * 1 / (1 - r) is at most 2 / (1 - r^2); the 4 is in MARGIN. Multiplied out: divisions would last as long as a sweep. */
+static inline int comes_to_rest(double change, double last, const solver_options *options, double margin)
 {
-  const double seen = smaller(larger(change / last, FASTEST_CONTRACTION), SLOWEST_CONTRACTION);
-  const double ratio = last < INFINITY ? seen : 1.0, gap = last < INFINITY ? 1.0 - seen : 1.0;
-  return absolute ? change : MARGIN * ratio * change * (SWEEPS_AFTER ? ratio : 1.0) / (gap * gap);
+  const double tolerance = options->tolerance * options->tolerance, rest = margin * change;
+  const double seen = smaller(larger(change, FASTEST_CONTRACTION * last), SLOWEST_CONTRACTION * last);
+  const double gap = last - seen;
+  const int rests = rest * seen * (SWEEPS_AFTER ? seen : last) <= tolerance * (gap * gap);
+  if (options->absolute)
+    return change <= tolerance;
+  return last < INFINITY ? rests : rest <= tolerance;
 }
 
 /* Whether a sweep that changed the points by the root of `change` (relative to the state) was good enough: what follows
@@ -29,7 +33,7 @@ static inline double expected_change(double change, double last, int absolute)
  * contracts too slowly or not at all. Without branches, for many at once. */
 static inline int sweep_status(double change, double last, const solver_options *options, int k)
 {
-  const int small = expected_change(change, last, options->absolute) <= options->tolerance * options->tolerance;
+  const int small = comes_to_rest(change, last, options, MARGIN);
   const int stopped = (change == 0.0) | ((k > 0) & (change >= last) & (change < ROUNDING_LEVEL));
   const int slow =
       (k >= options->max_iterations) | ((k > FIRST_SWEEPS) & (change > 0.5 * last) & (change > PROGRESS_LEVEL));
@@ -40,9 +44,7 @@ static inline int sweep_status(double change, double last, const solver_options 
  * changes of q. An infinite size gives NaN. */
 static inline void invert_sizes(const solver_options *options, double absolute, number *size)
 {
-  number largest = number_of(0.0);
-  for (int i = 0; i < M; i++)
-    largest = larger_number(largest, size[i]);
+  const number largest = largest_number(size);
   for (int i = 0; i < M; i++)
     size[i] =
         (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;

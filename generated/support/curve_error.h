@@ -4,26 +4,36 @@
 
 /* Of each coordinate, with everything as a part of its size: the square of what the highest coefficient moves it by,
  * over what the curve bends it by. To its size is added `share` of the largest: EACH where each is to be exact by
- * itself, ALL where the state is. Returned is the largest of these, or `least` if that is larger. */
-static double curve_error(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
+ * itself, ALL where the state is. Returned is the largest of these, or `least` if that is larger, as it is after most
+ * steps: loops of one kind of arithmetic each, which become vectors, say so. */
+static inline double curve_error(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
     double share, double least)
 {
-  double largest = 0.0;
+  double size[M], top[M], bend[M], added;
+  int exceeded = 0;
   for (int i = 0; i < M; i++)
-    largest = larger(largest, fabs(step->q0[i]) + fabs(dq[i]));
+    size[i] = fabs(step->q0[i]) + fabs(dq[i]);
+  added = share * largest_number(size) + DBL_MIN;
   for (int i = 0; i < M; i++) {
     const double *x = memory + i * LANES;
-    const double size = fabs(step->q0[i]) + fabs(dq[i]) + share * largest + DBL_MIN;
-    const double ends = KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0])
-                                        : fabs(x[0]) + fabs(x[KEPT - 1]);
-    const double bend = (fabs(KEPT_UNIT(i)) * ends + NEGLIGIBLE * size) * size;
-    lanes all;
-    double top;
-    memcpy(&all, x, sizeof all);
-    top = RESOLVED * KEPT_UNIT(i) * lanes_total(HIGHEST * all);
-    if (top * top > least * bend)
-      least = top * top / bend;
+    bend[i] =
+        KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0]) : fabs(x[0]) + fabs(x[KEPT - 1]);
   }
+  for (int i = 0; i < M; i++) {
+    lanes all;
+    memcpy(&all, memory + i * LANES, sizeof all);
+    top[i] = lanes_total(HIGHEST * all);
+  }
+  for (int i = 0; i < M; i++) {
+    size[i] += added;
+    top[i] *= RESOLVED * KEPT_UNIT(i);
+    top[i] *= top[i];
+    bend[i] = (fabs(KEPT_UNIT(i)) * bend[i] + NEGLIGIBLE * size[i]) * size[i];
+    exceeded |= top[i] > least * bend[i];
+  }
+  for (int i = 0; exceeded && i < M; i++)
+    if (top[i] > least * bend[i])
+      least = top[i] / bend[i];
   (void)data;
   return least;
 }

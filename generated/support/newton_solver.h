@@ -45,6 +45,8 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   if (status != OK)
     return status;
   gather(END_POSITION, 1, step->h, data.z, M, dq, 0, 1);
+  if (!reaches(step, dq, dp))
+    return NOT_FINITE;
   memcpy(memory, data.z, sizeof(real) * N);
   memcpy(memory + N, data.point, sizeof(real) * POINT);
   *guess = POINT > 0 && keep ? 2 : 1;

@@ -22,9 +22,23 @@ static inline number magnitude(number x)
   return fabs(x);
 }
 
-static inline number larger_number(number a, number b)
+/* The largest of M numbers: of many in as many parts as a vector has, which do not wait for each other. */
+static inline number largest_number(const number *x)
 {
-  return larger(a, b);
+  const int whole = M > LANES ? M - M % LANES : 1;
+  number largest = x[0];
+  if (whole > 1) {
+    lane_view parts;
+    memcpy(&parts, x, sizeof parts);
+    for (int i = LANES; i < whole; i += LANES)
+      for (int j = 0; j < LANES; j++)
+        parts.lane[j] = larger(parts.lane[j], x[i + j]);
+    for (int j = 0; j < LANES; j++)
+      largest = larger(largest, parts.lane[j]);
+  }
+  for (int i = whole; i < M; i++)
+    largest = larger(largest, x[i]);
+  return largest;
 }
 
 static inline number fused_numbers(number a, number b, number c)

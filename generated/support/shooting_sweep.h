@@ -1,5 +1,7 @@
 /* A step by sweeps of a shooting-based variational method. Before it: curve_points.h, the tables, the kernels
  * node_lanes and action_lanes. */
+#define ROUNDING_MARGIN 0.25 /* once all has rested for a sweep, what moves little is rounding and never shrinks */
+
 typedef struct {
   lanes weight; /* h w */
 } sweep_data;
@@ -57,7 +59,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     lanes_load(past + CURVE_MEMORY, m);
   for (int k = 0; needs_sweep(&now); k++) {
     lanes change = lanes_of(0.0), r[M], gamma[M];
-    double total, misfit[M];
+    double total, misfit[M], last = now.last;
     evaluate_nodes(step, &curve, m, node, mass);
     factor_mass(mass);
     for (int i = 0; i < M; i++)
@@ -89,7 +91,9 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     }
     total += lanes_total(change);
     take_change(&now, total, options, k, report);
-    if (now.status > 0 && !settled) { /* once more: the rate of contraction shows late */
+    if (settled && now.status == 0) {
+      now.status = comes_to_rest(total, last, options, ROUNDING_MARGIN);
+    } else if (now.status > 0 && !settled) { /* once more: the rate of contraction shows late */
       settled = 1;
       now.status = 0;
     }

@@ -24,6 +24,8 @@ static int solve(const step_data *step, const solver_data *data, real *memory, l
       drift(step, data, DRIFT[n], dp, dq);
   }
   report->iterations++;
+  if (!reaches(step, dq, dp))
+    return NOT_FINITE;
   memcpy(memory, F, sizeof F);
   *guess = 1;
   return OK;

@@ -75,6 +75,9 @@ ROLLED_FLAGS = ("--param=max-completely-peel-times=4",)
 """With -O3, for one trajectory: loops over more coordinates stay loops, which gcc turns into vectors; written out they
 become a heap of scalars (leapfrog of 8 masses: half as long again). The lanes of ensembles must be written out."""
 
+WRITTEN_OUT = frozenset({"support/newton_solver.h", "support/shooting_sweep.h"})
+"""Steps of one trajectory whose short loops, over unknowns or functions of points, take a tenth longer as loops."""
+
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 """Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
 WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
@@ -333,7 +336,7 @@ def _passes(part: Source, flags: tuple[str, ...], cut: bool) -> tuple[str, ...]:
     """What gcc does otherwise than -O3 says."""
     if "-O3" not in flags:
         return ()
-    rolled = ROLLED_FLAGS if "support/run.h" in part.files else ()
+    rolled = ROLLED_FLAGS if "support/run.h" in part.files and WRITTEN_OUT.isdisjoint(part.files) else ()
     return (*CUT_FLAGS, *rolled) if cut else rolled
 
 

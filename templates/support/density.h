@@ -57,11 +57,8 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
   }
   prepare(&now->step, &now->data);
   run->guess = 0; /* that of a step of another length */
-  status = solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
+  return solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
       now->step.scratch + SCRATCH);
-  if (status != OK)
-    return status;
-  return reaches(now->at.q, now->dq) && reaches(now->at.p, now->dp) ? OK : NOT_FINITE;
 }
 
 /* Makes the step that was found the state. */

@@ -19,7 +19,7 @@ SELDOM int NAME(exchanges)(real t, real h, const real *q0, const real *p0, const
     return status;
   sums_along(&step, data.z, given);
   gather(END_POSITION, 1, h, data.z, M, dq, 0, 1);
-  if (!all_finite(given, SUMS) || !reaches(q0, dq) || !reaches(p0, dp))
+  if (!all_finite(given, SUMS) || !reaches(&step, dq, dp))
     return NOT_FINITE;
   for (int i = 0; i < M; i++) {
     q1[i] = q0[i] + dq[i];

@@ -93,8 +93,8 @@ static inline int outcome(const progress *now, solver_report *report)
 /* Whether the increments are to be added. */
 static inline int accept(const step_data *step, const double *dq, const double *dp, solver_report *report)
 {
-  (void)step, (void)report;
-  return all_finite(dq, M) && all_finite(dp, M);
+  (void)report;
+  return reaches(step, dq, dp);
 }
 
 static inline long long next_guess(long long steps, const progress *now, const solver_report *report)

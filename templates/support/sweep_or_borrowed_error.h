@@ -1,9 +1,14 @@
 /* The largest error of the curves that sweeps found, or the fallback where they failed. Before it: curve_error.h,
  * borrowed_fallback.h; its power makes it one of those of the sweeps. */
+static SELDOM double fallback_error(const run_memory *run, const double *workspace)
+{
+  return larger(run->error, pow(*workspace, 1 / ERROR_POWER));
+}
+
 static double largest_error(const run_memory *run, const step_data *step, const solver_data *data, const double *dq,
     double *workspace)
 {
   if (run->guess > 0)
     return curve_error(step, data, run->memory, dq, ALL, run->error);
-  return larger(run->error, pow(*workspace, 1 / ERROR_POWER));
+  return fallback_error(run, workspace);
 }

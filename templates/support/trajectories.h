@@ -25,11 +25,15 @@ static inline number magnitude(number x)
   return view.all;
 }
 
-static inline number larger_number(number a, number b)
+/* The largest of M numbers. */
+static inline number largest_number(const number *x)
 {
-  lane_view largest = {a}, view = {b};
-  for (int j = 0; j < LANES; j++)
-    largest.lane[j] = larger(largest.lane[j], view.lane[j]);
+  lane_view largest = {x[0]};
+  for (int i = 1; i < M; i++) {
+    const lane_view view = {x[i]};
+    for (int j = 0; j < LANES; j++)
+      largest.lane[j] = larger(largest.lane[j], view.lane[j]);
+  }
   return largest.all;
 }
 
