@@ -214,6 +214,7 @@ USE = ("systems", "symmetries", "forces", "inputs", "mechanisms", "steps")
 TYPED_PAGES = (*USE, "derivatives", "chaos", "fits", "ensembles", "long_runs")
 
 
+@pytest.mark.full
 def test_a_type_checker_knows_them_and_the_code_of_the_pages(tmp_path):
     (tmp_path / "typed.py").write_text(TYPED)
     files = ["typed.py"]

@@ -29,15 +29,16 @@ def page() -> str:
     return report_html([outcome for outcome in outcomes if isinstance(outcome, Result)])
 
 
-class TestInABrowser:
-    @pytest.fixture(scope="class", params=VIEWS, ids="-".join)
-    def view(
-        self, request: pytest.FixtureRequest, browser: Any, page: str, tmp_path_factory: pytest.TempPathFactory
-    ) -> Iterator[Any]:
-        path = tmp_path_factory.mktemp("report") / "report.html"
-        with opened(browser, page, path, *request.param) as view:
-            yield view
+@pytest.fixture(scope="module", params=VIEWS, ids="-".join)
+def view(
+    request: pytest.FixtureRequest, browser: Any, page: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Any]:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    with opened(browser, page, path, *request.param) as view:
+        yield view
 
+
+class TestInABrowser:
     def test_it_asks_for_nothing_and_complains_of_nothing(self, view):
         assert_it_asks_for_nothing(view)
 
