@@ -69,7 +69,7 @@ METHODS = {
 }
 
 
-SHARES = 8
+SHARES = 6
 TUNED = (SVI(3), Gauss(5), SpectralCollocation(4), SCVI(5, variational=False))
 
 
@@ -137,7 +137,7 @@ def tool(name: str) -> str:
 
 
 def share_of(method: str, share: int) -> list[Source]:
-    """Every eighth of the texts of a method: over the shares all of them."""
+    """Every sixth of the texts of a method: over the shares all of them."""
     return [source for source, _ in generated(method).values()][share::SHARES]
 
 

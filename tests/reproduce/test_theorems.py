@@ -38,8 +38,8 @@ KEPLER = order_theorem.STEPS["kepler"]
 DEGREES = (2, 4, 6)
 
 
-COMPILING = ("theorem-4.1", "theorem-4.2")
-"""Of whose time a hundred integrators are most."""
+COMPILING = ("theorem-4.1", "theorem-4.2", "theorem-4.3")
+"""Of whose time integrators by the dozen are most."""
 
 
 @pytest.fixture(scope="module")
@@ -153,11 +153,12 @@ def test_slopes_and_rates_leave_round_off_out():
 def test_verdicts_are_those_of_the_numbers(results):
     assert results["section-2.1"].verdict is Verdict.HOLDS
     assert results["theorem-2.1"].verdict is Verdict.HOLDS
-    assert results["theorem-4.3"].verdict is Verdict.HOLDS
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("name", "held", "failed"), [("theorem-4.1", 2, 2), ("theorem-4.2", 2, 1)])
+@pytest.mark.parametrize(
+    ("name", "held", "failed"), [("theorem-4.1", 2, 2), ("theorem-4.2", 2, 1), ("theorem-4.3", 1, 0)]
+)
 def test_verdicts_on_the_order_and_on_the_rates(name, held, failed):
     [experiment] = [each for each in theorems.EXPERIMENTS if each.name == name]
     result = experiment.run({})
