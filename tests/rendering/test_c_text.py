@@ -437,7 +437,8 @@ def sanitizer(command: Sequence[str], folder: Path) -> None:
         pytest.skip(f"{' '.join(command)} links no program here")
 
 
-BRIEFLY = [name for name in METHODS if name.startswith(("svi-3", "scvi-2", "scvi-printed", "sc-3", "gauss", "stoermer"))]
+SANITIZED = ("svi-3", "scvi-2", "scvi-printed", "sc-3", "gauss", "stoermer")
+BRIEFLY = [name for name in METHODS if name.startswith(SANITIZED)]
 
 
 SANITIZERS = pytest.mark.parametrize(
