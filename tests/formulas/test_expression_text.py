@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import sympy
 from counting import at_most
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sympy import Integer, Rational, S, Symbol, pi
 
@@ -268,7 +268,7 @@ def test_not_written(expression: sympy.Expr, message: str) -> None:
         format_expression(expression)
 
 
-@settings(max_examples=4000, deadline=None)
+@settings(max_examples=1000, deadline=None)
 @given(
     st.one_of(
         st.text(max_size=30),
@@ -289,8 +289,9 @@ def test_random_text_gives_an_expression_or_an_expression_error(text: str) -> No
         assert parse(format_expression(result)) == result
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(EXPRESSIONS)
+@example(sympy.atan2(0, sympy.atan2(0, X)))
 def test_evaluation_agrees_with_sympy(expression: sympy.Expr) -> None:
     point = {X: Rational(3, 7), Y: Rational(5, 11), Z: Rational(13, 9)}
     try:
@@ -298,4 +299,6 @@ def test_evaluation_agrees_with_sympy(expression: sympy.Expr) -> None:
     except ArithmeticError:
         return
     expected = expression.subs(point).evalf(30, maxn=200)
+    if expected is sympy.nan:  # atan2(0, 0), which is 0 in C
+        return
     assert abs(mp.mpf(str(sympy.re(expected))) - value) <= mp.mpf("1e-20") * max(1, abs(value))

@@ -78,7 +78,7 @@ def try_formula(number: int) -> bool:
 
 
 def test_formulas_are_read_or_refused():
-    assert sum(map(try_formula, range(4000))) > 400
+    assert sum(map(try_formula, range(2000))) > 200
 
 
 @pytest.mark.full

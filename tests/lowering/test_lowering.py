@@ -118,7 +118,7 @@ EXPRESSIONS = st.recursive(st.one_of(st.sampled_from([x, y, t, a]), EIGHTHS), co
 POINTS = st.fixed_dictionaries({s: st.integers(1, 40).map(lambda n: sympy.Rational(n, 16)) for s in (x, y, t, a)})
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(values=st.lists(EXPRESSIONS, min_size=1, max_size=3), point=POINTS)
 def test_reading_back_gives_the_original_to_fifty_digits(values, point):
     kernel = kernel_of(*values)

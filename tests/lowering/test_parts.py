@@ -44,6 +44,7 @@ def test_a_short_kernel_stays_whole():
     assert (part.name, part.statements) == ("k", tuple(whole.statements()))
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("name", ["double-pendulum", "charged-particle", "fput-chain"])
 def test_the_same_motion_to_the_bit(name, solver, cut_after, monkeypatch, tmp_path):

@@ -109,6 +109,7 @@ def test_the_c_text_is_compiled_as_it_stands(pendulum, tmp_path):
         load_package(folder)
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(
     ("name", "method"),

@@ -41,6 +41,7 @@ def states_printed(folder, flags=STRICT):
     return np.loadtxt(printed.splitlines(), comments="#"), printed
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(0.03, 0.0), (-0.07, 2.55)])
 def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import oracle
 import pytest
+from samples import QUICK_FLAGS
 
 from scvi_codegen.methods import (
     SCVI,
@@ -88,6 +89,10 @@ TOLERANCE = 2e-14
 """Of the state: a step rounds its answer once (1e-16), and its kernels and Newton's last update some tens of times."""
 
 
+UNOPTIMISED = ("-O0", *QUICK_FLAGS[1:])
+"""What most families and solvers are tried with here; the full tier has every method with those of users."""
+
+
 def relative(found, expected):
     """The largest difference, relative to the size of the state (never less than 1)."""
     return np.abs(np.array(found) - expected).max() / max(1.0, np.abs(expected).max())
@@ -127,13 +132,13 @@ SOLVED_BOTH_WAYS = (
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
 def test_both_solvers_step_as_the_oracle(sample, compiled, name, method, solver):
-    check(sample, compiled, name, method, solver=solver)
+    check(sample, compiled, name, method, solver=solver, flags=UNOPTIMISED)
 
 
 @pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
 def test_every_family_of_methods_steps_as_the_oracle(sample, compiled, method):
     """On a Lagrangian with everything in it: coupled, mass depending on angle and time, velocity-dependent terms."""
-    check(sample, compiled, "pumped-cart-pole", method)
+    check(sample, compiled, "pumped-cart-pole", method, flags=UNOPTIMISED)
 
 
 @pytest.mark.full
@@ -146,7 +151,7 @@ def test_every_method_on_every_system_steps_as_the_oracle(sample, compiled, name
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3), RadauIIA(2)], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])
 def test_steps_back_and_far_from_time_zero_are_the_oracles(sample, compiled, method, h, t):
-    check(sample, compiled, "pumped-cart-pole", method, h=h, t=t)
+    check(sample, compiled, "pumped-cart-pole", method, h=h, t=t, flags=UNOPTIMISED)
 
 
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3)], ids=lambda method: method.name)

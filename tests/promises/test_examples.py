@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
+import warnings
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,8 +21,9 @@ from scipy.optimize import brentq
 
 from scvi_codegen.cli import main
 from scvi_codegen.models.model_file import load_model
+from scvi_codegen.native.building import FLAGS_VARIABLE
 
-pytestmark = [pytest.mark.long, pytest.mark.usefixtures("as_users_compile")]
+pytestmark = pytest.mark.long
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
@@ -50,19 +54,34 @@ ENERGY_ERRORS = {
 }
 
 
-def output_of(name: str, tmp_path: Path, *arguments: str) -> str:
-    """What a Python example prints, run from elsewhere."""
-    path = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
-    result = subprocess.run(
-        [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *arguments],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    return result.stdout
+@pytest.fixture(autouse=True, params=["-O0", pytest.param("", marks=pytest.mark.full)], ids=["quickly", "as users"])
+def compiled_with(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an example says does not depend on optimisation; the full tier has it as users compile."""
+    monkeypatch.setenv(FLAGS_VARIABLE, request.param)
+
+
+many_steps = pytest.mark.parametrize("compiled_with", [""], ids=["as users"], indirect=True)
+"""Of which an example is mostly made: quicker if they are compiled as users do."""
+
+
+@pytest.fixture
+def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
+    """What a Python example prints, with these arguments, run from elsewhere in this process."""
+
+    def output(name: str, *arguments: str) -> str:
+        script = str(EXAMPLES / f"{name}.py")
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("MPLBACKEND", "agg")
+        monkeypatch.setattr(sys, "argv", [script, *arguments])
+        with warnings.catch_warnings(action="error"):
+            runpy.run_path(script, run_name="__main__")
+        if "matplotlib.pyplot" in sys.modules:
+            sys.modules["matplotlib.pyplot"].close("all")
+        printed, complaints = capfd.readouterr()
+        assert complaints == ""
+        return printed
+
+    return output
 
 
 def test_every_example_is_tried_here():
@@ -101,10 +120,10 @@ def test_the_shaken_tower_moves_as_its_equations_say(tmp_path):
     assert last[:5] == pytest.approx([8.0, *state], abs=1e-8)
 
 
-def test_kepler_conservation_tells_the_methods_apart(tmp_path):
+def test_kepler_conservation_tells_the_methods_apart(output_of):
     errors = {
         line[:32].strip(): [float(word) for word in line[32:].split()]
-        for line in output_of("kepler_conservation", tmp_path).splitlines()[1:]
+        for line in output_of("kepler_conservation").splitlines()[1:]
     }
     assert max(errors["SVI, degree 4"]) < 1e-7
     assert max(errors["SVI, degree 4"]) < 1.1 * min(errors["SVI, degree 4"])
@@ -112,8 +131,8 @@ def test_kepler_conservation_tells_the_methods_apart(tmp_path):
     assert min(errors["explicit Euler"]) > 0.1
 
 
-def test_eccentric_comet_keeps_its_energy(tmp_path):
-    rows = [line[12:].split() for line in output_of("eccentric_comet", tmp_path).splitlines()[1:]]
+def test_eccentric_comet_keeps_its_energy(output_of):
+    rows = [line[12:].split() for line in output_of("eccentric_comet").splitlines()[1:]]
     (stretched, regular) = ([float(word) for word in row] for row in rows)
     assert stretched[1] > 1000 * stretched[2]
     assert stretched[3] < 1e-9
@@ -121,9 +140,9 @@ def test_eccentric_comet_keeps_its_energy(tmp_path):
     assert regular[4] < 1e-9
 
 
-def test_every_way_to_choose_steps_is_as_good_as_it_says(tmp_path):
+def test_every_way_to_choose_steps_is_as_good_as_it_says(output_of):
     """Over a thousand periods; in docs/steps.md ten thousand."""
-    rows = [line[28:].split() for line in output_of("which_step", tmp_path).splitlines()[1:]]
+    rows = [line[28:].split() for line in output_of("which_step").splitlines()[1:]]
     steps, _, energy, _, error = zip(*(map(float, row) for row in rows), strict=True)
     fixed, controlled, loose, transformed, reversible = range(5)
     assert steps[fixed] > 6 * max(steps[controlled:])
@@ -132,20 +151,21 @@ def test_every_way_to_choose_steps_is_as_good_as_it_says(tmp_path):
     assert max(error[way] for way in (controlled, transformed, reversible)) < 1e-8 < error[fixed]
 
 
-def test_a_comet_that_all_but_hits_the_sun_comes_back(tmp_path):
-    errors = [float(line.split()[-1]) for line in output_of("collisions_in_space", tmp_path).splitlines()[1:]]
+def test_a_comet_that_all_but_hits_the_sun_comes_back(output_of):
+    errors = [float(line.split()[-1]) for line in output_of("collisions_in_space").splitlines()[1:]]
     assert max(errors) < 1e-11
 
 
-def test_leapfrog_keeps_an_ellipse_by_its_logarithm(tmp_path):
-    rows = [line.split() for line in output_of("logarithmic_hamiltonian", tmp_path).splitlines()[1:]]
+def test_leapfrog_keeps_an_ellipse_by_its_logarithm(output_of):
+    rows = [line.split() for line in output_of("logarithmic_hamiltonian").splitlines()[1:]]
     _, away, period = zip(*(map(float, row) for row in rows), strict=True)
     assert max(away) < 1e-14
     assert period[0] / period[2] == pytest.approx(16.0, rel=0.2)
 
 
-def test_halo_orbits_are_the_published_ones_and_their_family_turns(tmp_path):
-    output = output_of("halo_orbits", tmp_path)
+@many_steps
+def test_halo_orbits_are_the_published_ones_and_their_family_turns(output_of, tmp_path):
+    output = output_of("halo_orbits")
     away = [float(found) for found in re.findall(r"(\S+) from the published orbit", output)]
     assert len(away) == 4
     assert max(away) < 1e-10
@@ -156,53 +176,61 @@ def test_halo_orbits_are_the_published_ones_and_their_family_turns(tmp_path):
     assert (tmp_path / "halo_orbits.png").stat().st_size > 10_000
 
 
-def test_the_map_of_henon_and_heiles_is_half_chaotic(tmp_path):
+def test_the_map_of_henon_and_heiles_is_half_chaotic(output_of, tmp_path):
     """Of coarser grids than by default; on fine ones 44 per cent are regular."""
-    output = output_of("henon_heiles_map", tmp_path, "24")
+    output = output_of("henon_heiles_map", "24")
     assert 30 < float(re.search(r"regular .*: (\d+)%", output)[1]) < 60
     assert float(re.search(r"(\d+) a second", output)[1]) > 0
     assert (tmp_path / "henon_heiles_map.png").stat().st_size > 10_000
 
 
-def test_curves_and_quadratures_win_where_they_say(tmp_path):
-    errors = [
-        float(line.split()[-1]) for line in output_of("curves_and_quadratures", tmp_path).splitlines() if "e-" in line
-    ]
+def test_curves_and_quadratures_win_where_they_say(output_of):
+    errors = [float(line.split()[-1]) for line in output_of("curves_and_quadratures").splitlines() if "e-" in line]
     polynomials, harmonics, smooth, splines, trapezoid, hermite, more = errors
     assert harmonics < polynomials / 100
     assert splines < smooth / 1e4
     assert more < 1e-7 < hermite < trapezoid
 
 
-def test_import_generated_stepper_runs_without_sympy(tmp_path):
-    output = output_of("import_generated_stepper", tmp_path)
+def test_import_generated_stepper_runs_without_sympy(output_of):
+    output = output_of("import_generated_stepper")
     assert "pendulum_svi.c" in output
     assert float(output.rsplit(maxsplit=1)[1]) < 1e-8
 
 
-def test_custom_sympy_system_finds_the_bifurcation(tmp_path):
-    output = output_of("custom_sympy_system", tmp_path)
+def test_custom_sympy_system_finds_the_bifurcation(output_of):
+    output = output_of("custom_sympy_system")
     assert "the same from LagrangesMethod: True" in output
     slow, fast = re.findall(r"between (\S+) and (\S+)", output)
     assert float(slow[0]) < 0 < float(slow[1])
     assert 0 < float(fast[0]) < float(fast[1])
 
 
-def test_a_mechanism_from_joints_moves_as_sympy_says(tmp_path):
-    output = output_of("mechanism_from_joints", tmp_path)
+def test_a_mechanism_from_joints_moves_as_sympy_says(output_of):
+    output = output_of("mechanism_from_joints")
     assert float(re.search(r"unaccounted for: (\S+)", output)[1]) < 1e-12
     assert float(re.search(r"after 10 s: (\S+)", output)[1]) < 1e-11
 
 
-def test_inspect_derivation_shows_equations_latex_and_radicals(tmp_path):
-    output = output_of("inspect_derivation", tmp_path)
-    assert "27a" in output
-    assert r"\tag{27a}" in output
-    assert "sqrt(3)" in output
+def test_inspect_derivation_shows_equations_latex_and_radicals_in_a_process_of_its_own(tmp_path):
+    path = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
+    result = subprocess.run(
+        [sys.executable, "-W", "error", str(EXAMPLES / "inspect_derivation.py")],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "27a" in result.stdout
+    assert r"\tag{27a}" in result.stdout
+    assert "sqrt(3)" in result.stdout
 
 
-def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(tmp_path):
-    lines = output_of("poincare_section", tmp_path).splitlines()
+@many_steps
+def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(output_of, tmp_path):
+    lines = output_of("poincare_section").splitlines()
     assert len(lines) == 3
     for line in lines:
         count, away, error = re.search(r"(\d+) crossings, .x. < (\S+), energy error (\S+)", line).groups()
@@ -214,8 +242,8 @@ def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(tmp_path):
     }
 
 
-def test_hanging_chain_comes_to_rest_as_a_catenary(tmp_path):
-    output = output_of("hanging_chain", tmp_path)
+def test_hanging_chain_comes_to_rest_as_a_catenary(output_of):
+    output = output_of("hanging_chain")
     assert float(re.search(r"off their length by (\S+)", output)[1]) < 1e-16
     a = brentq(lambda a: 2.0 * a * np.sinh(0.5 / a) - 1.2, 0.1, 10.0)
     sag, tension = (float(re.search(rf"{what} (\S+?),", output)[1]) for what in ("sag", "tension"))
@@ -225,8 +253,8 @@ def test_hanging_chain_comes_to_rest_as_a_catenary(tmp_path):
     assert float(carried) == pytest.approx(float(weight), abs=1e-5)
 
 
-def test_joints_carry_what_they_say(tmp_path):
-    output = output_of("joints", tmp_path)
+def test_joints_carry_what_they_say(output_of):
+    output = output_of("joints")
     forces = re.findall(r"(\d+\.\d+), (?:by its turning|with a constant acceleration) (\S+)", output)
     assert len(forces) == 2
     for found, expected in forces:
@@ -238,8 +266,8 @@ def test_joints_carry_what_they_say(tmp_path):
     assert sum(hangers) == pytest.approx((9 * 0.2 + 3.0) * 9.81, abs=1e-3)
 
 
-def test_a_cart_balances_its_pole(tmp_path):
-    output = output_of("balanced_cart_pole", tmp_path)
+def test_a_cart_balances_its_pole(output_of):
+    output = output_of("balanced_cart_pole")
     assert float(re.search(r"formula to (\S+)", output)[1]) < 1e-9
     first, later, last = re.search(r"tilt (\S+) at first, (\S+) after 2 s, (\S+) after", output).groups()
     assert float(first) > 0.3
@@ -248,8 +276,8 @@ def test_a_cart_balances_its_pole(tmp_path):
     assert float(re.search(r"ends (\S+) away", output)[1]) < 1e-12
 
 
-def test_a_duffing_oscillator_is_found_in_a_noisy_recording(tmp_path):
-    output = output_of("duffing_fit", tmp_path)
+def test_a_duffing_oscillator_is_found_in_a_noisy_recording(output_of):
+    output = output_of("duffing_fit")
     for name, true in {"alpha": -1.0, "beta": 1.0, "delta": 0.3}.items():
         value, error = map(float, re.search(rf"{name} += (\S+) \+- (\S+)", output).groups())
         assert abs(value - true) < 3.0 * error < 0.02

@@ -73,6 +73,7 @@ def test_scvi_and_collocation_do_depend_on_their_nodes(sample, compiled):
 # 2. SVI with s Gauss points is Gauss collocation.
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", SOME)
 @pytest.mark.parametrize("s", [1, 2, 4])
 def test_svi_with_as_many_gauss_points_as_its_degree_is_gauss_collocation(sample, compiled, name, s):
@@ -95,6 +96,7 @@ def test_one_more_gauss_point_is_another_map(sample, compiled, name):
 # 3. SVI with Lobatto points and the Lobatto IIIA-IIIB pairs.
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", SOME)
 @pytest.mark.parametrize("s", [2, 3, 4])
 def test_svi_with_as_many_lobatto_points_as_its_degree_is_the_lobatto_pair(sample, compiled, name, s):
@@ -102,6 +104,7 @@ def test_svi_with_as_many_lobatto_points_as_its_degree_is_the_lobatto_pair(sampl
     assert distance(compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s}")), expected) < ROUND_OFF
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", CONSTANT_MASS)
 @pytest.mark.parametrize("s", [1, 2, 3])
 def test_for_constant_mass_one_more_lobatto_point_is_the_next_pair(sample, compiled, name, s):
@@ -157,6 +160,7 @@ def test_svi_of_degree_one_with_one_gauss_point_is_the_midpoint_rule(sample, com
 # 4. With two nodes the shooting methods are the Galerkin one.
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", SOME)
 @pytest.mark.parametrize("quadrature", ["gauss-legendre:1", "gauss-lobatto:2"])
 def test_scvi_of_degree_one_is_svi_of_degree_one(sample, compiled, name, quadrature):
@@ -179,6 +183,7 @@ def test_with_three_nodes_they_are_three_maps(sample, compiled):
 # 5. Spectral collocation is collocation Runge-Kutta.
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
 @pytest.mark.parametrize("s", [1, 2, 3])
 @pytest.mark.parametrize("form", ["position", "phase-space"])
@@ -216,12 +221,14 @@ def reversal_defect(sample, compiled, name, method, h=H):
     return distance(stepper.step(*stepper.step(*state, h, T), -h, T + h), state)
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
 @pytest.mark.parametrize("quadrature", SYMMETRIC)
 def test_svi_with_a_symmetric_quadrature_is_reversible(sample, compiled, name, quadrature):
     assert reversal_defect(sample, compiled, name, SVI(3, quadrature)) < ROUND_OFF
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
 @pytest.mark.parametrize("family", ["gauss", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto"])
 def test_scvi_on_symmetric_abscissae_is_reversible(sample, compiled, name, family):
@@ -247,6 +254,7 @@ def test_the_abscissae_of_nodes_give_the_scvi_on_those_nodes(sample, compiled, n
     assert distance(*maps) < 1e-15
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("s", [2, 3, 4])
 @pytest.mark.parametrize("name", CONSTANT_MASS)
 def test_for_constant_mass_scvi_on_gauss_points_is_svi(sample, compiled, name, s):

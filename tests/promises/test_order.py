@@ -145,6 +145,7 @@ def test_global_error_of_every_low_order_method_on_that_system(compiled, sample,
     assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.25)
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("name", ["kepler", "planar-pendulum"])
 @pytest.mark.parametrize("s", [2, 3, 4, 5])
 def test_the_printed_shooting_equations_have_order_one_less_than_their_degree(compiled, sample, name, s):

@@ -78,8 +78,13 @@ FINITE_DIFFERENCES = 2e-12
 SHOOTING = tuple(SCVI(s) for s in (2, 3, 4, 5, 6))
 ON_SYSTEMS = (
     *(("double-pendulum", method) for method in SYMPLECTIC),
-    *(("kepler", method) for method in (SVI(2, "gauss-legendre:3"), SVI(3, "clenshaw-curtis:5"), *SHOOTING)),
-    *(("charged-particle", method) for method in (SVI(4, "gauss-lobatto:5"), Gauss(3), *SHOOTING)),
+    *(("kepler", method) for method in (SVI(2, "gauss-legendre:3"), SVI(3, "clenshaw-curtis:5"), *SHOOTING[:2])),
+    *(("charged-particle", method) for method in (SVI(4, "gauss-lobatto:5"), Gauss(3), *SHOOTING[:2])),
+    *(
+        pytest.param(name, method, marks=pytest.mark.full)
+        for name in ("kepler", "charged-particle")
+        for method in SHOOTING[2:]
+    ),
 )
 
 

@@ -69,7 +69,7 @@ METHODS = {
 }
 
 
-SHARES = 4
+SHARES = 6
 TUNED = (SVI(3), Gauss(5), SpectralCollocation(4), SCVI(5, variational=False))
 
 
@@ -137,7 +137,7 @@ def tool(name: str) -> str:
 
 
 def share_of(method: str, share: int) -> list[Source]:
-    """Every fourth of the texts of a method: over the shares all of them."""
+    """Every sixth of the texts of a method: over the shares all of them."""
     return [source for source, _ in generated(method).values()][share::SHARES]
 
 
@@ -161,7 +161,7 @@ def test_clang_has_no_warning_either(method, share, tmp_path):
     run([tool("clang"), *C99, "-c", *files], tmp_path)
 
 
-@pytest.mark.covering(2)
+@pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
@@ -259,7 +259,7 @@ def test_text_is_the_same_in_every_process(tmp_path):
             stdout=subprocess.PIPE,
             text=True,
         )
-        for seed in (0, 1, 4242)
+        for seed in (0, 4242)
     ]
     first, *others = [process.communicate()[0] for process in processes]
     assert first.count("\n") == 4 * len(systems()) - 2  # two of the methods do not take the singular Hamiltonian
@@ -437,7 +437,8 @@ def sanitizer(command: Sequence[str], folder: Path) -> None:
         pytest.skip(f"{' '.join(command)} links no program here")
 
 
-BRIEFLY = [name for name in METHODS if name.startswith(("svi-3", "scvi", "sc-3", "gauss", "stoermer"))]
+SANITIZED = ("svi-3", "scvi-2", "scvi-printed", "sc-3", "gauss", "stoermer")
+BRIEFLY = [name for name in METHODS if name.startswith(SANITIZED)]
 
 
 SANITIZERS = pytest.mark.parametrize(

@@ -21,6 +21,7 @@ CASES = {
 }
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("name", CASES)
 def test_compiles_without_a_warning(name, compiler, tmp_path):

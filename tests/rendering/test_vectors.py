@@ -26,6 +26,7 @@ void check(const double *x, double *y)
 """
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("flags", ["-march=native -O2", "-O2"])
 @pytest.mark.parametrize("k", [1, 3, 5, 7])
 def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiers import first_of_each
 
 from scvi_codegen import SCVI, SVI, Gauss, StoermerVerlet, compile_stepper, generate_source, problem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -52,6 +53,12 @@ def test_written_out_and_with_tables_are_the_same(case, monkeypatch):
     )
     assert (ours.q == theirs.q).all()
     assert (ours.p == theirs.p).all()
+
+
+@pytest.mark.parametrize("case", first_of_each(CASES, lambda case: type(CASES[case][0])))
+def test_they_are_to_round_off_where_it_does_fuse(case, monkeypatch):
+    m = CASES[case][0].dimension
+    q, p = [0.9, 0.4][:m], [0.3, 0.8][:m]
     ours, theirs = (each.integrate(q, p, h=0.05, steps=100) for each in both(case, monkeypatch, {}))
     assert np.abs(ours.q - theirs.q).max() < 1e-12
     assert np.abs(ours.p - theirs.p).max() < 1e-12

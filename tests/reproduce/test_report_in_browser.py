@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,12 +29,16 @@ def page() -> str:
     return report_html([outcome for outcome in outcomes if isinstance(outcome, Result)])
 
 
-class TestInABrowser:
-    @pytest.fixture(params=VIEWS, ids="-".join)
-    def view(self, request: pytest.FixtureRequest, browser: Any, page: str, tmp_path: Path) -> Iterator[Any]:
-        with opened(browser, page, tmp_path / "report.html", *request.param) as view:
-            yield view
+@pytest.fixture(scope="module", params=VIEWS, ids="-".join)
+def view(
+    request: pytest.FixtureRequest, browser: Any, page: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Any]:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    with opened(browser, page, path, *request.param) as view:
+        yield view
 
+
+class TestInABrowser:
     def test_it_asks_for_nothing_and_complains_of_nothing(self, view):
         assert_it_asks_for_nothing(view)
 
@@ -73,6 +76,7 @@ class TestInABrowser:
         assert view.evaluate(f"({style})('figure').breakInside") == "avoid"
         assert view.evaluate(f"({style})('.back').display") == "none"
         assert view.evaluate(UNREADABLE) == []
+        view.emulate_media(media="null")
 
 
 def test_dark_is_dark(browser, page):

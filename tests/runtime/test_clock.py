@@ -63,6 +63,7 @@ def test_time_is_that_of_kepler_s_equation(form: str, solver: str) -> None:
     assert np.array_equal(run.tau, 0.1 * np.arange(301)) or np.abs(run.tau - 0.1 * np.arange(301)).max() < 1e-14
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("form", ["L", "K"])
 def test_every_way_to_solve_a_step_gives_the_same_time(form: str, method: str) -> None:

@@ -86,6 +86,7 @@ def test_steps_follow_the_motion(kepler):
     assert far.min() > 8.0 * near.max()
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10])
 @pytest.mark.parametrize("degree", [4, 8])
 def test_the_end_of_a_step_is_as_accurate_as_wanted(tolerance, degree):

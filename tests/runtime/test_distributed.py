@@ -92,7 +92,7 @@ class TestCluster:
 
     def test_a_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: Stepper):
         q, p = states()
-        arguments = {"h": 0.05, "steps": 150_000, "every": 50_000}
+        arguments = {"h": 0.05, "steps": 15_000, "every": 5_000}
         here = kepler.integrate_ensemble(q, p, **arguments)
         pids = [worker.pid for worker in cluster.workers.values()]
         killed: list[int] = []
@@ -139,7 +139,7 @@ class TestCluster:
         q, p = states()
         with pytest.raises(KeyboardInterrupt):
             integrate_ensemble(
-                kepler, q, p, h=0.05, steps=50_000, address=cluster.scheduler_address, blocks=9, progress=interrupt
+                kepler, q, p, h=0.05, steps=10_000, address=cluster.scheduler_address, blocks=9, progress=interrupt
             )
         with distributed.Client(cluster.scheduler_address) as client:
             end = time.monotonic() + 60.0

@@ -64,7 +64,7 @@ def assert_equals_single_runs(
 
 
 class TestEqualsSingleTrajectories:
-    @pytest.mark.covering(2)
+    @pytest.mark.covering
     @pytest.mark.parametrize("kind", KINDS)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
     def test_for_systems_and_methods(self, kind: str, method: Method):

@@ -369,6 +369,7 @@ def test_a_stepper_with_events_is_pickled_and_keeps_them(pendulum):
     assert watched.with_events(()).source == pendulum.source
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize(
     ("name", "method", "events"),

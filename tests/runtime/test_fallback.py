@@ -24,7 +24,9 @@ LONG = 0.2
 """A step of the double pendulum on which sweeps fail now and then, and Newton's iteration does not."""
 
 each_method = pytest.mark.parametrize(
-    "method", [SVI(4), SCVI(2), Gauss(3), SpectralCollocation(2)], ids=lambda method: method.name
+    "method",
+    [SVI(4), Gauss(3), *(pytest.param(method, marks=pytest.mark.full) for method in (SCVI(2), SpectralCollocation(2)))],
+    ids=lambda method: method.name,
 )
 
 

@@ -110,6 +110,7 @@ def test_too_few_points_for_the_pieces_are_warned_of() -> None:
 # Exactness and order.
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
 @pytest.mark.parametrize("turn", [0.1, 1.0, 3.0])
 def test_trigonometric_curves_are_exact_on_the_oscillator(degree: int, turn: float) -> None:
@@ -161,6 +162,7 @@ STRUCTURED = (
 )
 
 
+@pytest.mark.covering
 @pytest.mark.parametrize("method", STRUCTURED, ids=lambda method: method.name)
 @pytest.mark.parametrize("solver", ["newton", "auto"])
 def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> None:
