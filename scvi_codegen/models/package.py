@@ -36,7 +36,15 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
-__all__ = ["CERTIFICATE_FILE", "generate_package", "load_package"]
+__all__ = [
+    "CERTIFICATE_FILE",
+    "INTERFACE_FILE",
+    "generate_package",
+    "load_package",
+    "prefix_of",
+    "record_text",
+    "write_folder",
+]
 
 INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1
@@ -85,8 +93,13 @@ def generate_package(
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
-    prefix = _prefix(target)
-    texts = _texts(model, prefix, solver, embedded, single_file=single_file)
+    prefix = prefix_of(target)
+    write_folder(target, _texts(model, prefix, solver, embedded, single_file=single_file), force=force)
+    return target
+
+
+def write_folder(target: Path, texts: Mapping[str, str], *, force: bool) -> None:
+    """Texts by file name, ``interface.json`` among them, which says what may be overwritten. Raises PackageError."""
     try:
         target.mkdir(parents=True, exist_ok=True)
         stale = _stale(target, texts)
@@ -99,7 +112,6 @@ def generate_package(
             write_atomically(target / name, partial(_write, text))
     except OSError as error:
         raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error
-    return target
 
 
 @takes(folder=PATH)
@@ -140,7 +152,7 @@ def _write(text: str, file: IO[bytes]) -> None:
     file.write(text.encode())
 
 
-def _prefix(folder: Path) -> str:
+def prefix_of(folder: Path) -> str:
     """The name of the folder, fit to begin C names and to be imported."""
     from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # here, because it imports SymPy
 
@@ -340,13 +352,14 @@ def _template(name: str) -> str:
 
 
 def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
-    record = {
-        "format": FORMAT,
-        "interface": json.loads(interface.to_json()),
-        "declarations": source.declarations.split("\n"),
-        "files": {name: _checksum(text.encode()) for name, text in texts.items()},
-    }
-    return json.dumps(record, indent=1) + "\n"
+    described = {"interface": json.loads(interface.to_json()), "declarations": source.declarations.split("\n")}
+    return record_text(texts, **described)
+
+
+def record_text(texts: Mapping[str, str], **described: Any) -> str:
+    """``interface.json`` of files, with what else it describes."""
+    files = {name: _checksum(text.encode()) for name, text in texts.items()}
+    return json.dumps({"format": FORMAT, **described, "files": files}, indent=1) + "\n"
 
 
 def _checksum(data: bytes) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
@@ -22,7 +22,7 @@ from scvi_codegen.rendering.source import Source, included
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = ["render_indexed"]
+__all__ = ["render_indexed", "render_indexed_example"]
 
 Lines: TypeAlias = Callable[[int], list[str]]
 """Of a slot, by its number."""
@@ -61,6 +61,19 @@ def render_indexed(program: IndexedProgram) -> Source:
         declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
         support=tuple((name, support_text(name)) for name in included(code)),
     )
+
+
+def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
+    """``main.c`` and ``Makefile`` that run the integrator from arrays in files beside them.
+
+    Args:
+        prefix: of the C names.
+        start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
+            moving ("p", "velocity" or nothing), run (t, h, steps, every).
+    """
+    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, **start}
+    templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
+    return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
 
 def _sweep_text(program: IndexedProgram) -> SweepText | None:

@@ -12,6 +12,7 @@ from scvi_codegen import verification
 from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, reporting, tell
 from scvi_codegen.errors import PackageError
+from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
 from scvi_codegen.runtime.stepper import Stepper
@@ -62,13 +63,19 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
     """
     folder = Path(name)
     if not folder.is_dir():
-        model = read_model(name, choices)
+        model = _expanded(read_model(name, choices))
         return _certificate(model, model.stepper(solver=solver), solver)
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
         raise PackageError(f"{folder} has no {MODEL_FILE} to say what its C code promises: generate it from a model")
-    return _certificate(read_model(str(folder / MODEL_FILE), choices), load_package(folder), "auto")
+    return _certificate(_expanded(read_model(str(folder / MODEL_FILE), choices)), load_package(folder), "auto")
+
+
+def _expanded(model: Model | IndexedModel) -> Model:
+    if isinstance(model, IndexedModel):
+        raise click.UsageError("certificates are those of systems written out (expand_sums)")
+    return model
 
 
 def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:

@@ -73,7 +73,7 @@ class IndexedSystem:
         self._check_names()
         for term in self.terms:
             if problem := unsupported_part(term.formula):
-                raise SystemDefinitionError(f"in the {self._function} of '{self.name}': {problem}")
+                raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
             _check_form(term, self._velocities, self.time)
         for array in () if self.momenta else self.coordinates:
             if not any(mass.access.array == array for mass in self.masses):
@@ -219,9 +219,14 @@ class IndexedSystem:
         return tuple(found)
 
     def _repr_latex_(self) -> str:
+        return rf"$\displaystyle {self.latex}$"
+
+    @property
+    def latex(self) -> str:
+        """L or H in LaTeX."""
         arguments = ", ".join(array.name for array in self.state)
         terms = " + ".join(map(latex_sum, self.terms)).replace("+ -", "-")
-        return rf"$\displaystyle {self._function[0]}({arguments}) = {terms}$"
+        return rf"{self.function[0]}({arguments}) = {terms}"
 
     @property
     def depends_on_time(self) -> bool:
@@ -235,10 +240,11 @@ class IndexedSystem:
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))
-        return f"{self.name}: {self._function[0]}({arguments}) = {' + '.join(map(str, self.terms))}"
+        return f"{self.name}: {self.function[0]}({arguments}) = {' + '.join(map(str, self.terms))}"
 
     @property
-    def _function(self) -> str:
+    def function(self) -> str:
+        """What it is given by, in a word."""
         return "Hamiltonian" if self.momenta else "Lagrangian"
 
     @property
