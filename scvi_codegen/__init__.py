@@ -116,6 +116,7 @@ _HOMES = {
     "mechanics.lagrangian": ("LagrangianSystem",),
     "runtime.trajectory": ("Trajectory",),
     "verification": ("Certificate", "verify"),
+    "verification.indexed": ("verify_indexed",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

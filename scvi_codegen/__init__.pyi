@@ -120,4 +120,5 @@ from scvi_codegen.tables.spaces import Splines as Splines
 from scvi_codegen.tables.spaces import Trigonometric as Trigonometric
 from scvi_codegen.verification import Certificate as Certificate
 from scvi_codegen.verification import verify as verify
+from scvi_codegen.verification.indexed import verify_indexed as verify_indexed
 from scvi_codegen.version import __version__ as __version__

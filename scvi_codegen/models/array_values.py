@@ -24,8 +24,8 @@ from sympy import Expr
 
 from scvi_codegen.errors import ExpressionError, ModelFileError, StateError, closest
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.on_arrays import on_arrays
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.formulas.vocabulary import NAME_OF
 from scvi_codegen.indices import Array
 from scvi_codegen.models.csv_tables import parse_table
 from scvi_codegen.models.model import real
@@ -103,25 +103,7 @@ def _filled(value: Any, shape: tuple[int, ...], where: str, names: Mapping[str, 
     places = zip(indices, np.indices(shape, dtype=float, sparse=True), strict=True)
     known: dict[Expr, Any] = {symbol(name): number for name, number in (*names.items(), *places)}
     with np.errstate(all="ignore"):
-        return np.array(np.broadcast_to(_value(formula, known), shape), dtype=float)
-
-
-def _value(formula: Expr, known: dict[Expr, Any]) -> Any:
-    """Of a formula at all places, part by part."""
-    if formula in known:
-        return known[formula]
-    if not formula.args:
-        return float(formula)
-    operands = [_value(part, known) for part in formula.args]
-    if formula.is_Pow:
-        return np.power(*(np.asarray(operand, dtype=float) for operand in operands))
-    if formula.is_Add or formula.is_Mul:
-        total = operands[0]
-        for operand in operands[1:]:
-            total = total + operand if formula.is_Add else total * operand
-        return total
-    name = NAME_OF[formula.func]
-    return getattr(np, name.replace("a", "arc", 1) if name.startswith("a") else name)(*operands)
+        return np.array(np.broadcast_to(on_arrays(formula, known), shape), dtype=float)
 
 
 def _from_list(value: list[Any], where: str) -> Numbers:

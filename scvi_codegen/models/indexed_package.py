@@ -20,7 +20,7 @@ from scvi_codegen.kinds import PATH, SWITCH, of, takes
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.package import INTERFACE_FILE, prefix_of, record_text, write_folder
 from scvi_codegen.rendering.indexed import render_indexed_example
-from scvi_codegen.runtime.indexed_interface import read_problem, read_state
+from scvi_codegen.runtime.indexed_interface import read_arrays, read_state
 
 __all__ = ["generate_sums"]
 
@@ -36,7 +36,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
     """
     target = Path(folder)
     source, interface = generate_indexed(model.system, model.method, prefix=prefix_of(target))
-    problem = read_problem(interface, model.q, model.parameters, model.tables)
+    problem = read_arrays(interface, model.q, model.parameters, model.tables)
     arrays = {"q": _flat(problem.state)}
     moving = "p" if model.velocity is None else "velocity"
     if (given := getattr(model, moving)) is not None:

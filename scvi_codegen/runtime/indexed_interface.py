@@ -16,7 +16,7 @@ __all__ = [
     "IndexedInterface",
     "Numbers",
     "RunArrays",
-    "read_problem",
+    "read_arrays",
     "read_state",
 ]
 
@@ -69,7 +69,7 @@ class RunArrays:
     places: dict[str, Places]
 
 
-def read_problem(
+def read_arrays(
     interface: IndexedInterface,
     q: ArrayLike | Mapping[str, ArrayLike],
     parameters: Mapping[str, ArrayLike] | None,

@@ -20,7 +20,7 @@ from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.indexed_interface import (
     IndexedInterface,
     Numbers,
-    read_problem,
+    read_arrays,
     read_state,
 )
 from scvi_codegen.runtime.portions import SLICE_SECONDS
@@ -62,7 +62,7 @@ class IndexedRun:
     ) -> None:
         self.interface, self._binding, self.iterations = interface, binding, 0
         self._options = binding.options(options)
-        given = read_problem(interface, q, parameters, tables)
+        given = read_arrays(interface, q, parameters, tables)
         self.sizes, self._kept = given.sizes, (given.places, given.fields)
         self._problem = self._new_problem(given.numbers)
         self._start(given.state, self._momenta(p, velocity), checked_step(h), checked_number(t, "t"))
@@ -155,6 +155,11 @@ class IndexedRun:
         if self.interface.momenta:
             raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
+
+    @property
+    def carries(self) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+        """What rounding cut off positions and momenta, as ``q`` and ``p``."""
+        return self._arrays(self._numbers["carry_q"]), self._arrays(self._numbers["carry_p"])
 
     @property
     def inverse_masses(self) -> dict[str, Numbers]:
