@@ -83,6 +83,6 @@ def _interface(system: IndexedSystem, method: Method, source: Source) -> Indexed
         defaults=system.defaults,
         field_defaults=system.field_defaults,
         maps=momentum_maps(system),
-        accesses=tuple((access, term.loops) for term in system.terms for _, access in term.slots),
+        accesses=system.accesses,
         depends_on_time=system.depends_on_time,
     )

@@ -130,10 +130,10 @@ def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
 
 
 def _energy(model: IndexedModel, outcome: SumsOutcome) -> str:
-    if model.system.depends_on_time:
+    if why := model.system.changes_energy:
         energy = _energies(outcome)[:, 2]
         change = float(np.abs(energy - energy[0]).max())
-        return f"energy: the {model.system.function} depends on time, it changed by {change:.3g} at most"
+        return f"energy: {why}, it changed by {change:.3g} at most"
     return f"relative energy error: {_energy_error(outcome):.2e} at most"
 
 

@@ -43,7 +43,10 @@ def _text(system: IndexedSystem) -> Iterator[str]:
     if not system.momenta:
         yield "Masses:"
         yield from (f"  {_loops_text(mass.loops, mass.formula)} at {mass.access}" for mass in system.masses)
-    energy = () if system.depends_on_time else ("energy",)
+    if system.forces:
+        yield "Forces beside:"
+        yield from (f"  {force}" for force in system.forces)
+    energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
 

@@ -1,31 +1,39 @@
 """Model files of sums over indices: those of :mod:`scvi_codegen.models.model_file` with arrays.
 
-[system]
-name = "ring"
-coordinates = ["q[N]"]                              # "r[N, 3]", "u[NX, NY]", several arrays
-lagrangian = "sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"
+    [system]
+    name = "ring"
+    coordinates = ["q[N]"]                              # "r[N, 3]", "u[NX, NY]", several arrays
+    lagrangian = "sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"
 
-[sizes]                                             # where no list or file of numbers says them
-N = 1000
+    # dissipation = "sum(i in N, c*q_dot[i]**2/2)"      # Rayleigh's function
 
-[parameters]
-k = 1.0
-"m[N]" = 1.0                                        # an array: as [initial] has them
+    [forces]                                            # on coordinates, at every place or at one; left out: 0
+    # "q[i]" = "-c*q_dot[i]"
+    # "q[0]" = "cos(w*t)"
 
-[tables]                                            # whole numbers; or { file = "bonds.csv" }
-# "bonds[B, 2]" = [[0, 1], [1, 2]]
+    [sizes]                                             # where no list or file of numbers says them
+    N = 1000
 
-[initial]                                           # of several arrays: [initial.q] with a line each
-q = "sin(2*pi*i/N)"                                 # a number, a list, { file = "q.npy" }, a formula: array_values.py
-q_dot = 0.0                                         # or p; left out: 0
+    [parameters]
+    k = 1.0
+    "m[N]" = 1.0                                        # an array: as [initial] has them
 
-[method]
-method = "svi:4"
+    [tables]                                            # whole numbers; or { file = "bonds.csv" }
+    # "bonds[B, 2]" = [[0, 1], [1, 2]]
 
-[run]
-step = 0.1
-span = 100.0                                        # or steps
-every = 10
+    [initial]                                           # of several arrays: [initial.q] with a line each
+    q = "sin(2*pi*i/N)"                                 # a number, a list, { file = "q.npy" }, a formula: array_values.py
+    q_dot = 0.0                                         # or p; left out: 0
+
+    [method]
+    method = "svi:4"
+
+    [run]
+    step = 0.1
+    span = 100.0                                        # or steps
+    every = 10
+
+Hamiltonians, and sections laid over others, are as there.
 """
 
 from __future__ import annotations
@@ -65,14 +73,14 @@ from scvi_codegen.models.sections import (
 __all__ = ["read_indexed"]
 
 KEYS = {
-    "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian"),
+    "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation"),
     "initial": ("q", "p", "q_dot", "t"),
     "run": ("step", "span", "steps", "every"),
 }
-SECTIONS = ("system", "sizes", "parameters", "tables", "initial", "method", "run")
+SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
 OTHERS = {
-    "": ("forces", "inputs"),
-    "system": ("dissipation", "constraints", "inputs", "catalogue", "monitor"),
+    "": ("inputs",),
+    "system": ("constraints", "inputs", "catalogue", "monitor"),
     "run": ("tolerance", "controller"),
 }
 """What other models have."""
@@ -173,6 +181,8 @@ def _read_system(document: Document) -> IndexedSystem:
         "tables": list(document.get("tables", {})),
         "momenta": names_of(section, "momenta") if "momenta" in section else None,
         kind: text_of(section, kind, "[system]"),
+        "forces": {key: text_of(document["forces"], key, "[forces]") for key in document.get("forces", {})},
+        "dissipation": text_of(section, "dissipation", "[system]") if "dissipation" in section else None,
     }
     return in_section("[system]", lambda: IndexedSystem.from_text(**given))
 

@@ -70,7 +70,8 @@ def certificate(name: str, method: str) -> sc.Certificate:
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("name", "method"), [("ring", "svi:3"), ("net", "svi:2"), ("net", "composition:8"), ("waves", "gauss:2")]
+    ("name", "method"),
+    [("ring", "svi:3"), ("net", "svi:2"), ("net", "composition:8"), ("waves", "gauss:2"), ("damped", "svi:2")],
 )
 def test_sound_integrators_pass(name: str, method: str) -> None:
     """Each promise is measured, but for velocities of a Hamiltonian."""
@@ -85,6 +86,7 @@ FAULTS = {
     "a part of a ring one too long": ("ring", "svi:2", r"\*end = change;", "*end = change + 1;"),
     "a force of the other sign": ("net", "svi:2", r"(F\[start_r [^;]*?) \+= ", r"\1 -= "),
     "the other end of a bond": ("net", "svi:2", r"bonds\[index_b \* 2 \+ 0\]", "bonds[index_b * 2 + 1]"),
+    "friction by velocities at the start": ("damped", "svi:2", r"run->p\[i\] \+ kick\)", "run->p[i] + 0.999 * kick)"),
     "energy without masses": ("net", "svi:2", r"0\.5 \* inverse_mass\[i\] \* ", "0.5 * "),
     "positions off at the end": ("ring", "svi:2", r"bent = inverse \* ", "bent = 1.00000001 * inverse * "),
     "what rounding cuts off is lost": ("ring", "svi:2", r"\*carry = rest - \(new_x - sum\);", "*carry = 0.0;"),

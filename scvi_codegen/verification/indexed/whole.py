@@ -14,6 +14,7 @@ from sympy import Expr
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.formulas.on_arrays import on_arrays
+from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop, Place
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
@@ -57,6 +58,9 @@ class WholeStart:
         momenta = {p.name: q.name for q, p in zip(self.system.coordinates, self.system.momenta, strict=False)}
         if name in momenta:
             return self.p[momenta[name]]
+        moving = name.removesuffix(DOT)
+        if moving != name and moving in self.p:
+            return self.p[moving] / _masses(self)[moving]
         return {**self.arrays.state, **self.arrays.fields}[name]
 
     def run(self, h: float | None = None) -> IndexedRun:
@@ -117,6 +121,10 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
         for slot, access in term.slots:
             if slot.name in slopes:
                 np.add.at(found[access.array.name], at.of(access), at.values(slopes[slot.name], term.slots))
+    for force in system.forces:
+        at = _Places(start, force.loops)
+        for access, formula in force.targets:
+            np.add.at(found[access.array.name], at.of(access), at.values(formula, force.slots))
     if system.momenta:
         pairs = list(zip(system.coordinates, system.momenta, strict=True))
         return {q.name: -found[p.name] for q, p in pairs}, {q.name: found[q.name] for q, _ in pairs}
@@ -217,7 +225,7 @@ def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
         return
     walk, where = ROUNDINGS * EPSILON * float(np.sqrt(steps)), f"{steps} steps of {run.h:g}"
     change = abs(run.energy - before[2]) / (abs(before[0]) + abs(before[1]) or 1.0)
-    if not start.system.depends_on_time:
+    if not start.system.changes_energy:
         if start.method.symplectic and run.step_error < RESOLVED:
             promise = f"at {sizes} nothing but rounding changes it"
             yield from checked("energy", promise, partial(Finding, float(change), walk, f"relative, {where}"))
