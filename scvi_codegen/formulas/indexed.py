@@ -360,6 +360,8 @@ class _IndexedParser(_Indices):
         while self.accept(","):
             places.append(self.place())
         self.expect("]")
+        if len(places) == 1 and self.tables.get(array.name) is array and array.axes[-1] == Size("", 1):
+            places.append(Place())  # pins[p] is pins[p, 0]
         if len(places) != len(array.axes):
             self.refuse(f"'{array}' has {len(array.axes)} axes, not {len(places)}", column)
         for place, axis in zip(places, array.axes, strict=True):
@@ -391,7 +393,7 @@ class _IndexedParser(_Indices):
         row, *columns = self.brackets(table, token.column)
         plain = row.index and not row.table and not row.base.number
         if not plain or len(columns) != 1 or columns[0].index or columns[0].base.name:
-            self.refuse("a table is accessed by an index and a whole number, as bonds[b, 0]", token.column)
+            self.refuse("a table is accessed by an index and a whole number, as bonds[b, 0] (pins[p])", token.column)
         return Place(index=row.index, table=table.name, column=columns[0].base.number)
 
     def leaves(self, place: Place, axis: Size) -> str:

@@ -50,7 +50,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     """
     one = one_coordinate(system)
     splitting = splitting_of(one, method)
-    if splitting and (system.velocities or (system.momenta and system.forces)):
+    if splitting and system.velocities:
         raise MethodError(
             f"{method.name} is explicit for forces of positions and time: for those of velocities take an SVI or a "
             "Runge-Kutta method"

@@ -4,7 +4,6 @@
     name = "ring"
     coordinates = ["q[N]"]                              # "r[N, 3]", "u[NX, NY]", several arrays
     lagrangian = "sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"
-
     # dissipation = "sum(i in N, c*q_dot[i]**2/2)"      # Rayleigh's function
 
     [forces]                                            # on coordinates, at every place or at one; left out: 0
@@ -22,7 +21,7 @@
     # "bonds[B, 2]" = [[0, 1], [1, 2]]
 
     [initial]                                           # of several arrays: [initial.q] with a line each
-    q = "sin(2*pi*i/N)"                                 # a number, a list, { file = "q.npy" }, a formula: array_values.py
+    q = "sin(2*pi*i/N)"                                 # a number, a list, { file = "q.npy" }, a formula
     q_dot = 0.0                                         # or p; left out: 0
 
     [method]

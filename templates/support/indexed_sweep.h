@@ -1,5 +1,5 @@
-/* A step of any number of coordinates by sweeps, for constant diagonal masses and forces of position, time and
- * perhaps velocity: that of separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h,
+/* A step of any number of coordinates by sweeps, for constant diagonal masses and forces of position, time and perhaps
+ * velocity: that of separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h,
  * contraction.h, the tables, forces. */
 
 /* The parts of work: positions at the points (velocities behind them), and forces there in this step, the last and the

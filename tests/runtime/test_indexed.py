@@ -431,8 +431,6 @@ def test_forces_of_momenta() -> None:
     run = sc.compile_indexed(system, "gauss:3").integrate(q, p, h=0.1, steps=30)
     other = sc.compile_stepper(sc.expand_sums(system, {"N": 3}), "gauss:3").integrate(q, p, h=0.1, steps=30)
     assert run.q["q"] == pytest.approx(other.q, abs=1e-14)
-    with pytest.raises(sc.MethodError):
-        sc.compile_indexed(system, "stoermer-verlet")
 
 
 def test_friction_damps_as_it_should() -> None:
@@ -449,3 +447,18 @@ def test_friction_damps_as_it_should() -> None:
     w = np.sqrt(1 - c**2 / 4)
     exact = np.exp(-5 * c) * (np.cos(10 * w) + c / (2 * w) * np.sin(10 * w))
     assert run.q["q"][-1] == pytest.approx(exact, abs=1e-12)
+
+
+def test_a_table_of_one_axis() -> None:
+    """Springs at some places only."""
+    pinned = sc.IndexedSystem.from_text(
+        name="pinned",
+        coordinates=["q[N]"],
+        tables=["pins[P]"],
+        lagrangian=f"{KINETIC} - sum(p in P, q[pins[p]]**2/2)",
+    )
+    run = sc.compile_indexed(pinned, "svi:6").integrate(np.ones(4), h=0.1, steps=10, tables={"pins": [1, 3]})
+    assert run.q["q"][-1] == pytest.approx([1, np.cos(1), 1, np.cos(1)], abs=1e-12)
+    written = str(sc.expand_sums(pinned, {"N": 2, "P": 1}, tables={"pins": [1]}).formula)
+    assert "q_1**2" in written
+    assert "q_0**2" not in written

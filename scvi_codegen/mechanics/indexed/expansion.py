@@ -56,7 +56,7 @@ def expand_sums(
     >>> expand_sums(chain, {"N": 2}).formula
     q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
     """
-    given, places = dict(parameters or {}), {name: np.asarray(table) for name, table in (tables or {}).items()}
+    given, places = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}
     for known, named, what in (
         (system.sizes, sizes, "size"),
         ([table.name for table in system.tables], places, "table"),
@@ -78,7 +78,7 @@ def expand_sums(
         if name not in numbers:
             raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
         numbers[name] = number(name, value)
-    written = _Writer(sizes, places, names)
+    written = _Elements(sizes, places, names)
     summands = [term.formula.xreplace(rule) for term in system.terms for _, rule in written.rules(term)]
     acting = written.forces(system.forces)
     coordinates, momenta = (
@@ -96,6 +96,12 @@ def expand_sums(
     if momenta:
         return HamiltonianSystem(**same, momenta=momenta, hamiltonian=Add(*summands))
     return LagrangianSystem(**same, lagrangian=Add(*summands))
+
+
+def _columns(table: ArrayLike) -> NDArray[np.int64]:
+    """A table of one axis has one column."""
+    found = np.asarray(table)
+    return found[:, None] if found.ndim == 1 else found
 
 
 def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
@@ -123,7 +129,7 @@ def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Eleme
 
 
 @dataclass(frozen=True, slots=True)
-class _Writer:
+class _Elements:
     """What an access is at given values of the indices.
 
     Attributes:

@@ -23,7 +23,7 @@ from scvi_codegen.formulas.indexed import IndexedForce, IndexedTerm, parse_array
 from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.kinds import MAPPING, TEXT, TEXTS, of, takes
 
 __all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
@@ -124,7 +124,7 @@ class IndexedSystem:
             momenta: of H, declarations as of the coordinates; by default ``["p_q[N]"]``.
             parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
                 an array, one an element, are given with each run.
-            tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``.
+            tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
             forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` at every place, ``{"q[0]": "cos(t)"}`` at one.
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
 
@@ -139,7 +139,7 @@ class IndexedSystem:
         """
         arrays = tuple(map(parse_array, coordinates))
         conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
-        places = tuple(map(parse_array, tables))
+        places = tuple(map(_table, tables))
         values = {key: number(key, value) for key, value in (parameters or {}).items()}
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
@@ -307,6 +307,12 @@ class IndexedSystem:
         for array in self.coordinates:
             if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                 raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
+
+
+def _table(text: str) -> Array:
+    """Of one axis it has one column."""
+    array = parse_array(text)
+    return array if len(array.axes) > 1 else replace(array, axes=(*array.axes, Size("", 1)))
 
 
 def _momenta(
