@@ -126,6 +126,17 @@ static void last_positions(const run_memory *run, const parts_of_work *parts, co
   }
 }
 
+/* The largest coordinate at the last point: of a step from rest at 0 the only size there is. */
+static double largest_at_end(const lanes *X, long long n)
+{
+  double largest = DBL_MIN;
+  for (long long i = 0; i < n; i++) {
+    const lane_view at = {X[i]};
+    largest = larger(largest, fabs(at.lane[KEPT - 1]));
+  }
+  return largest;
+}
+
 /* Whether all forces are finite. And what the highest coefficient of the forces at the points moves a coordinate by,
  * squared, over what they bend it by: the largest of these, everything as a part of the largest coordinate. */
 static int examine(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest, double *error)
@@ -168,8 +179,7 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
   const lanes t = run->t + run->h * ABSCISSA[0];
-  const double largest = first_positions(run, &parts, &by, n);
-  double size = 0.0, first = 0.0, last = INFINITY, error;
+  double largest = first_positions(run, &parts, &by, n), size = 0.0, first = 0.0, last = INFINITY, error;
   int status = 0;
   improve_velocities(run, &parts, &by, n);
   forces(given, parts.X, t, parts.F, n);
@@ -187,6 +197,8 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   if (status < 0)
     return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
   last_positions(run, &parts, &by, n);
+  if (largest <= DBL_MIN)
+    largest = largest_at_end(parts.X, n);
   improve_velocities(run, &parts, &by, n);
   forces(given, parts.X, t, parts.F, n);
   if (!examine(run, parts.F, &by, n, largest, &error))
