@@ -21,7 +21,7 @@ from scvi_codegen.formulas.grammar import Parser, Token, parsed
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
-__all__ = ["IndexedForce", "IndexedTerm", "parse_array", "parse_force", "parse_indexed"]
+__all__ = ["Bound", "IndexedParser", "IndexedTerm", "parse_array", "parse_indexed", "term_of"]
 
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
@@ -55,24 +55,6 @@ class IndexedTerm:
         return f"sum({', '.join(map(str, named))}, {self.formula})"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedForce:
-    """Forces over loops.
-
-    Attributes:
-        loops, slots: as of :class:`IndexedTerm`, of all formulas.
-        targets: the coordinate that each acts on, and its formula.
-    """
-
-    loops: tuple[Loop, ...]
-    slots: tuple[tuple[Symbol, Access], ...]
-    targets: tuple[tuple[Access, Expr], ...]
-
-    def __str__(self) -> str:
-        loops = f" for {', '.join(map(str, self.loops))}" if self.loops else ""
-        return ", ".join(f"{formula} on {access}" for access, formula in self.targets) + loops
-
-
 def parse_array(text: str) -> Array:
     """A declaration, ``"q[N]"``.
 
@@ -103,7 +85,7 @@ def parse_indexed(
     >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
     ['sum(i in 0..N-2, -k*(q[i+1] - q[i])**2)']
     """
-    parser = _IndexedParser(text, symbols, arrays, tables)
+    parser = IndexedParser(text, symbols, arrays, tables)
     whole = parsed(parser)
     by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
     for placeholder, (loops, formula, column) in parser.sums.items():
@@ -114,50 +96,11 @@ def parse_indexed(
         by_loops.setdefault(loops, []).append(factor * formula)
     by_loops.setdefault((), []).append(whole.xreplace(dict.fromkeys(parser.sums, S.Zero)))
     terms = [(loops, Add(*formulas)) for loops, formulas in by_loops.items()]
-    return tuple(_term(loops, formula, parser.accesses) for loops, formula in terms if formula != 0)
+    return tuple(term_of(loops, formula, parser.accesses) for loops, formula in terms if formula != 0)
 
 
-def parse_force(
-    target: str,
-    text: str,
-    coordinates: Sequence[Array],
-    arrays: Sequence[Array],
-    symbols: Mapping[str, Symbol],
-    tables: Sequence[Array] = (),
-) -> tuple[IndexedForce, ...]:
-    """Read the force on ``q[i]``, every place of an axis, or on a single place, ``q[0]``.
-
-    Args:
-        target: what it acts on.
-        text: its formula, in the indices of the target.
-        coordinates: arrays of the target.
-        arrays, symbols, tables: as of :func:`parse_indexed`.
-
-    Raises:
-        ExpressionError: as :func:`parse_indexed`.
-
-    >>> q, v = parse_array("q[N]"), parse_array("q_dot[N]")
-    >>> [str(force) for force in parse_force("q[i]", "-c*q_dot[i]", [q], [q, v], {"c": symbol("c")})]
-    ['-c*q_dot[i] on q[i] for i in N']
-    """
-    reader = _Target(target, {}, coordinates, ())
-    bounds = reader.read()
-    rows: list[dict[str, Bound]] = [{}]
-    for name, axis in bounds.items():
-        values: list[Bound] = [Loop(index=name, first=Size("", 0), end=axis)] if axis.name else [*range(axis.number)]
-        rows = [{**row, name: value} for row in rows for value in values]
-    found = []
-    for row in rows:
-        place, formula = (_IndexedParser(given, symbols, arrays, tables) for given in (target, text))
-        place.bound, formula.bound = dict(row), dict(row)
-        slot, expression = parsed(place), parsed(formula)
-        loops = tuple(bound for bound in row.values() if isinstance(bound, Loop))
-        term = _term(loops, expression, formula.accesses)
-        found.append(IndexedForce(loops=loops, slots=term.slots, targets=((place.accesses[slot], expression),)))
-    return tuple(found)
-
-
-def _term(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
+def term_of(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
+    """A formula over loops, with those accesses that occur in it."""
     found = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
     return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in found))
 
@@ -234,7 +177,7 @@ class _Declaration(_Indices):
         return size
 
 
-class _IndexedParser(_Indices):
+class IndexedParser(_Indices):
     """Formulas with entries of arrays, and sums."""
 
     def __init__(
@@ -248,6 +191,7 @@ class _IndexedParser(_Indices):
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
 
     def name(self, name: str, column: int) -> Expr:
+        """A name: of a sum, of an entry, or as in every formula."""
         if name == "sum" and self.peek().text == "(":
             return self.summed(column)
         if name in self.arrays:
@@ -283,6 +227,7 @@ class _IndexedParser(_Indices):
         return placeholder
 
     def end_of_sum(self, loops: Sequence[Loop]) -> None:
+        """Its bracket, behind which its indices are free again."""
         for loop in loops:
             del self.bound[loop.index]
         self.close()
@@ -312,6 +257,7 @@ class _IndexedParser(_Indices):
         return Add(*formulas)
 
     def loop(self) -> list[Loop]:
+        """``i in N``; two of a pair."""
         first = self.take_name("an index")
         pair = self.take_name("an index") if self.accept("<") else None
         for token in (first, *([pair] if pair else [])):
@@ -335,6 +281,7 @@ class _IndexedParser(_Indices):
         return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text)]
 
     def check_index(self, token: Token) -> None:
+        """Refuse a name that means something."""
         try:
             check_name(token.text)
         except SystemDefinitionError as error:
@@ -355,6 +302,7 @@ class _IndexedParser(_Indices):
         return slot
 
     def brackets(self, array: Array, column: int) -> tuple[Place, ...]:
+        """The places of an entry, each on its axis."""
         self.expect("[")
         places = [self.place()]
         while self.accept(","):
@@ -370,6 +318,7 @@ class _IndexedParser(_Indices):
         return tuple(places)
 
     def place(self) -> Place:
+        """Where an axis is accessed."""
         token = self.peek()
         if token.kind != "name":
             return Place(base=self.size())
@@ -388,6 +337,7 @@ class _IndexedParser(_Indices):
         return Place(index=token.text, base=Size("", self.offset()))
 
     def entry_of_table(self) -> Place:
+        """``bonds[b, 0]``."""
         token = self.take_name("a table")
         table = self.tables[token.text]
         row, *columns = self.brackets(table, token.column)
@@ -421,29 +371,3 @@ class _IndexedParser(_Indices):
             span, leaves = f"{loop.first}..{last + -beyond}", last + base.number
             return f"{place} is {leaves} at {loop.index} = {last}: end at {loop.index} in {span}, {remedy}"
         return ""
-
-
-class _Target(_IndexedParser):
-    """An entry of an array whose indices run over whole axes."""
-
-    def read(self) -> dict[str, Size]:
-        """The axis of each index."""
-        token = self.take_name("an array of coordinates")
-        if token.text not in self.arrays:
-            known = ", ".join(map(str, self.arrays.values()))
-            self.refuse(f"a force acts on coordinates, {known}, not on '{token.text}'", token.column)
-        array, bounds = self.arrays[token.text], dict[str, Size]()
-        self.expect("[")
-        for number, axis in enumerate(array.axes):
-            if number:
-                self.expect(",")
-            place = self.peek()
-            if place.kind != "name" or place.text in self.sizes:
-                self.size()
-                continue
-            self.check_index(place)
-            if place.text in bounds:
-                self.refuse(f"the index '{place.text}' stands for two axes", place.column)
-            bounds[self.take_name("an index").text] = axis
-        self.expect("]")
-        return bounds

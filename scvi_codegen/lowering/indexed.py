@@ -13,7 +13,8 @@ from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.indexed import IndexedForce, IndexedTerm
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel

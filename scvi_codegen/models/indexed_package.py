@@ -17,8 +17,9 @@ import numpy as np
 
 from scvi_codegen.indexed_compiler import generate_indexed
 from scvi_codegen.kinds import PATH, SWITCH, of, takes
+from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.indexed_model import IndexedModel
-from scvi_codegen.models.package import INTERFACE_FILE, prefix_of, record_text, write_folder
+from scvi_codegen.models.package import prefix_of
 from scvi_codegen.rendering.indexed import render_indexed_example
 from scvi_codegen.runtime.indexed_interface import read_arrays, read_state
 
