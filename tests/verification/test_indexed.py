@@ -103,8 +103,8 @@ FAULTS = {
     "a long loop without its second part": (
         "ring",
         "stoermer-verlet",
-        r"(add_force_0\([\s\S]*?begin < )size_N",
-        r"\1CHUNK",
+        r"(add_force_0\([\s\S]*?begin < size_N; begin = )end",
+        r"\1size_N",
     ),
 }
 QUICK = ("a ring that closes one place off",)
