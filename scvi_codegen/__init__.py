@@ -37,7 +37,8 @@ _HOMES = {
     "runtime.fitting": ("Fit", "fit"),
     "runtime.gradients": ("Gradient",),
     "runtime.indexed_run": ("IndexedRun",),
-    "runtime.indexed_stepper": ("IndexedStepper", "IndexedTrajectory"),
+    "runtime.indexed_stepper": ("IndexedStepper",),
+    "runtime.indexed_trajectory": ("IndexedTrajectory",),
     "runtime.linearised": ("Sensitivity",),
     "mechanics.hamiltonian": ("HamiltonianSystem", "hamiltonian_of", "lagrangian_of"),
     "mechanics.reparametrisation": ("reparametrise",),
@@ -87,7 +88,8 @@ _HOMES = {
     "mechanics.indexed.expansion": ("expand_sums",),
     "mechanics.indexed.system": ("IndexedSystem",),
     "models.model": ("Model",),
-    "models.model_file": ("load_model", "save_model"),
+    "models.indexed_model": ("IndexedModel",),
+    "models.model_file": ("load_indexed_model", "load_model", "save_model"),
     "advice.motion": ("Motion", "solve_motion"),
     "tables.nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),
     "models.package": ("generate_package", "load_package"),
@@ -95,6 +97,7 @@ _HOMES = {
     "pictures.conserved": ("plot_energy", "plot_momentum_maps"),
     "pictures.overview": ("plot_trajectory",),
     "pictures.paths": ("plot_motion", "plot_phase"),
+    "pictures.arrays": ("plot_arrays",),
     "pictures.section": ("plot_section",),
     "models.problems": ("PROBLEMS", "problem"),
     "tables.quadrature": (
@@ -118,6 +121,7 @@ _HOMES = {
     "mechanics.lagrangian": ("LagrangianSystem",),
     "runtime.trajectory": ("Trajectory",),
     "verification": ("Certificate", "verify"),
+    "verification.indexed": ("verify_indexed",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -71,7 +71,9 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
+from scvi_codegen.models.indexed_model import IndexedModel as IndexedModel
 from scvi_codegen.models.model import Model as Model
+from scvi_codegen.models.model_file import load_indexed_model as load_indexed_model
 from scvi_codegen.models.model_file import load_model as load_model
 from scvi_codegen.models.model_file import save_model as save_model
 from scvi_codegen.models.package import generate_package as generate_package
@@ -81,6 +83,7 @@ from scvi_codegen.models.problems import problem as problem
 from scvi_codegen.native.options import SolverOptions as SolverOptions
 from scvi_codegen.pictures.animation import Film as Film
 from scvi_codegen.pictures.animation import animate as animate
+from scvi_codegen.pictures.arrays import plot_arrays as plot_arrays
 from scvi_codegen.pictures.conserved import plot_energy as plot_energy
 from scvi_codegen.pictures.conserved import plot_momentum_maps as plot_momentum_maps
 from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
@@ -101,7 +104,7 @@ from scvi_codegen.runtime.fitting import fit as fit
 from scvi_codegen.runtime.gradients import Gradient as Gradient
 from scvi_codegen.runtime.indexed_run import IndexedRun as IndexedRun
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper as IndexedStepper
-from scvi_codegen.runtime.indexed_stepper import IndexedTrajectory as IndexedTrajectory
+from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory as IndexedTrajectory
 from scvi_codegen.runtime.linearised import Sensitivity as Sensitivity
 from scvi_codegen.runtime.periodic import periodic_orbit as periodic_orbit
 from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit as PeriodicOrbit
@@ -124,4 +127,5 @@ from scvi_codegen.tables.spaces import Splines as Splines
 from scvi_codegen.tables.spaces import Trigonometric as Trigonometric
 from scvi_codegen.verification import Certificate as Certificate
 from scvi_codegen.verification import verify as verify
+from scvi_codegen.verification.indexed import verify_indexed as verify_indexed
 from scvi_codegen.version import __version__ as __version__

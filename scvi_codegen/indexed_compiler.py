@@ -25,7 +25,7 @@ from scvi_codegen.rendering.text_cache import remembered_text
 from scvi_codegen.runtime.indexed_interface import IndexedInterface
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 
-__all__ = ["compile_indexed"]
+__all__ = ["compile_indexed", "generate_indexed"]
 
 
 @takes(system=INDEXED, flags=TEXTS, prefix=TEXT)
@@ -49,6 +49,13 @@ def compile_indexed(
         BuildError: if there is no C compiler.
         MethodError: for a method without such sweeps.
     """
+    return IndexedStepper(*generate_indexed(system, method, prefix=prefix), flags=flags)
+
+
+def generate_indexed(
+    system: IndexedSystem, method: Method | str, *, prefix: str | None = None
+) -> tuple[Source, IndexedInterface]:
+    """The C text, and what a caller must know of it; arguments and errors as of :func:`compile_indexed`."""
     one = one_coordinate(system)
     chosen = as_method(method, one)
     name = c_identifier(prefix or f"{system.name}_{chosen.name}")
@@ -58,7 +65,7 @@ def compile_indexed(
             return render_indexed(lower_indexed(system, chosen, name)).to_json()
 
     source = Source.from_json(remembered_text((*system.key(), *chosen.key(), name, "indexed"), text))
-    return IndexedStepper(source, _interface(system, chosen, source), flags=flags)
+    return source, _interface(system, chosen, source)
 
 
 def _interface(system: IndexedSystem, method: Method, source: Source) -> IndexedInterface:
@@ -76,6 +83,6 @@ def _interface(system: IndexedSystem, method: Method, source: Source) -> Indexed
         defaults=system.defaults,
         field_defaults=system.field_defaults,
         maps=momentum_maps(system),
-        accesses=tuple((access, term.loops) for term in system.terms for _, access in term.slots),
+        accesses=system.accesses,
         depends_on_time=system.depends_on_time,
     )

@@ -30,6 +30,7 @@ Examples:
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
   scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
   scvi-codegen verify mine_svi                         measure whether it keeps what it promises
+  scvi-codegen run ring.toml --size N=10000            a model of sums over indices, of any size
 
 With --json a command prints one JSON document, with --quiet nothing but errors, warnings and files asked for.
 

@@ -16,8 +16,9 @@ from click.shell_completion import CompletionItem
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.reparametrisation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
+from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import catalogue_model, load_model
+from scvi_codegen.models.model_file import catalogue_model, read_model_file
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 __all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "Choices", "complete_model", "model_arguments", "read_model"]
@@ -58,6 +59,7 @@ class Choices:
     monitor: str | None = None
     controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
+    size: tuple[tuple[str, int], ...] | None = None
 
     def sections(self) -> dict[str, dict[str, Any]]:
         """The same as sections of a model file."""
@@ -68,6 +70,7 @@ class Choices:
             "run": {name: getattr(self, name) for name in ("step", "span", "steps", "every", "controller")},
             "parameters": dict(self.parameter),
             "inputs": dict(self.inputs or ()),
+            "sizes": dict(self.size or ()),
         }
         given = {
             name: {key: _plain(x) for key, x in section.items() if x is not None} for name, section in named.items()
@@ -110,6 +113,13 @@ def _assignments(
             raise click.BadParameter(f"'{text}' is not of the form NAME=VALUE, as in g=9.81")
         result.append((name, value))
     return tuple(result)
+
+
+def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+    for name, value in (found := _assignments(context, parameter, values)):
+        if not value.is_integer():
+            raise click.BadParameter(f"the size {name} is a whole number, not {value:g}")
+    return tuple((name, int(value)) for name, value in found)
 
 
 def _input_files(
@@ -201,6 +211,13 @@ STATE_OPTIONS = (
         help="Values of an input: columns t and value of a .csv or .npz file, between them constant, linear (so unless "
         "said) or cubic; may be repeated.",
     ),
+    _option(
+        "--size",
+        multiple=True,
+        metavar="NAME=N",
+        callback=_sizes,
+        help="Size of the arrays of a model of sums over indices, as N=1000; may be repeated.",
+    ),
     _option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
     _option("--velocity", metavar="V1,V2,..", callback=_numbers, help="Initial velocities, instead of momenta."),
@@ -260,7 +277,7 @@ def _check_method(choices: Choices) -> None:
             )
 
 
-def read_model(name: str, choices: Choices) -> Model:
+def read_model(name: str, choices: Choices) -> Model | IndexedModel:
     """The model of a file or of the catalogue, with the choices of the command line laid over it.
 
     Raises:
@@ -274,7 +291,7 @@ def read_model(name: str, choices: Choices) -> Model:
     _check_method(choices)
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
-        return load_model(path, choices.sections())
+        return read_model_file(path, choices.sections())
     if name.partition(":")[0] not in PROBLEMS:
         try:
             problem(name)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 
-__all__ = ["check_memory", "check_room", "usable_memory"]
+__all__ = ["check_memory", "check_room", "check_states", "usable_memory"]
 
 COPIES = 2
 """Kept in pieces, then joined and summed up."""
@@ -33,14 +34,23 @@ def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
     Raises:
         StateError: as :func:`check_memory`.
     """
-    kept = steps // model.every + 1
-    each = 16 * len(model.q) * trajectories + 12  # q and p of each; time and iterations
+    folder = "write them into a folder as they come (-o NAME.run)"
+    check_states(len(model.q), steps, model.every, trajectories, ways=[folder] if trajectories == 1 else [])
+
+
+def check_states(m: int, steps: int, every: int, trajectories: int = 1, *, ways: Sequence[str] = ()) -> None:
+    """The same for states of m coordinates, with ways to do without memory.
+
+    Raises:
+        StateError: as :func:`check_memory`.
+    """
+    kept = steps // every + 1
+    each = 16 * m * trajectories + 12  # q and p of each; time and iterations
     room = usable_memory() / (COPIES * each)
     if kept <= room:
         return
     states = f"{kept} states" if trajectories == 1 else f"{kept} states of each of {trajectories} trajectories"
-    ways = [f"keep fewer (--every {-(-steps // int(room - 1))})"] if room >= 2 else []
-    ways += ["write them into a folder as they come (-o NAME.run)"] if trajectories == 1 else []
+    ways = [*([f"keep fewer (--every {-(-steps // int(room - 1))})"] if room >= 2 else []), *ways]
     needed = f"{COPIES * each * kept / 1e9:.3g} GB of memory"
     raise StateError(f"{states} need {needed}: {' or '.join(ways or ['run fewer'])}")
 

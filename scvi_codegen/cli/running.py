@@ -21,6 +21,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, unwarned
 from scvi_codegen.runtime.driven import with_end
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
+from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.longest_step import too_wrong
 from scvi_codegen.runtime.observation import Observation
@@ -35,6 +36,7 @@ __all__ = [
     "integrate_model",
     "known_at_end",
     "summary",
+    "worst_step",
 ]
 
 PORTION_SECONDS = 0.2
@@ -258,7 +260,7 @@ def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory) -> Iterat
     yield from momentum_report(trajectory)
 
 
-def worst_step(trajectory: Trajectory | DrivenTrajectory) -> Iterator[str]:
+def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) -> Iterator[str]:
     """How well the worst step was resolved."""
     if math.isnan(trajectory.step_error):
         yield "worst step: its error is not known, nothing tells it here"

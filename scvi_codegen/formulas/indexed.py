@@ -21,7 +21,7 @@ from scvi_codegen.formulas.grammar import Parser, Token, parsed
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
-__all__ = ["IndexedTerm", "parse_array", "parse_indexed"]
+__all__ = ["Bound", "IndexedParser", "IndexedTerm", "parse_array", "parse_indexed", "term_of"]
 
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
@@ -85,7 +85,7 @@ def parse_indexed(
     >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
     ['sum(i in 0..N-2, -k*(q[i+1] - q[i])**2)']
     """
-    parser = _IndexedParser(text, symbols, arrays, tables)
+    parser = IndexedParser(text, symbols, arrays, tables)
     whole = parsed(parser)
     by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
     for placeholder, (loops, formula, column) in parser.sums.items():
@@ -96,10 +96,11 @@ def parse_indexed(
         by_loops.setdefault(loops, []).append(factor * formula)
     by_loops.setdefault((), []).append(whole.xreplace(dict.fromkeys(parser.sums, S.Zero)))
     terms = [(loops, Add(*formulas)) for loops, formulas in by_loops.items()]
-    return tuple(_term(loops, formula, parser.accesses) for loops, formula in terms if formula != 0)
+    return tuple(term_of(loops, formula, parser.accesses) for loops, formula in terms if formula != 0)
 
 
-def _term(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
+def term_of(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
+    """A formula over loops, with those accesses that occur in it."""
     found = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
     return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in found))
 
@@ -176,7 +177,9 @@ class _Declaration(_Indices):
         return size
 
 
-class _IndexedParser(_Indices):
+class IndexedParser(_Indices):
+    """Formulas with entries of arrays, and sums."""
+
     def __init__(
         self, text: str, symbols: Mapping[str, Symbol], arrays: Sequence[Array], tables: Sequence[Array]
     ) -> None:
@@ -188,6 +191,7 @@ class _IndexedParser(_Indices):
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
 
     def name(self, name: str, column: int) -> Expr:
+        """A name: of a sum, of an entry, or as in every formula."""
         if name == "sum" and self.peek().text == "(":
             return self.summed(column)
         if name in self.arrays:
@@ -223,6 +227,7 @@ class _IndexedParser(_Indices):
         return placeholder
 
     def end_of_sum(self, loops: Sequence[Loop]) -> None:
+        """Its bracket, behind which its indices are free again."""
         for loop in loops:
             del self.bound[loop.index]
         self.close()
@@ -252,6 +257,7 @@ class _IndexedParser(_Indices):
         return Add(*formulas)
 
     def loop(self) -> list[Loop]:
+        """``i in N``; two of a pair."""
         first = self.take_name("an index")
         pair = self.take_name("an index") if self.accept("<") else None
         for token in (first, *([pair] if pair else [])):
@@ -275,6 +281,7 @@ class _IndexedParser(_Indices):
         return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text)]
 
     def check_index(self, token: Token) -> None:
+        """Refuse a name that means something."""
         try:
             check_name(token.text)
         except SystemDefinitionError as error:
@@ -295,11 +302,14 @@ class _IndexedParser(_Indices):
         return slot
 
     def brackets(self, array: Array, column: int) -> tuple[Place, ...]:
+        """The places of an entry, each on its axis."""
         self.expect("[")
         places = [self.place()]
         while self.accept(","):
             places.append(self.place())
         self.expect("]")
+        if len(places) == 1 and self.tables.get(array.name) is array and array.axes[-1] == Size("", 1):
+            places.append(Place())  # pins[p] is pins[p, 0]
         if len(places) != len(array.axes):
             self.refuse(f"'{array}' has {len(array.axes)} axes, not {len(places)}", column)
         for place, axis in zip(places, array.axes, strict=True):
@@ -308,6 +318,7 @@ class _IndexedParser(_Indices):
         return tuple(places)
 
     def place(self) -> Place:
+        """Where an axis is accessed."""
         token = self.peek()
         if token.kind != "name":
             return Place(base=self.size())
@@ -326,12 +337,13 @@ class _IndexedParser(_Indices):
         return Place(index=token.text, base=Size("", self.offset()))
 
     def entry_of_table(self) -> Place:
+        """``bonds[b, 0]``."""
         token = self.take_name("a table")
         table = self.tables[token.text]
         row, *columns = self.brackets(table, token.column)
         plain = row.index and not row.table and not row.base.number
         if not plain or len(columns) != 1 or columns[0].index or columns[0].base.name:
-            self.refuse("a table is accessed by an index and a whole number, as bonds[b, 0]", token.column)
+            self.refuse("a table is accessed by an index and a whole number, as bonds[b, 0] (pins[p])", token.column)
         return Place(index=row.index, table=table.name, column=columns[0].base.number)
 
     def leaves(self, place: Place, axis: Size) -> str:

@@ -8,7 +8,7 @@ from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop, Place
 
-__all__ = ["latex_sum"]
+__all__ = ["latex_entry", "latex_sum", "latex_sums"]
 
 
 def latex_sum(term: IndexedTerm) -> str:
@@ -19,10 +19,15 @@ def latex_sum(term: IndexedTerm) -> str:
     >>> print(latex_sum(term))
     \sum_{i=0}^{N-2} \left(\frac{\left(q_{i+1} - q_{i}\right)^{2}}{2}\right)
     """
-    formula = latex(term.formula, symbol_names={slot: _entry(access) for slot, access in term.slots})
+    formula = latex(term.formula, symbol_names={slot: latex_entry(access) for slot, access in term.slots})
+    sums = latex_sums(term)
+    return f"{sums} \\left({formula}\\right)" if sums else str(formula)
+
+
+def latex_sums(term: IndexedTerm) -> str:
+    """Its sums alone."""
     pairs = {loop.behind for loop in term.loops}
-    sums = [_sum(loop) for loop in term.loops if loop.index not in pairs]
-    return f"{' '.join(sums)} \\left({formula}\\right)" if sums else str(formula)
+    return " ".join(_sum(loop) for loop in term.loops if loop.index not in pairs)
 
 
 def _sum(loop: Loop) -> str:
@@ -33,7 +38,8 @@ def _sum(loop: Loop) -> str:
     return rf"\sum_{{{loop.index}={loop.first}}}^{{{loop.end + -1}}}"
 
 
-def _entry(access: Access) -> str:
+def latex_entry(access: Access) -> str:
+    """An entry of an array, its places as indices."""
     name = access.array.name
     letter = rf"\dot{{{_letter(name.removesuffix(DOT))}}}" if name.endswith(DOT) else _letter(name)
     return f"{letter}_{{{', '.join(map(_place, access.places))}}}"

@@ -18,16 +18,18 @@ class LoopedKernel:
     Attributes:
         text: what is summed, for people.
         loops: outermost first.
-        slots: the coordinates that are the kernel's arguments u.
+        slots: the coordinates (for forces, velocities too) that are the kernel's arguments u.
+        targets: what each value is added to; of a potential the slots.
         given: the entries of arrays that are its last parameters, behind those that are numbers.
-        kernel: of a potential: a value a slot, what is added to the force there (of a momentum: to the velocity); of a
-            mass: one value, added to that of the only slot.
+        kernel: of a potential or a force: a value a target, what is added to the force there (of a momentum: to the
+            velocity); of a mass: one value, added to that of the only target.
         scalar: of a potential: L itself.
     """
 
     text: str
     loops: tuple[Loop, ...]
     slots: tuple[Access, ...]
+    targets: tuple[Access, ...]
     given: tuple[Access, ...]
     kernel: Kernel
     scalar: Kernel | None = None
@@ -43,6 +45,7 @@ class IndexedProgram:
         sizes: names of the sizes of arrays.
         coordinates, fields, tables: arrays.
         momenta: of a Hamiltonian, behind the coordinates in the state.
+        velocities: on which forces depend, behind the coordinates at the points.
         parameter_names, parameter_defaults: of the numbers.
         forces, masses: loops.
         sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
@@ -56,6 +59,7 @@ class IndexedProgram:
     sizes: tuple[str, ...]
     coordinates: tuple[Array, ...]
     momenta: tuple[Array, ...]
+    velocities: tuple[Array, ...]
     fields: tuple[Array, ...]
     tables: tuple[Array, ...]
     parameter_names: tuple[str, ...]

@@ -37,6 +37,7 @@ class SeparableSweep(Sweep):
         guess: from the forces of former steps to sum_j product[n][j] F_j.
         force: F at (q, t).
         mass: m (no arguments).
+        velocity: (lanes, lanes) V_n = v0 + h sum_j velocity[n][j] F_j / m, where forces depend on velocities.
     """
 
     points: int
@@ -49,6 +50,7 @@ class SeparableSweep(Sweep):
     guess: GuessTables
     force: Kernel
     mass: Kernel
+    velocity: NumberTable = ()
 
     mass_entries: tuple[tuple[int, int], ...] = ()
 
@@ -69,6 +71,8 @@ class SeparableSweep(Sweep):
         yield SweepTable("PRODUCT", self.product, in_two_parts=True)
         yield SweepTable("POINT_END_POSITION", self.end_position, in_two_parts=True)
         yield SweepTable("POINT_END_MOMENTUM", self.end_momentum, in_two_parts=True)
+        if self.velocity:
+            yield SweepTable("VELOCITY", self.velocity)
         yield from self.guess.tables
 
     @property

@@ -14,13 +14,16 @@ from sympy import Expr, S, Symbol
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.program import comment_text, notes_of
+from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.lowering.solvers.separable import separable_sweep
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.system import IndexedSystem, MassTerm
@@ -48,8 +51,15 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     """
     one = one_coordinate(system)
     splitting = splitting_of(one, method)
-    forces = tuple(_force(system, term, number) for number, term in enumerate(system.potentials))
-    sweep = None if splitting else _sweep(one, method)
+    if splitting and system.velocities:
+        raise MethodError(
+            f"{method.name} is explicit for forces of positions and time: for those of velocities take an SVI or a "
+            "Runge-Kutta method"
+        )
+    kernels = [_force(system, term, number) for number, term in enumerate(system.potentials)]
+    kernels += [_pushing(system, force, number) for number, force in enumerate(system.forces, len(kernels))]
+    forces = tuple(kernels)
+    sweep = None if splitting else _sweep(one, method, velocities=bool(system.velocities))
     return IndexedProgram(
         prefix=prefix,
         title=comment_text(f"{system.name}: {method.title}"),
@@ -58,6 +68,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
         sizes=system.sizes,
         coordinates=system.coordinates,
         momenta=system.momenta,
+        velocities=system.velocities,
         fields=system.fields,
         tables=system.tables,
         parameter_names=tuple(parameter.name for parameter in system.parameters),
@@ -69,8 +80,9 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     )
 
 
-def _sweep(one: MechanicalSystem, method: Method) -> SeparableSweep | HamiltonianSweep:
-    found = sweep_of(one, discretise(one, method))
+def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> SeparableSweep | HamiltonianSweep:
+    stages = discretise(one, method)
+    found = separable_sweep(StepProblem(one, stages.shape), velocities=True) if velocities else sweep_of(one, stages)
     if isinstance(found, SeparableSweep | HamiltonianSweep):
         return found
     explicit = "" if one.auxiliaries else ", Stoermer-Verlet or a composition"
@@ -90,6 +102,7 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
         text=comment_text(str(term)),
         loops=term.loops,
         slots=tuple(arrays[slot] for slot in u),
+        targets=tuple(arrays[slot] for slot in u),
         given=_given(term.slots, u),
         kernel=_kernel(system, f"force_{number}", values, term.slots, u, "Derivatives by its coordinates."),
     )
@@ -97,11 +110,27 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
     return replace(looped, scalar=scalar)
 
 
+def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedKernel:
+    """Forces beside L or H."""
+    moving = (*system.state, *system.velocities)
+    u = [slot for slot, access in force.slots if access.array in moving]
+    values = [formula for _, formula in force.targets]
+    return LoopedKernel(
+        text=comment_text(f"forces {force}"),
+        loops=force.loops,
+        slots=tuple(access for slot, access in force.slots if slot in u),
+        targets=tuple(access for access, _ in force.targets),
+        given=_given(force.slots, u),
+        kernel=_kernel(system, f"force_{number}", values, force.slots, u, "Forces."),
+    )
+
+
 def _mass(system: IndexedSystem, term: MassTerm, number: int) -> LoopedKernel:
     return LoopedKernel(
         text=comment_text(f"mass of {term.access}"),
         loops=term.loops,
-        slots=(term.access,),
+        slots=(),
+        targets=(term.access,),
         given=_given(term.slots, ()),
         kernel=_kernel(system, f"mass_{number}", [term.formula], term.slots, (), "A mass."),
     )

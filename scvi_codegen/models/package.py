@@ -13,21 +13,18 @@ The folder's name begins every C name. Importing it compiles the C text once, as
 
 from __future__ import annotations
 
-import hashlib
 import json
 import keyword
 import os
-import re
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from string import Template
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
-from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.kinds import PATH, SWITCH, TEXT, Kind, takes
+from scvi_codegen.models.folders import CERTIFICATE_FILE, FORMAT, INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -36,11 +33,8 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
-__all__ = ["CERTIFICATE_FILE", "generate_package", "load_package"]
+__all__ = ["CERTIFICATE_FILE", "generate_package", "load_package", "prefix_of"]
 
-INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
-FORMAT = 1
-FILE_NAME = re.compile(r"(support/)?[\w.]+")
 OUTPUTS = 20
 COMPARED = 1e-9
 """Tolerance of steps that choose their length beside an example of steps that do not."""
@@ -85,20 +79,8 @@ def generate_package(
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
-    prefix = _prefix(target)
-    texts = _texts(model, prefix, solver, embedded, single_file=single_file)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        stale = _stale(target, texts)
-        if not force:
-            _refuse_to_lose(target, texts, stale)
-        for name in stale:
-            (target / name).unlink(missing_ok=True)
-        for name, text in texts.items():
-            (target / name).parent.mkdir(exist_ok=True)
-            write_atomically(target / name, partial(_write, text))
-    except OSError as error:
-        raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error
+    prefix = prefix_of(target)
+    write_folder(target, _texts(model, prefix, solver, embedded, single_file=single_file), force=force)
     return target
 
 
@@ -136,11 +118,7 @@ def _read(file: Path) -> str:
     return file.read_text(encoding="utf-8")
 
 
-def _write(text: str, file: IO[bytes]) -> None:
-    file.write(text.encode())
-
-
-def _prefix(folder: Path) -> str:
+def prefix_of(folder: Path) -> str:
     """The name of the folder, fit to begin C names and to be imported."""
     from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # here, because it imports SymPy
 
@@ -340,55 +318,5 @@ def _template(name: str) -> str:
 
 
 def _interface_text(source: Source, interface: Interface, texts: Mapping[str, str]) -> str:
-    record = {
-        "format": FORMAT,
-        "interface": json.loads(interface.to_json()),
-        "declarations": source.declarations.split("\n"),
-        "files": {name: _checksum(text.encode()) for name, text in texts.items()},
-    }
-    return json.dumps(record, indent=1) + "\n"
-
-
-def _checksum(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
-def _stale(folder: Path, texts: Mapping[str, str]) -> list[str]:
-    """Files of the integrator that is there which this one has not; its certificate, unless the code is the same."""
-    known = _recorded(folder)
-    if known is None:
-        return []
-    same = all(known.get(name) == _checksum(text.encode()) for name, text in texts.items() if name != INTERFACE_FILE)
-    return [
-        *([] if same else [CERTIFICATE_FILE]),
-        *(name for name in known if name not in texts and FILE_NAME.fullmatch(name)),
-    ]
-
-
-def _refuse_to_lose(folder: Path, texts: Mapping[str, str], stale: Sequence[str]) -> None:
-    """Raise :class:`PackageError` if a file to be lost exists and was neither written by us nor is the same."""
-    known = _recorded(folder)
-    for name, text in ({name: "" for name in stale if name != CERTIFICATE_FILE} | dict(texts)).items():
-        try:
-            found = _checksum((folder / name).read_bytes())
-        except FileNotFoundError:
-            continue
-        if name == INTERFACE_FILE:
-            ours = known is not None
-        else:
-            ours = found in (_checksum(text.encode()), (known or {}).get(name))
-        if not ours:
-            raise PackageError(
-                f"{folder / name} was edited, or not written by this program: move it away, choose another folder, "
-                "or overwrite it with --force (from Python: force=True)"
-            )
-
-
-def _recorded(folder: Path) -> dict[str, str] | None:
-    """Checksums by file name from ``interface.json``, or ``None`` if that is missing or not ours."""
-    try:
-        record = json.loads((folder / INTERFACE_FILE).read_text(encoding="utf-8"))
-        files = record["files"] if isinstance(record["format"], int) else None
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
-        return None
-    return files if isinstance(files, dict) else None
+    described = {"interface": json.loads(interface.to_json()), "declarations": source.declarations.split("\n")}
+    return record_text(texts, **described)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias
 
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
@@ -22,7 +22,7 @@ from scvi_codegen.rendering.source import Source, included
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = ["render_indexed"]
+__all__ = ["render_indexed", "render_indexed_example"]
 
 Lines: TypeAlias = Callable[[int], list[str]]
 """Of a slot, by its number."""
@@ -31,7 +31,8 @@ Lines: TypeAlias = Callable[[int], list[str]]
 def render_indexed(program: IndexedProgram) -> Source:
     """Header and source of a program. Equal programs give equal bytes."""
     environment = template_environment()
-    scalars = [each.kernel for each in program.masses] + [cast(Kernel, each.scalar) for each in program.forces]
+    terms = [(each, each.scalar) for each in program.forces if each.scalar]
+    scalars = [each.kernel for each in program.masses] + [scalar for _, scalar in terms]
     if program.splitting:
         scalars += [each.kernel for each in program.forces]
     context = {
@@ -41,10 +42,10 @@ def render_indexed(program: IndexedProgram) -> Source:
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
         "forces": [_force_text(program, each) for each in program.forces],
-        "energies": [_energy_text(program, each) for each in program.forces],
+        "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in program.masses],
         "force_names": [each.kernel.name for each in program.forces],
-        "energy_names": [cast(Kernel, each.scalar).name for each in program.forces],
+        "energy_names": [scalar.name for _, scalar in terms],
         "mass_names": [each.kernel.name for each in program.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
         "inverse_roots": _inverse_roots(scalars),
@@ -61,6 +62,19 @@ def render_indexed(program: IndexedProgram) -> Source:
         declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
         support=tuple((name, support_text(name)) for name in included(code)),
     )
+
+
+def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
+    """``main.c`` and ``Makefile`` that run the integrator from arrays in files beside them.
+
+    Args:
+        prefix: of the C names.
+        start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
+            moving ("p", "velocity" or nothing), run (t, h, steps, every).
+    """
+    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, **start}
+    templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
+    return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
 
 def _sweep_text(program: IndexedProgram) -> SweepText | None:
@@ -80,9 +94,9 @@ def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:
 
 
 def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
-    """Where each array begins in the state: coordinates, then momenta of a Hamiltonian."""
+    """Where each array begins in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
     sizes: list[str] = []
-    for array in (*program.coordinates, *program.momenta):
+    for array in (*program.coordinates, *program.momenta, *program.velocities):
         yield array.name, " + ".join(sizes) or "0"
         sizes.append(_product(array))
 
@@ -101,8 +115,10 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     """A function that adds to the forces; of an explicit method so many times the forces."""
     explicit = program.sweep is None
     nest = _Nest(program, looped, "lanes", "X", chunked=explicit and bool(looped.loops))
-    slots = range(len(looped.slots))
-    targets = [f"F[{nest.place_of(k)}]" if nest.is_innermost(k) else f"sum_{k}" for k in slots]
+    slots = range(len(looped.targets))
+    places = [nest.place_of(target) for target in looped.targets]
+    inner = [nest.is_innermost(target) for target in looped.targets]
+    targets = [f"F[{places[k]}]" if inner[k] else f"sum_{k}" for k in slots]
     call = f"{looped.kernel.name}(u, t, parameters, value);"
     if nest.chunked:
         here = f"[index_{looped.loops[-1].index} - begin]"
@@ -115,18 +131,17 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
         prepare=lambda k: [f"lanes sum_{k} = zero;"],
         innermost=innermost,
         behind=behind,
-        finish=lambda k: [f"F[{nest.place_of(k)}] += sum_{k};"],
+        finish=lambda k: [f"F[{places[k]}] += sum_{k};"],
     )
-    zero = ["const lanes zero = {0};"] if any(not nest.is_innermost(k) for k in slots) else []
+    zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
     arguments = ["const problem *given", "const lanes *restrict X", "times t", *factor, "lanes *restrict F"]
-    values = f"lanes value[{len(looped.slots)}]"
+    values = f"lanes value[{len(looped.targets)}]"
     return nest.function(f"static void add_{looped.kernel.name}", arguments, [*zero, *lines], values=values)
 
 
-def _energy_text(program: IndexedProgram, looped: LoopedKernel) -> str:
+def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) -> str:
     """A function that gives the sum of the terms."""
-    kernel = cast(Kernel, looped.scalar)
     nest = _Nest(program, looped, "double", "q")
     lines = nest.text(
         prepare=lambda k: [],
@@ -140,9 +155,13 @@ def _energy_text(program: IndexedProgram, looped: LoopedKernel) -> str:
 def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     """A function that adds to the masses."""
     nest = _Nest(program, looped, "", "")
+    place = nest.place_of(looped.targets[0])
     lines = nest.text(
         prepare=lambda k: [],
-        innermost=[f"{looped.kernel.name}(NULL, 0.0, parameters, value);", f"mass[{nest.place_of(0)}] += value[0];"],
+        innermost=[
+            f"{looped.kernel.name}(NULL, 0.0, parameters, value);",
+            f"mass[{place}] += value[0];",
+        ],
         finish=lambda k: [],
     )
     arguments = ["const problem *given", "double *mass"]
@@ -177,15 +196,15 @@ class _Nest:
         """The depth of the innermost loop that moves it."""
         return max((self.levels[index] for index in access.indices), default=0)
 
-    def is_innermost(self, slot: int) -> bool:
-        """Whether a slot moves with the innermost loop."""
-        return self.level(self.looped.slots[slot]) == len(self.looped.loops)
+    def is_innermost(self, access: Access) -> bool:
+        """Whether an entry moves with the innermost loop."""
+        return self.level(access) == len(self.looped.loops)
 
     def text(self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str] = ()) -> list[str]:
         """The nest.
 
         Args:
-            prepare, finish: lines of slots before and behind the loops that do not move them.
+            prepare, finish: lines of targets before and behind the loops that do not move them.
             innermost: lines in the innermost loop.
             behind: lines, each in a loop of its own over the same part.
         """
@@ -195,7 +214,7 @@ class _Nest:
         self, level: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str]
     ) -> list[str]:
         lines = list(self._found(level))
-        outer = [k for k, slot in enumerate(self.looped.slots) if self.level(slot) == level]
+        outer = [k for k, target in enumerate(self.looped.targets) if self.level(target) == level]
         if level == len(self.looped.loops):
             return [*lines, *innermost]
         lines += [line for k in outer for line in prepare(k)]
@@ -215,7 +234,7 @@ class _Nest:
             f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {end}, &end);"
             for offset in offsets
         ]
-        lines += [f"lanes values[{len(self.looped.slots)}][CHUNK];"] if self.chunked else []
+        lines += [f"lanes values[{len(self.looped.targets)}][CHUNK];"] if self.chunked else []
         lines += _loop(loop, "begin", "end", inner)
         for line in behind:
             lines += _loop(loop, "begin", "end", [line])
@@ -227,7 +246,8 @@ class _Nest:
 
     def _offsets(self, loop: Loop) -> list[int]:
         """At which places of a ring stand from an index."""
-        places = [place for access in (*self.looped.slots, *self.looped.given) for place in access.places]
+        accesses = (*self.looped.slots, *self.looped.targets, *self.looped.given)
+        places = [place for access in accesses for place in access.places]
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         return sorted(moved - {0}) if loop.periodic else []
 
@@ -235,14 +255,13 @@ class _Nest:
         """What is known at a level: arguments, parameters."""
         for k, slot in enumerate(self.looped.slots):
             if self.level(slot) == level and self.source:
-                yield f"u[{k}] = {self.source}[{self.place_of(k)}];"
+                yield f"u[{k}] = {self.source}[{self.place_of(slot)}];"
         for k, access in enumerate(self.looped.given, self.scalars):
             if self.level(access) == level:
                 yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"
 
-    def place_of(self, slot: int) -> str:
-        """Where a slot stands in the state."""
-        access = self.looped.slots[slot]
+    def place_of(self, access: Access) -> str:
+        """Where an entry stands in the state."""
         return f"start_{access.array.name} + {self.place(access)}"
 
     def place(self, access: Access) -> str:
@@ -274,7 +293,7 @@ class _Nest:
         count = self.scalars + len(self.looped.given)
         known = [
             *self._arrays("\n".join(lines)),
-            *([f"{self.scalar} u[{len(self.looped.slots)}];"] if self.source else []),
+            *self._unknowns(),
             f"{values};",
             f"double parameters[{max(1, count)}] = {{0}};",
             *(f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars)),
@@ -283,6 +302,14 @@ class _Nest:
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
         signature = wrapped(f"{head}({', '.join(arguments)})", indent=0)
         return f"{wrapped_comment(self.looped.text)}\n{signature}\n{{\n{text}\n}}"
+
+    def _unknowns(self) -> Iterator[str]:
+        """The arguments of the kernel, if it has any."""
+        if self.source and self.looped.slots:
+            yield f"{self.scalar} u[{len(self.looped.slots)}];"
+        elif self.source:
+            yield f"const {self.scalar} u[1] = {{0}};"
+            yield f"(void){self.source};"
 
     def _sizes(self, text: str) -> Iterator[str]:
         """Those that occur."""

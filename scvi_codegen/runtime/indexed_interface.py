@@ -15,11 +15,9 @@ from scvi_codegen.native.arguments import checked_number, real_array
 __all__ = [
     "IndexedInterface",
     "Numbers",
-    "check_accesses",
-    "field_values",
-    "number_values",
+    "RunArrays",
+    "read_arrays",
     "read_state",
-    "read_tables",
 ]
 
 Numbers = NDArray[np.float64]
@@ -58,6 +56,42 @@ class IndexedInterface:
     maps: tuple[IndexedMap, ...]
     accesses: tuple[tuple[Access, tuple[Loop, ...]], ...]
     depends_on_time: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunArrays:
+    """What a run is over: sizes, positions, fields and tables by name, numbers in the order of the parameters."""
+
+    sizes: dict[str, int]
+    state: dict[str, Numbers]
+    numbers: list[float]
+    fields: dict[str, Numbers]
+    places: dict[str, Places]
+
+
+def read_arrays(
+    interface: IndexedInterface,
+    q: ArrayLike | Mapping[str, ArrayLike],
+    parameters: Mapping[str, ArrayLike] | None,
+    tables: Mapping[str, ArrayLike] | None,
+) -> RunArrays:
+    """The arrays of a run, held against their declarations and each other.
+
+    Raises:
+        StateError: on wrong names, shapes and numbers, and where an index would leave its array.
+    """
+    places, state = read_tables(interface, tables), read_state(interface, q, "positions")
+    shapes = [(array, state[array.name].shape) for array in interface.coordinates]
+    shapes += [(table, places[table.name].shape) for table in interface.tables]
+    given = dict(parameters or {})
+    numbers = number_values(interface, given)
+    shapes += [
+        (field, np.shape(given[field.name])) for field in interface.fields if np.ndim(given.get(field.name, 0.0))
+    ]
+    sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.sizes)
+    fields = field_values(interface, given, sizes)
+    check_accesses(interface, sizes, places)
+    return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=places)
 
 
 def read_state(

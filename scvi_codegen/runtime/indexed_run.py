@@ -20,12 +20,8 @@ from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.indexed_interface import (
     IndexedInterface,
     Numbers,
-    check_accesses,
-    field_values,
-    number_values,
+    read_arrays,
     read_state,
-    read_tables,
-    sizes_of,
 )
 from scvi_codegen.runtime.portions import SLICE_SECONDS
 
@@ -66,20 +62,10 @@ class IndexedRun:
     ) -> None:
         self.interface, self._binding, self.iterations = interface, binding, 0
         self._options = binding.options(options)
-        places, state = read_tables(interface, tables), read_state(interface, q, "positions")
-        shapes = [(array, state[array.name].shape) for array in interface.coordinates]
-        shapes += [(table, places[table.name].shape) for table in interface.tables]
-        given = dict(parameters or {})
-        numbers = number_values(interface, given)
-        shapes += [
-            (field, np.shape(given[field.name])) for field in interface.fields if np.ndim(given.get(field.name, 0.0))
-        ]
-        self.sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.sizes)
-        fields = field_values(interface, given, self.sizes)
-        check_accesses(interface, self.sizes, places)
-        self._kept = (places, fields)
-        self._problem = self._new_problem(numbers)
-        self._start(state, self._momenta(p, velocity), checked_step(h), checked_number(t, "t"))
+        given = read_arrays(interface, q, parameters, tables)
+        self.sizes, self._kept = given.sizes, (given.places, given.fields)
+        self._problem = self._new_problem(given.numbers)
+        self._start(given.state, self._momenta(p, velocity), checked_step(h), checked_number(t, "t"))
 
     def __repr__(self) -> str:
         return f"<IndexedRun of {self.interface.title}: {self.sizes}, t = {self.t:g} after {self.steps} steps>"
@@ -169,6 +155,11 @@ class IndexedRun:
         if self.interface.momenta:
             raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
+
+    @property
+    def carries(self) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+        """What rounding cut off positions and momenta, as ``q`` and ``p``."""
+        return self._arrays(self._numbers["carry_q"]), self._arrays(self._numbers["carry_p"])
 
     @property
     def inverse_masses(self) -> dict[str, Numbers]:
@@ -264,19 +255,26 @@ class IndexedRun:
             raise StateError(f"these bytes are no saved run: {error}") from error
         return run
 
-    def advance(self, steps: int, *, progress: Callable[[int], None] | None = None) -> None:
+    def advance(
+        self,
+        steps: int,
+        *,
+        progress: Callable[[int], None] | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> None:
         """So many steps.
 
         Args:
             steps: their number.
             progress: called now and then with the number of steps of the run.
+            stop: asked as often whether to end before.
 
         Raises:
             StepFailedError: if one fails; the run stands before it.
         """
         steps, done, portion = checked_count(steps, "steps", least=0), 0, 1
         report = self._binding.new("report *")
-        while done < steps:
+        while done < steps and not (stop and stop()):
             size, began = min(portion, steps - done), time.perf_counter()
             status = self._binding.function("advance")(self._run, self._problem, size, self._options, report)
             done += report.steps

@@ -12,7 +12,6 @@ All is measured at states and parameters a little off those given: nothing hides
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import time
 from collections.abc import Sequence
 
@@ -30,7 +29,7 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.verification.certificate import Certificate, Check, Outcome
+from scvi_codegen.verification.certificate import Certificate, Check, Outcome, installed_version
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
 from scvi_codegen.verification.identities import identity_checks
@@ -121,7 +120,7 @@ def _certificate(stepper: Stepper, subject: Subject, checks: tuple[Check, ...], 
         title=stepper.title,
         system=subject.system.name,
         method=subject.method.name,
-        version=_version(),
+        version=installed_version(),
         checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
         flags=stepper.flags,
         q=tuple(given.q.tolist()),
@@ -132,13 +131,6 @@ def _certificate(stepper: Stepper, subject: Subject, checks: tuple[Check, ...], 
         checks=checks,
         seconds=seconds,
     )
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("scvi-codegen")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _newton(

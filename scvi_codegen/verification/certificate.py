@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 import os
@@ -17,7 +18,16 @@ from scvi_codegen.errors import MethodError, StateError, StepFailedError, System
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native.waiting import waiting_for
 
-__all__ = ["BrokenError", "Certificate", "Check", "Finding", "Outcome", "checked", "information"]
+__all__ = [
+    "BrokenError",
+    "Certificate",
+    "Check",
+    "Finding",
+    "Outcome",
+    "checked",
+    "information",
+    "installed_version",
+]
 
 
 class Outcome(StrEnum):
@@ -180,6 +190,14 @@ class Certificate:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the JSON, whole or not at all."""
         write_atomically(path, partial(_write, self.to_json()))
+
+
+def installed_version() -> str:
+    """Of this package."""
+    try:
+        return importlib.metadata.version("scvi-codegen")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _row(check: Check) -> tuple[Html, ...]:

@@ -1,8 +1,9 @@
-/* A step of any number of coordinates by sweeps, for constant diagonal masses and forces of position and time: that of
- * separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h, contraction.h, the
- * tables, forces. */
+/* A step of any number of coordinates by sweeps, for constant diagonal masses and forces of position, time and perhaps
+ * velocity: that of separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h,
+ * contraction.h, the tables, forces. */
 
-/* The parts of work: positions at the points, and forces there in this step, the last and the one before. */
+/* The parts of work: positions at the points (velocities behind them), and forces there in this step, the last and the
+ * one before. */
 typedef struct {
   lanes *X, *F, *last, *before;
 } parts_of_work;
@@ -12,7 +13,7 @@ static parts_of_work divide(const run_memory *run, long long n)
   lanes *work = (lanes *)run->work, *forces_of[3];
   parts_of_work parts;
   for (int k = 0; k < 3; k++)
-    forces_of[(k + run->turn) % 3] = work + (k + 1) * n;
+    forces_of[(k + run->turn) % 3] = work + (k + 1 + VELOCITIES) * n;
   parts.X = work;
   parts.F = forces_of[0], parts.last = forces_of[1], parts.before = forces_of[2];
   return parts;
@@ -46,11 +47,17 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
   for (long long i = 0; i < n; i++) {
     double low;
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
-    lanes x = run->q[i] + DRIFT[0] * drift;
+    lanes x = run->q[i] + DRIFT[0] * drift, bend = lanes_of(0.0);
     if (run->guess == 1)
-      x += unit * lanes_apply(LAST_ALONE, &parts->last[i]);
+      bend = lanes_apply(LAST_ALONE, &parts->last[i]);
     else if (run->guess > 1)
-      x += unit * (lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]));
+      bend = lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]);
+#if VELOCITIES
+    parts->F[i] = bend; /* forces are guessed, of which velocities are made, too */
+    bend = lanes_apply(PRODUCT, &parts->F[i]);
+#endif
+    if (run->guess > 0)
+      x += unit * bend;
     parts->X[i] = x;
     largest = larger(largest, fabs(run->q[i]) + fabs(drift));
   }
@@ -78,6 +85,27 @@ static double improve(const run_memory *run, const parts_of_work *parts, const l
   return lanes_total(total);
 }
 
+#if VELOCITIES
+/* Velocities at the points by the forces; returned is the sum of the squares of what that changes, times h. */
+static double improve_velocities(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+{
+  lanes total = lanes_of(0.0), *V = parts->X + n;
+  for (long long i = 0; i < n; i++) {
+    const lanes kick = run->carry_p[i] + by->h * lanes_apply(VELOCITY, &parts->F[i]);
+    const lanes v = run->inverse_mass[i] * (run->p[i] + kick), moved = by->h * (v - V[i]);
+    total += moved * moved;
+    V[i] = v;
+  }
+  return lanes_total(total);
+}
+#else
+static double improve_velocities(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+{
+  (void)run, (void)parts, (void)by, (void)n;
+  return 0.0;
+}
+#endif
+
 /* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
 static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
 {
@@ -96,6 +124,17 @@ static void last_positions(const run_memory *run, const parts_of_work *parts, co
     parts->X[i] = sum_of_three(lanes_of(run->q[i]), DRIFT[0] * drift + inverse * (by->square * sum),
         rest + inverse * (by->square * low + by->square_low * sum));
   }
+}
+
+/* The largest coordinate at the last point: of a step from rest at 0 the only size there is. */
+static double largest_at_end(const lanes *X, long long n)
+{
+  double largest = DBL_MIN;
+  for (long long i = 0; i < n; i++) {
+    const lane_view at = {X[i]};
+    largest = larger(largest, fabs(at.lane[KEPT - 1]));
+  }
+  return largest;
 }
 
 /* Whether all forces are finite. And what the highest coefficient of the forces at the points moves a coordinate by,
@@ -140,12 +179,13 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
   const lanes t = run->t + run->h * ABSCISSA[0];
-  const double largest = first_positions(run, &parts, &by, n);
-  double size = 0.0, first = 0.0, last = INFINITY, error;
+  double largest = first_positions(run, &parts, &by, n), size = 0.0, first = 0.0, last = INFINITY, error;
   int status = 0;
+  improve_velocities(run, &parts, &by, n);
   forces(given, parts.X, t, parts.F, n);
   for (int k = 0; status == 0; k++) {
     double change = improve(run, &parts, &by, n, k == 0 ? &size : NULL);
+    change += improve_velocities(run, &parts, &by, n);
     change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
     forces(given, parts.X, t, parts.F, n);
     status = sweep_status(change, last, options, k);
@@ -157,6 +197,9 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   if (status < 0)
     return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
   last_positions(run, &parts, &by, n);
+  if (largest <= DBL_MIN)
+    largest = largest_at_end(parts.X, n);
+  improve_velocities(run, &parts, &by, n);
   forces(given, parts.X, t, parts.F, n);
   if (!examine(run, parts.F, &by, n, largest, &error))
     return NOT_FINITE;

@@ -84,6 +84,7 @@ class TestHelp:
         """Certificates and benchmarks, which have tests of their own, are only read as they stand, or run."""
         texts = [output_of("--help"), *(output_of(command, "--help") for command in ABOUT)]
         Path("mine.toml").write_text(output_of("systems", "kepler"))
+        shutil.copy(Path(__file__).parents[2] / "examples/fput_ring.toml", "ring.toml")
         found = [match[1] for text in texts for match in re.finditer(r"^ +scvi-codegen (\w.*)$", text, re.MULTILINE)]
         lines = dict.fromkeys(re.split(r" {2,}| > ", line)[0] for line in found)  # in order: some need others' files
         assert len(lines) >= 9

@@ -217,3 +217,47 @@ def test_a_lagrangian_or_a_hamiltonian(given: dict[str, object], message: str) -
     """One of both, with what belongs to it."""
     with pytest.raises(SystemDefinitionError, match=message):
         IndexedSystem.from_text(name="x", coordinates=["q[N]"], **given)
+
+
+KINETIC = "sum(i in N, q_dot[i]**2/2)"
+
+
+def test_forces_and_what_they_conserve() -> None:
+    """Friction between neighbours leaves the momentum of a ring alone, friction against the ground does not."""
+    ring = f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2)"
+    between = system("q[N]", ring, dissipation="sum(i in N periodic, (q_dot[i+1] - q_dot[i])**2)")
+    assert [each.name for each in momentum_maps(between)] == ["momentum of q"]
+    assert between.changes_energy == "forces act"
+    assert momentum_maps(system("q[N]", ring, forces={"q[i]": "-q_dot[i]"})) == ()
+    assert [array.name for array in between.velocities] == ["q_dot"]
+    assert system("q[N]", ring, forces={"q[0]": "cos(t)"}).velocities == ()
+
+
+def test_forces_are_written_out() -> None:
+    """At every place, of every component, and at one place."""
+    found = expand_sums(
+        system(
+            "r[N, 2]",
+            "sum(i in N, sum(a in 2, r_dot[i, a]**2))",
+            forces={"r[i, a]": "-r_dot[i, a]", "r[N-1, 0]": "cos(t)"},
+        ),
+        {"N": 2},
+    )
+    assert [str(force) for force in found.forces] == ["-r_0_0_dot", "-r_0_1_dot", "-r_1_0_dot + cos(t)", "-r_1_1_dot"]
+
+
+@pytest.mark.parametrize(
+    ("beside", "message"),
+    [
+        ({"forces": {"x[i]": "1"}}, "a force acts on coordinates"),
+        ({"forces": {"q[i]": "-q_dot[j]"}}, "'j' is no index"),
+        ({"forces": {"q[i]": "q[i+1]"}}, "i\\+1 is N at i = N-1"),
+        ({"forces": {"q[N]": "1"}}, "is not on an axis"),
+        ({"forces": {"q[i": "1"}}, "is expected here"),
+        ({"dissipation": "sum(i in N, q[i]**2)"}, "no velocity occurs in the dissipation"),
+    ],
+)
+def test_forces_that_are_refused(beside: dict[str, object], message: str) -> None:
+    """By the parser, or by what they are."""
+    with pytest.raises(SystemDefinitionError, match=message):
+        system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **beside)

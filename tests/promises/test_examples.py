@@ -86,7 +86,7 @@ def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
 
 def test_every_example_is_tried_here():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
-    assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower"}
+    assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower", "fput_ring"}
 
 
 @pytest.mark.parametrize("name", ENERGY_ERRORS)
@@ -100,6 +100,16 @@ def test_model_files_run_and_keep_their_energy(name, tmp_path):
     model = load_model(EXAMPLES / f"{name}.toml")
     with np.load(output) as written:
         assert len(written["t"]) == model.step_count // model.every + 1
+
+
+def test_the_ring_keeps_its_energy_and_momentum(tmp_path):
+    output = tmp_path / "run.npz"
+    words = ["run", str(EXAMPLES / "fput_ring.toml"), "--steps", "100", "-o", str(output)]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    with np.load(output) as written:
+        assert np.ptp(written["energies"][:, 2]) < 1e-14 * written["energies"][0, 2]
+        assert np.ptp(written["maps"]) < 1e-14
 
 
 def test_the_shaken_tower_moves_as_its_equations_say(tmp_path):

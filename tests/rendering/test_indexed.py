@@ -32,7 +32,11 @@ FORMULAS = {
         "sum(i in NX periodic, j in NY, p_u[i+1, j]*u[i, j]**2 + p_u[i, j]**2) - sum(i in N, m[i]*p_q[i]**4*q[i])",
     ),
     "free": (["q[N]"], "sum(i in N, q_dot[i]**2/2)"),
+    "damped": (["q[N]"], "sum(i in N, q_dot[i]**2/2) - sum(i < j in N, q[i]*q[j])"),
 }
+EXPLICIT = ("damped", "stoermer-verlet")
+"""Is refused."""
+FORCES = {"damped": {"q[i]": "-m[i]*q_dot[i]*q[i]", "q[N-1]": "cos(t)"}}
 
 
 def rendered(name: str, method: str) -> Source:
@@ -44,12 +48,15 @@ def rendered(name: str, method: str) -> Source:
         **{"hamiltonian" if name == "hamiltonian" else "lagrangian": formula},
         parameters={"m[N]": 1, "k[B]": 1, "g": 2},
         tables=["bonds[B, 2]"],
+        forces=FORCES.get(name),
     )
     return render_indexed(lower_indexed(system, as_method(method, one_coordinate(system)), "indexed"))
 
 
-@pytest.mark.parametrize("method", ["svi:4", "stoermer-verlet"])
-@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [(name, method) for name in FORMULAS for method in ("svi:4", "stoermer-verlet") if (name, method) != EXPLICIT],
+)
 def test_it_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
     """No warnings, in the style of all C here, and nothing that is not declared in the header."""
     source = rendered(name, method)

@@ -367,3 +367,109 @@ def test_sweeps_contract_up_to_the_steps_that_are_told(form: str, method: str, m
     run.advance(50)
     assert run.energy == pytest.approx(before, rel=1e-13)
     assert np.isnan(run.step_error) == (method == "svi:1" and form == "hamiltonian")
+
+
+FORCED = sc.IndexedSystem.from_text(
+    name="forced net",
+    coordinates=["r[N, 2]"],
+    parameters={"m[N]": 1, "c": 0.3, "w": 2},
+    tables=["bonds[B, 2]"],
+    lagrangian="sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2)"
+    "- sum(b in B, sum(a in 2, (r[bonds[b, 1], a] - r[bonds[b, 0], a])**2))",
+    forces={"r[i, a]": "-c*m[i]*r_dot[i, a]**3", "r[N-1, 0]": "cos(w*t)"},
+    dissipation="sum(b in B, c*(r_dot[bonds[b, 1], 1] - r_dot[bonds[b, 0], 1])**2)",
+)
+
+
+@pytest.mark.parametrize(
+    "method", ["svi:2", *(pytest.param(name, marks=pytest.mark.full) for name in ("svi:1", "svi:5", "gauss:3", "sc:4"))]
+)
+def test_forces_of_velocities_as_written_out(method: str) -> None:
+    """Friction at every place, between the ends of bonds, and a drive at one place."""
+    bonds, masses = {"bonds": [[0, 1], [1, 2], [2, 3], [0, 3]]}, {"m": [1, 2, 3, 4]}
+    q, velocity = random(2, 4, 2)
+    written = sc.expand_sums(FORCED, {"N": 4, "B": 4}, tables=bonds, parameters=masses)
+    stepper = sc.compile_indexed(FORCED, method)
+    run = stepper.integrate(q, velocity=velocity, h=0.05, steps=40, tables=bonds, parameters=masses)
+    other = sc.compile_stepper(written, method).integrate(
+        q.reshape(-1), velocity=velocity.reshape(-1), h=0.05, steps=40
+    )
+    assert run.q["r"].reshape(41, -1) == pytest.approx(other.q, abs=1e-14)
+    assert run.p["r"].reshape(41, -1) == pytest.approx(other.p, abs=1e-14)
+    assert abs(run.energy() - run.energy()[0]).max() > 0.1
+    assert stepper.momentum_map_names == ()
+
+
+@pytest.mark.parametrize("method", ["stoermer-verlet", pytest.param("svi:3", marks=pytest.mark.full)])
+def test_forces_of_position_and_time(method: str) -> None:
+    """Explicit methods take them; those of velocities are refused."""
+    chain = {"name": "chain", "coordinates": ["q[N]"], "parameters": {"c": 0.3}}
+    lagrangian = f"{KINETIC} - sum(i in 0..N-2, (q[i+1] - q[i])**2)"
+    driven = sc.IndexedSystem.from_text(
+        **chain, lagrangian=lagrangian, forces={"q[N-1]": "cos(t)", "q[i]": "-c*q[i]**3"}
+    )
+    q, velocity = random(2, 3)
+    run = sc.compile_indexed(driven, method).integrate(q, velocity=velocity, h=0.1, steps=30)
+    other = sc.compile_stepper(sc.expand_sums(driven, {"N": 3}), method)
+    assert run.q["q"] == pytest.approx(other.integrate(q, velocity=velocity, h=0.1, steps=30).q, abs=1e-14)
+    damped = sc.IndexedSystem.from_text(**chain, lagrangian=lagrangian, forces={"q[i]": "-c*q_dot[i]"})
+    with pytest.raises(sc.MethodError, match="is explicit for forces of positions and time"):
+        sc.compile_indexed(damped, "stoermer-verlet")
+
+
+@pytest.mark.full
+def test_forces_of_momenta() -> None:
+    """Beside a Hamiltonian."""
+    system = sc.IndexedSystem.from_text(
+        name="waves",
+        coordinates=["q[N]"],
+        parameters={"c": 0.3},
+        hamiltonian="sum(i in N, p_q[i]**2/2 + q[i]**2/2) + sum(i in 0..N-2, q[i]*q[i+1]*p_q[i])",
+        forces={"q[i]": "-c*p_q[i] + cos(t)"},
+    )
+    q, p = 0.3 * random(2, 3)
+    run = sc.compile_indexed(system, "gauss:3").integrate(q, p, h=0.1, steps=30)
+    other = sc.compile_stepper(sc.expand_sums(system, {"N": 3}), "gauss:3").integrate(q, p, h=0.1, steps=30)
+    assert run.q["q"] == pytest.approx(other.q, abs=1e-14)
+
+
+def test_friction_damps_as_it_should() -> None:
+    """A damped oscillator at every place, in closed form."""
+    system = sc.IndexedSystem.from_text(
+        name="damped",
+        coordinates=["q[N]"],
+        parameters={"c[N]": 1},
+        lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2)",
+        dissipation="sum(i in N, c[i]*q_dot[i]**2/2)",
+    )
+    c = np.array([0.1, 0.5, 1.5])
+    run = sc.compile_indexed(system, "svi:5").integrate(np.ones(3), h=0.2, steps=50, parameters={"c": c})
+    w = np.sqrt(1 - c**2 / 4)
+    exact = np.exp(-5 * c) * (np.cos(10 * w) + c / (2 * w) * np.sin(10 * w))
+    assert run.q["q"][-1] == pytest.approx(exact, abs=1e-12)
+
+
+def test_a_table_of_one_axis() -> None:
+    """Springs at some places only."""
+    pinned = sc.IndexedSystem.from_text(
+        name="pinned",
+        coordinates=["q[N]"],
+        tables=["pins[P]"],
+        lagrangian=f"{KINETIC} - sum(p in P, q[pins[p]]**2/2)",
+    )
+    run = sc.compile_indexed(pinned, "svi:6").integrate(np.ones(4), h=0.1, steps=10, tables={"pins": [1, 3]})
+    assert run.q["q"][-1] == pytest.approx([1, np.cos(1), 1, np.cos(1)], abs=1e-12)
+    written = str(sc.expand_sums(pinned, {"N": 2, "P": 1}, tables={"pins": [1]}).formula)
+    assert "q_1**2" in written
+    assert "q_0**2" not in written
+
+
+def test_the_error_of_a_step_from_rest_at_0() -> None:
+    """Where nothing but a drive moves anything, it is a part of where that leads."""
+    driven = sc.IndexedSystem.from_text(
+        name="driven", coordinates=["q[N]"], lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2)", forces={"q[0]": "cos(t)"}
+    )
+    run = sc.compile_indexed(driven, "svi:4").start(np.zeros(3), h=0.2)
+    run.advance(1)
+    error = abs(run.q["q"][0] - 0.1 * np.sin(0.2)) / 0.02
+    assert 0.1 * error < run.step_error < 1e3 * error

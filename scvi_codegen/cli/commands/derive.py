@@ -9,8 +9,11 @@ import click
 
 from scvi_codegen.cli.choices import Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import check_writable, emit
+from scvi_codegen.cli.sums import refuse
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import derive as derive_equations
+from scvi_codegen.derivation.indexed import derive_sums
+from scvi_codegen.models.indexed_model import IndexedModel
 
 __all__ = ["derive"]
 
@@ -29,6 +32,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     With --html everything between the Lagrangian and the C goes to a page that needs no network: equations of motion,
     trial curve, tables, equations with the paper's numbers, Jacobian, operation counts, C beside its formulas.
 
+    Of a model of sums over indices: each kind of term with its derivatives by the entries in it, masses, and the step.
+
     \b
     Examples:
       scvi-codegen derive planar-pendulum --method svi:1 --quadrature gauss-lobatto:2 --radicals
@@ -39,6 +44,10 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
             raise click.UsageError("--html writes a page of its own: leave out --latex, --radicals and -o")
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, Choices(**choices))
+    if isinstance(model, IndexedModel):
+        refuse({"html": html, "radicals": radicals})
+        emit(derive_sums(model.system, model.method, as_latex=latex), output)
+        return
     if html is not None:
         start = Start(q=model.q, velocity=model.velocity, p=model.p, h=model.step, t=model.t)
         emit(derivation_html(model.system, model.method, start=start), html)

@@ -8,6 +8,9 @@ import click
 
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import reporting, tell
+from scvi_codegen.cli.sums import refuse
+from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.indexed_package import generate_sums
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.rendering.text import Embedded
 
@@ -41,6 +44,9 @@ def generate(
 
     With --embedded the C is small: Newton's iteration alone, or an explicit method, iterations bounded by a macro.
 
+    Of a model of sums over indices the folder has C for any number of coordinates, and the initial state as text beside
+    it; no Python package.
+
     \b
     Example:
       scvi-codegen generate planar-pendulum -o pendulum_svi
@@ -48,7 +54,11 @@ def generate(
       python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
     """
     model = read_model(model_name, Choices(**choices))
-    folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
+    if isinstance(model, IndexedModel):
+        refuse({"embedded": embedded, "single_file": single_file, "solver": None if solver == "auto" else solver})
+        folder, python = generate_sums(model, output, force=force), ""
+    else:
+        folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
+        python = "" if embedded else f", or 'import {folder.resolve().name}'"
     tell(f"{model.system.name}: {model.method.title}", system=model.system.name, method=model.method.name)
-    python = "" if embedded else f", or 'import {folder.resolve().name}'"
     tell(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}", written=[folder])

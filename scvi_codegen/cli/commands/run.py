@@ -16,7 +16,9 @@ from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_w
 from scvi_codegen.cli.numbers import ensemble_numbers, failure_text, recorded_numbers, run_numbers
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
+from scvi_codegen.cli.sums import refuse, run_sums
 from scvi_codegen.models.ensemble_file import load_ensemble
+from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.canvas import check_plot_path
@@ -39,6 +41,9 @@ With --monitor steps are of one length in a time tau that runs the slower the fa
 symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
 and all times are of t. Where the system depends on time or forces act, --controller reversible takes steps of tau
 that are the same backward.
+
+A model of sums over indices (coordinates that are arrays, q[N]) takes sizes from its arrays, [sizes] or --size; its
+trajectory is an .npz file, its picture one of places and time.
 
 A system with inputs, functions of time that are data, takes their values from the section [inputs] of its file or
 from --input: a table with columns t and value. Steps end where a piece of an input does.
@@ -68,6 +73,7 @@ Examples:
   scvi-codegen run kepler --monitor frequency --span 1000
   scvi-codegen run kepler --monitor frequency --controller reversible --step 0.2
   scvi-codegen run kepler --json > kepler.json
+  scvi-codegen run ring.toml --size N=10000 --plot ring.png
 """
 
 
@@ -142,11 +148,15 @@ def run(
     wanted = {"tolerance": tolerance, "advise": advise}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
-    if model.system.inputs:
-        _check_driven(advise, recorded=recorded)
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
+    if isinstance(model, IndexedModel):
+        refuse({"ensemble": ensemble, **wanted, "solver": None if solver == "auto" else solver})
+        run_sums(model, output, plot, options)
+        return
+    if model.system.inputs:
+        _check_driven(advise, recorded=recorded)
     if ensemble is not None:
         _run_ensemble(model, ensemble, output, solver, options)
         return

@@ -31,8 +31,10 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["separable_sweep"]
 
 
-def separable_sweep(problem: StepProblem) -> SeparableSweep | None:
+def separable_sweep(problem: StepProblem, *, velocities: bool = False) -> SeparableSweep | None:
     """The fixed-point iteration of a separable system; ``None`` of others, and with too many points.
+
+    With ``velocities`` it has the table of those at the points, and guesses forces rather than positions.
 
     Nothing is integrated along its curve, whose velocities it does not keep.
 
@@ -45,17 +47,18 @@ def separable_sweep(problem: StepProblem) -> SeparableSweep | None:
         tables: VelocityTables | None = tableau_tables(shape.tableau.c, shape.tableau.A, shape.tableau.b)
     else:
         tables = velocity_tables(shape.unrounded or shape if isinstance(shape, Velocities) else None)
-    return _sweep(system, tables) if tables else None
+    return _sweep(system, tables, velocities=velocities) if tables else None
 
 
-def _sweep(system: LagrangianSystem, tables: VelocityTables) -> SeparableSweep | None:
+def _sweep(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableSweep | None:
     lanes = lane_count(len(tables.abscissae))
     if lanes > MOST_LANES:
         return None
     product = matrix_product(tables.position, tables.momentum)
     drift = tuple(mp.fsum(line) for line in tables.position)
     highest = min(len(tables.abscissae), len(tables.blocks)) - 1
-    guess = guess_tables(tables.abscissae, lanes, through=product, degree=highest)
+    guess = guess_tables(tables.abscissae, lanes, through=None if velocities else product, degree=highest)
+    at_points = matrix_product(tables.velocity, tables.momentum) if tables.velocity else tables.momentum
     forms = forms_of(system)
     return SeparableSweep(
         points=len(tables.abscissae),
@@ -68,4 +71,5 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> SeparableSweep |
         guess=guess,
         force=system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
         mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        velocity=pad_matrix(at_points, lanes) if velocities else (),
     )

@@ -8,6 +8,7 @@ the expanded system, which was derived on another way.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place
 from scvi_codegen.kinds import MAPPING, takes
@@ -54,7 +57,7 @@ def expand_sums(
     >>> expand_sums(chain, {"N": 2}).formula
     q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
     """
-    given, places = dict(parameters or {}), {name: np.asarray(table) for name, table in (tables or {}).items()}
+    given, places = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}
     for known, named, what in (
         (system.sizes, sizes, "size"),
         ([table.name for table in system.tables], places, "table"),
@@ -76,11 +79,9 @@ def expand_sums(
         if name not in numbers:
             raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
         numbers[name] = number(name, value)
-    summands: list[Expr] = []
-    for term in system.terms:
-        for at in _elements(term.loops, sizes):
-            rule = {slot: _entry(access, at, term.loops, sizes, places, names) for slot, access in term.slots}
-            summands.append(term.formula.xreplace(rule))
+    written = _Elements(sizes, places, names)
+    summands = [term.formula.xreplace(rule) for term in system.terms for _, rule in written.rules(term)]
+    acting = written.forces(system.forces)
     coordinates, momenta = (
         tuple(symbol(str(name)) for array in arrays for name in names[array.name].flat)
         for arrays in (system.coordinates, system.momenta)
@@ -91,10 +92,17 @@ def expand_sums(
         "time": system.time,
         "parameters": tuple(map(symbol, [*numbers, *values])),
         "defaults": (*numbers.values(), *values.values()),
+        "forces": tuple(Add(*acting.get(q, ())) for q in coordinates) if acting else (),
     }
     if momenta:
         return HamiltonianSystem(**same, momenta=momenta, hamiltonian=Add(*summands))
     return LagrangianSystem(**same, lagrangian=Add(*summands))
+
+
+def _columns(table: ArrayLike) -> NDArray[np.int64]:
+    """A table of one axis has one column."""
+    found = np.asarray(table)
+    return found[:, None] if found.ndim == 1 else found
 
 
 def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
@@ -121,25 +129,46 @@ def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Eleme
             yield {**outer, last.index: k}
 
 
-def _entry(
-    access: Access,
-    at: Elements,
-    loops: Sequence[Loop],
-    sizes: Mapping[str, int],
-    tables: Tables,
-    names: Mapping[str, NDArray[np.str_]],
-) -> Symbol:
-    periods = {loop.index: loop.end.at(sizes) for loop in loops if loop.periodic}
-    try:
-        places = tuple(_place(place, at, periods, sizes, tables) for place in access.places)
-    except IndexError as error:
-        raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
-    if any(not 0 <= place < length for place, length in zip(places, access.array.shape(sizes), strict=True)):
-        raise SystemDefinitionError(f"{access} is at {list(places)}, outside of {access.array}, at {dict(at)}")
-    name = access.array.name
-    if name in names:
-        return symbol(str(names[name][places]))
-    return symbol(str(names[name.removesuffix(DOT)][places]) + DOT)
+@dataclass(frozen=True, slots=True)
+class _Elements:
+    """What an access is at given values of the indices.
+
+    Attributes:
+        sizes, tables: as given.
+        names: of the entries of each array.
+    """
+
+    sizes: Mapping[str, int]
+    tables: Tables
+    names: Mapping[str, NDArray[np.str_]]
+
+    def rules(self, of: IndexedTerm | IndexedForce) -> Iterator[tuple[Elements, dict[Symbol, Symbol]]]:
+        """What stands for the slots, for all values of the indices."""
+        for at in _elements(of.loops, self.sizes):
+            yield at, {slot: self.entry(access, at, of.loops) for slot, access in of.slots}
+
+    def forces(self, forces: Sequence[IndexedForce]) -> dict[Symbol, list[Expr]]:
+        """The parts of each by the coordinate that they act on."""
+        found: dict[Symbol, list[Expr]] = {}
+        for force in forces:
+            for at, rule in self.rules(force):
+                for access, formula in force.targets:
+                    found.setdefault(self.entry(access, at, force.loops), []).append(formula.xreplace(rule))
+        return found
+
+    def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Symbol:
+        """The symbol of an entry."""
+        periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
+        try:
+            places = tuple(_place(place, at, periods, self.sizes, self.tables) for place in access.places)
+        except IndexError as error:
+            raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
+        if any(not 0 <= place < length for place, length in zip(places, access.array.shape(self.sizes), strict=True)):
+            raise SystemDefinitionError(f"{access} is at {list(places)}, outside of {access.array}, at {dict(at)}")
+        name = access.array.name
+        if name in self.names:
+            return symbol(str(self.names[name][places]))
+        return symbol(str(self.names[name.removesuffix(DOT)][places]) + DOT)
 
 
 def _place(place: Place, at: Elements, periods: Mapping[str, int], sizes: Mapping[str, int], tables: Tables) -> int:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, IndexedMap, Place
@@ -35,18 +35,36 @@ def momentum_maps(system: IndexedSystem) -> tuple[IndexedMap, ...]:
     return tuple(found for array in system.coordinates for found in _maps(system, array))
 
 
+@dataclass(frozen=True, slots=True)
+class _Pushes:
+    """What one element of a sum, or of forces, adds to the rates of momenta (-H_p to those of positions)."""
+
+    entries: tuple[tuple[Access, Expr], ...]
+    slots: tuple[Symbol, ...]
+
+
+def _pushes(system: IndexedSystem) -> Iterator[_Pushes]:
+    for term in system.potentials:
+        moved = [(slot, access) for slot, access in term.slots if access.array in system.state]
+        slopes = gradient(term.formula, [slot for slot, _ in moved])
+        entries = tuple((access, slopes.get(k, S.Zero)) for k, (_, access) in enumerate(moved))
+        yield _Pushes(entries, tuple(slot for slot, _ in term.slots))
+    for force in system.forces:
+        yield _Pushes(force.targets, tuple(slot for slot, _ in force.slots))
+
+
 def _maps(system: IndexedSystem, array: Array) -> Iterator[IndexedMap]:
-    last = array.axes[-1]
+    last, pushes = array.axes[-1], list(_pushes(system))
     components: Sequence[int | None] = [None] if last.name else range(last.number)
     for component in components:
-        if all(_vanishes(*_shift(system, term, array, component)) for term in system.potentials):
+        if all(_vanishes(*_shift(system, each, array, component)) for each in pushes):
             yield IndexedMap(array.name, component)
-    if system.momenta and all(_vanishes(*_phase(system, term, array)) for term in system.potentials):
+    if system.momenta and all(_vanishes(*_phase(system, each, array)) for each in pushes):
         yield IndexedMap(array.name, None, phase=True)
     if not last.name and last.number <= MOST_TURNED:
         for a in range(last.number):
             for b in range(a + 1, last.number):
-                turned = all(_vanishes(*_turn(system, term, array, (a, b))) for term in system.potentials)
+                turned = all(_vanishes(*_turn(system, each, array, (a, b))) for each in pushes)
                 if turned and _same_masses(system, array, a, b):
                     yield IndexedMap(array.name, a, b)
 
@@ -63,27 +81,27 @@ def _whole(component: int) -> Place:
 
 
 def _shift(
-    system: IndexedSystem, term: IndexedTerm, array: Array, component: int | None
+    system: IndexedSystem, pushes: _Pushes, array: Array, component: int | None
 ) -> tuple[list[Expr], list[Symbol]]:
-    slots = [slot for slot, access in term.slots if _component(access, array, component)]
-    return list(gradient(term.formula, slots).values()), _symbols(system, term)
+    parts = [slope for access, slope in pushes.entries if _component(access, array, component)]
+    return parts, _symbols(system, pushes)
 
 
 def _turn(
-    system: IndexedSystem, term: IndexedTerm, array: Array, plane: tuple[int, int]
+    system: IndexedSystem, pushes: _Pushes, array: Array, plane: tuple[int, int]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Parts of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
     pairs = [
         ((each, _whole(to)), (each, _whole(by)), sign) for each in arrays for to, by, sign in ((b, a, 1), (a, b, -1))
     ]
-    return _moved(system, term, pairs)
+    return _moved(system, pushes, pairs)
 
 
-def _phase(system: IndexedSystem, term: IndexedTerm, array: Array) -> tuple[list[Expr], list[Symbol]]:
+def _phase(system: IndexedSystem, pushes: _Pushes, array: Array) -> tuple[list[Expr], list[Symbol]]:
     """Parts of sum p dl/dq - q dl/dp."""
     (momenta,) = _conjugate(system, array)
-    return _moved(system, term, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
+    return _moved(system, pushes, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
 
 
 def _conjugate(system: IndexedSystem, array: Array) -> tuple[Array, ...]:
@@ -95,25 +113,24 @@ Entry: TypeAlias = tuple[Array, Place | None]
 
 
 def _moved(
-    system: IndexedSystem, term: IndexedTerm, pairs: Sequence[tuple[Entry, Entry, int]]
+    system: IndexedSystem, pushes: _Pushes, pairs: Sequence[tuple[Entry, Entry, int]]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Parts of what changes where entries of the first kind move by those of the second at the same places."""
     parts: list[Expr] = []
-    known = _symbols(system, term)
+    known = _symbols(system, pushes)
     for (array, last), (other, by), sign in pairs:
-        moved = [(slot, access) for slot, access in term.slots if access.array == array]
-        moved = [(slot, access) for slot, access in moved if last is None or access.places[-1] == last]
-        slopes = gradient(term.formula, [slot for slot, _ in moved])
-        for number, (_, access) in enumerate(moved):
+        for access, slope in pushes.entries:
+            if access.array != array or (last is not None and access.places[-1] != last):
+                continue
             places = access.places if by is None else (*access.places[:-1], by)
             partner = symbol(str(Access(array=other, places=places)))
             known += [] if partner in known else [partner]
-            parts.append(sign * partner * slopes.get(number, S.Zero))
+            parts.append(sign * partner * slope)
     return parts, known
 
 
-def _symbols(system: IndexedSystem, term: IndexedTerm) -> list[Symbol]:
-    return [*(slot for slot, _ in term.slots), *system.parameters, system.time]
+def _symbols(system: IndexedSystem, pushes: _Pushes) -> list[Symbol]:
+    return [*pushes.slots, *system.parameters, system.time]
 
 
 def _vanishes(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:

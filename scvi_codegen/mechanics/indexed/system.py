@@ -20,10 +20,11 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
 from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.kinds import MAPPING, TEXT, TEXTS, of, takes
 
 __all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
@@ -53,6 +54,7 @@ class IndexedSystem:
         field_defaults: the value of all their elements where none are given.
         tables: arrays of places, ``bonds[B, 2]``, given with each run.
         terms: of the Lagrangian or the Hamiltonian.
+        forces: beside it, of coordinates, velocities (momenta of a Hamiltonian) and time.
     """
 
     name: str
@@ -65,6 +67,7 @@ class IndexedSystem:
     field_defaults: tuple[float, ...]
     tables: tuple[Array, ...]
     terms: tuple[IndexedTerm, ...]
+    forces: tuple[IndexedForce, ...] = ()
 
     def __repr__(self) -> str:
         return f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))"
@@ -73,8 +76,12 @@ class IndexedSystem:
         self._check_names()
         for term in self.terms:
             if problem := unsupported_part(term.formula):
-                raise SystemDefinitionError(f"in the {self._function} of '{self.name}': {problem}")
+                raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
             _check_form(term, self._velocities, self.time)
+        for force in self.forces:
+            for access, formula in force.targets:
+                if problem := unsupported_part(formula):
+                    raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
         for array in () if self.momenta else self.coordinates:
             if not any(mass.access.array == array for mass in self.masses):
                 raise SystemDefinitionError(
@@ -92,6 +99,8 @@ class IndexedSystem:
         momenta=TEXTS,
         parameters=MAPPING,
         tables=TEXTS,
+        forces=MAPPING,
+        dissipation=TEXT,
     )
     def from_text(
         cls,
@@ -103,6 +112,8 @@ class IndexedSystem:
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         tables: Sequence[str] = (),
+        forces: Mapping[str, str] | None = None,
+        dissipation: str | None = None,
     ) -> IndexedSystem:
         """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
 
@@ -114,7 +125,9 @@ class IndexedSystem:
             momenta: of H, declarations as of the coordinates; by default ``["p_q[N]"]``.
             parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
                 an array, one an element, are given with each run.
-            tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``.
+            tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
+            forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` at every place, ``{"q[0]": "cos(t)"}`` at one.
+            dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
 
         Raises:
             SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
@@ -127,7 +140,7 @@ class IndexedSystem:
         """
         arrays = tuple(map(parse_array, coordinates))
         conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
-        places = tuple(map(parse_array, tables))
+        places = tuple(map(_table, tables))
         values = {key: number(key, value) for key, value in (parameters or {}).items()}
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
@@ -135,6 +148,10 @@ class IndexedSystem:
         text = lagrangian if hamiltonian is None else hamiltonian
         assert text is not None
         known = {key: symbol(key) for key in (*scalars, TIME)}
+        everything = (*arrays, *conjugate, *velocities, *fields.values())
+        acting = [parse_force(*pair, arrays, everything, known, places) for pair in (forces or {}).items()]
+        if dissipation is not None:
+            acting.append(_friction(parse_indexed(dissipation, everything, known, places), velocities, arrays))
         return cls(
             name=name,
             coordinates=arrays,
@@ -145,7 +162,8 @@ class IndexedSystem:
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
             tables=places,
-            terms=parse_indexed(text, (*arrays, *conjugate, *velocities, *fields.values()), known, places),
+            terms=parse_indexed(text, everything, known, places),
+            forces=tuple(chain(*acting)),
         )
 
     @classmethod
@@ -192,6 +210,27 @@ class IndexedSystem:
         return (*self.coordinates, *self.momenta)
 
     @property
+    def velocities(self) -> tuple[Array, ...]:
+        """Arrays of velocities that forces depend on: of all coordinates, if any; none of a Hamiltonian."""
+        names = {access.array.name for force in self.forces for _, access in force.slots}
+        own = tuple(Array(name, array.axes) for name, array in self._velocities.items())
+        return own if any(array.name in names for array in own) else ()
+
+    @property
+    def accesses(self) -> tuple[tuple[Access, tuple[Loop, ...]], ...]:
+        """Every access of an array, with the loops around it."""
+        slots = [(access, term.loops) for term in self.terms for _, access in term.slots]
+        slots += [(access, force.loops) for force in self.forces for _, access in force.slots]
+        return (*slots, *((access, force.loops) for force in self.forces for access, _ in force.targets))
+
+    @property
+    def changes_energy(self) -> str:
+        """Why energy is not conserved; nothing where it is."""
+        if self.forces:
+            return "forces act"
+        return f"the {self.function} depends on time" if self.depends_on_time else ""
+
+    @property
     def masses(self) -> tuple[MassTerm, ...]:
         """Second derivatives of L by velocities; none of a Hamiltonian."""
         return tuple(chain(*(_masses(term, self._velocities) for term in self.terms)))
@@ -219,14 +258,20 @@ class IndexedSystem:
         return tuple(found)
 
     def _repr_latex_(self) -> str:
+        return rf"$\displaystyle {self.latex}$"
+
+    @property
+    def latex(self) -> str:
+        """L or H in LaTeX."""
         arguments = ", ".join(array.name for array in self.state)
         terms = " + ".join(map(latex_sum, self.terms)).replace("+ -", "-")
-        return rf"$\displaystyle {self._function[0]}({arguments}) = {terms}$"
+        return rf"{self.function[0]}({arguments}) = {terms}"
 
     @property
     def depends_on_time(self) -> bool:
         """Whether time occurs: energy is then not conserved."""
-        return any(self.time in term.formula.free_symbols for term in self.terms)
+        formulas = [term.formula for term in self.terms] + [f for force in self.forces for _, f in force.targets]
+        return any(self.time in formula.free_symbols for formula in formulas)
 
     def key(self) -> tuple[str, ...]:
         """All that tells this system from others."""
@@ -235,10 +280,12 @@ class IndexedSystem:
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))
-        return f"{self.name}: {self._function[0]}({arguments}) = {' + '.join(map(str, self.terms))}"
+        forces = f"; forces {'; '.join(map(str, self.forces))}" if self.forces else ""
+        return f"{self.name}: {self.function[0]}({arguments}) = {' + '.join(map(str, self.terms))}{forces}"
 
     @property
-    def _function(self) -> str:
+    def function(self) -> str:
+        """What it is given by, in a word."""
         return "Hamiltonian" if self.momenta else "Lagrangian"
 
     @property
@@ -263,6 +310,12 @@ class IndexedSystem:
                 raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
 
 
+def _table(text: str) -> Array:
+    """Of one axis it has one column."""
+    array = parse_array(text)
+    return array if len(array.axes) > 1 else replace(array, axes=(*array.axes, Size("", 1)))
+
+
 def _momenta(
     coordinates: Sequence[Array], names: Sequence[str] | None, lagrangian: str | None, hamiltonian: str | None
 ) -> tuple[Array, ...]:
@@ -282,6 +335,28 @@ def _momenta(
             f"momenta are arrays like those of the coordinates, {shown}, not {', '.join(names)}"
         )
     return given
+
+
+def _friction(
+    terms: Sequence[IndexedTerm], velocities: Sequence[Array], coordinates: Sequence[Array]
+) -> tuple[IndexedForce, ...]:
+    """The forces -dD/dv of Rayleigh's function."""
+    arrays = dict(zip(velocities, coordinates, strict=False))
+    found = []
+    for term in terms:
+        moving = [(slot, access) for slot, access in term.slots if access.array in arrays]
+        slopes = gradient(term.formula, [slot for slot, _ in moving])
+        targets = tuple(
+            (replace(access, array=arrays[access.array]), -slopes[k])
+            for k, (_, access) in enumerate(moving)
+            if k in slopes
+        )
+        if not targets:
+            raise SystemDefinitionError(
+                f"no velocity occurs in the dissipation {term}: Rayleigh's function gives the forces -dD/dq_dot"
+            )
+        found.append(IndexedForce(loops=term.loops, slots=term.slots, targets=targets))
+    return tuple(found)
 
 
 def _masses(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:

@@ -1,0 +1,178 @@
+"""``scvi-codegen run`` for sums over indices: in portions, so that Ctrl-C and failing steps lose nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import click
+import numpy as np
+
+from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, tell
+from scvi_codegen.cli.memory import check_states
+from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.running import worst_step
+from scvi_codegen.cli.wording import counted, duration
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.pictures.arrays import plot_arrays
+from scvi_codegen.runtime.indexed_interface import Numbers
+from scvi_codegen.runtime.indexed_run import IndexedRun
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory, check_npz
+
+__all__ = ["refuse", "run_sums"]
+
+MOST_SHOWN = 4
+"""Entries of an array at the end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SumsOutcome:
+    """What came of a run: its states, where it stands, seconds before and in its steps, and what ended it."""
+
+    trajectory: IndexedTrajectory
+    run: IndexedRun
+    stepper: IndexedStepper
+    preparation: float
+    seconds: float
+    failure: StepFailedError | None
+    interrupted: bool
+
+
+def refuse(what: dict[str, object]) -> None:
+    """Refuse options, by name, that sums over indices do not have."""
+    for name, value in what.items():
+        if value not in (None, False):
+            raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices")
+
+
+def run_sums(model: IndexedModel, output: str | None, plot: str | None, options: SolverOptions | None) -> None:
+    """Integrate, sum up, write what is asked for.
+
+    Raises:
+        CommandFailure: where a step failed, or a signal ended the run, with the states before it summed up and written.
+    """
+    if output is not None:
+        check_npz(output)
+    outcome = _integrate(model, options)
+    tell("\n".join(_summary(model, outcome)), **_numbers(model, outcome))
+    if output is not None:
+        outcome.trajectory.save(output)
+    if plot is not None:
+        plot_arrays(outcome.trajectory, plot)
+    written = [path for path in (output, plot) if path is not None]
+    tell(written=written)
+    if outcome.failure is not None:
+        raise CommandFailure(str(outcome.failure), FAILURE)
+    if outcome.interrupted:
+        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}", INTERRUPTED)
+    for path in written:
+        tell(f"wrote {path}")
+
+
+def _integrate(model: IndexedModel, options: SolverOptions | None) -> SumsOutcome:
+    steps, began = model.step_count, time.perf_counter()
+    check_states(sum(np.size(values) for values in model.q.values()), steps, model.every)
+    stepper = model.stepper()
+    run, failure, done = model.start(stepper, options=options), None, 0
+    preparation, began = time.perf_counter() - began, time.perf_counter()
+    record = IndexedRecord(run)
+    with interruptions() as caught, progress_bar(steps) as advance:
+
+        def look(count: int) -> None:
+            nonlocal done
+            advance(count - done)
+            done = count
+
+        try:
+            record.follow(steps, model.every, progress=look, stop=lambda: bool(caught))
+        except StepFailedError as error:
+            failure = error
+    return SumsOutcome(
+        trajectory=record.trajectory(),
+        run=run,
+        stepper=stepper,
+        preparation=preparation,
+        seconds=time.perf_counter() - began,
+        failure=failure,
+        interrupted=bool(caught) and run.steps < steps,
+    )
+
+
+def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
+    run, trajectory, method = outcome.run, outcome.trajectory, model.method
+    sizes = ", ".join(f"{name} = {size}" for name, size in run.sizes.items())
+    count = sum(values.size for values in run.q.values())
+    order = "no order claimed" if method.order is None else f"order {method.order}"
+    yield f"{model.system.name}: {counted(count, 'coordinate')}{f', {sizes}' if sizes else ''}"
+    geometry = f"{'' if method.symplectic else 'not '}symplectic, {'' if method.symmetric else 'not '}symmetric"
+    yield f"{method.title}; {order}, {geometry}"
+    kept = counted(len(trajectory.t), "state")
+    yield f"{counted(run.steps, 'step')} of {run.h:g} from t = {model.t:g} to t = {run.t:g}; {kept} kept"
+    if run.steps:
+        each = outcome.seconds / run.steps
+        yield (
+            f"{outcome.seconds:.3g} s, {duration(each)} a step, {duration(each / count)} a step and coordinate, "
+            f"{run.iterations / run.steps:.2f} iterations a step; prepared in {outcome.preparation:.2f} s"
+        )
+        yield _energy(model, outcome)
+        for name, change in _map_changes(outcome):
+            yield f"{name}: changed by {change:.2e} at most"
+        yield from worst_step(trajectory)
+    yield "final state"
+    for name, values in run.q.items():
+        shown = ", ".join(f"{x:.9g}" for x in values.reshape(-1)[:MOST_SHOWN])
+        yield f"  {name} = {shown}{', ..' if values.size > MOST_SHOWN else ''}"
+
+
+def _energy(model: IndexedModel, outcome: SumsOutcome) -> str:
+    if why := model.system.changes_energy:
+        energy = _energies(outcome)[:, 2]
+        change = float(np.abs(energy - energy[0]).max())
+        return f"energy: {why}, it changed by {change:.3g} at most"
+    return f"relative energy error: {_energy_error(outcome):.2e} at most"
+
+
+def _energies(outcome: SumsOutcome) -> Numbers:
+    """Of all states kept, and of the last, which may not be."""
+    return np.vstack([outcome.trajectory.energies, outcome.run.energies])
+
+
+def _energy_error(outcome: SumsOutcome) -> float:
+    return replace(outcome.trajectory, energies=_energies(outcome)).energy_error()
+
+
+def _map_changes(outcome: SumsOutcome) -> Iterator[tuple[str, float]]:
+    """The largest change of each momentum map."""
+    maps = np.vstack([outcome.trajectory.momentum_maps(), outcome.run.momentum_maps])
+    changes = np.abs(maps - maps[0]).max(axis=0)
+    return zip(outcome.stepper.momentum_map_names, changes.tolist(), strict=True)
+
+
+def _numbers(model: IndexedModel, outcome: SumsOutcome) -> dict[str, Any]:
+    """What ``--json`` says."""
+    run, trajectory = outcome.run, outcome.trajectory
+    failure = "interrupted" if outcome.interrupted else None
+    return {
+        "system": model.system.name,
+        "method": model.method.name,
+        "order": model.method.order,
+        "sizes": run.sizes,
+        "steps": run.steps,
+        "h": run.h,
+        "states": len(trajectory.t),
+        "seconds": outcome.seconds,
+        "preparation_seconds": outcome.preparation,
+        "iterations": run.iterations,
+        "energy": trajectory.energy()[0],
+        "energy_error": _energy_error(outcome),
+        "momentum_changes": dict(_map_changes(outcome)),
+        "step_error": trajectory.step_error,
+        "step_error_t": trajectory.step_error_t,
+        "final": {"t": run.t, "q": run.q, "p": run.p},
+        "failure": failure if outcome.failure is None else str(outcome.failure),
+    }

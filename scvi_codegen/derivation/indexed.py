@@ -1,0 +1,119 @@
+"""What is derived of sums over indices, as mathematics: L or H, the slopes of every term by its entries, and a step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from sympy import Expr, latex
+
+from scvi_codegen.formulas.indexed_latex import latex_entry, latex_sums
+from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.numbers import Number
+from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
+from scvi_codegen.lowering.indexed import lower_indexed
+from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods.method import Method
+
+__all__ = ["derive_sums"]
+
+DIGITS = 17
+
+
+def derive_sums(system: IndexedSystem, method: Method, *, as_latex: bool = False) -> str:
+    """The kernels that are compiled, with the loops around them, and the equations of a step, as text or LaTeX.
+
+    Raises:
+        MethodError: for a method without sweeps.
+    """
+    program = lower_indexed(system, method, "derived")
+    if as_latex:
+        return "\n".join(_latex(system))
+    return "\n".join([*_text(system), "", *_step(program, method)])
+
+
+def _text(system: IndexedSystem) -> Iterator[str]:
+    yield str(system)
+    yield ""
+    yield "Terms of -H, and their derivatives:" if system.momenta else "Terms of -V, and what each adds to the forces:"
+    for term, slopes in system.kernels:
+        yield f"  {term}"
+        yield from (f"    by {name}: {slope}" for name, slope in slopes.items())
+    if not system.momenta:
+        yield "Masses:"
+        yield from (f"  {_loops_text(mass.loops, mass.formula)} at {mass.access}" for mass in system.masses)
+    if system.forces:
+        yield "Forces beside:"
+        yield from (f"  {force}" for force in system.forces)
+    energy = () if system.changes_energy else ("energy",)
+    conserved = (*energy, *(each.name for each in momentum_maps(system)))
+    yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
+
+
+def _loops_text(loops: Sequence[object], formula: Expr) -> str:
+    return f"for {', '.join(map(str, loops))}: {formula}" if loops else str(formula)
+
+
+def _latex(system: IndexedSystem) -> Iterator[str]:
+    """One line each, in display mode."""
+    yield rf"\[ {system.latex} \]"
+    for term, slopes in system.kernels:
+        entries = {slot: latex_entry(access) for slot, access in term.slots}
+        for name, slope in slopes.items():
+            by = rf"\frac{{\partial}}{{\partial {entries[symbol(name)]}}}"
+            yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(slope, symbol_names=entries)} \]"
+
+
+def _step(program: IndexedProgram, method: Method) -> Iterator[str]:
+    yield f"A step of h by {method.title}, from q, p to q', p', the same for every coordinate"
+    if program.splitting:
+        yield from _splitting(program.splitting)
+    elif isinstance(program.sweep, SeparableSweep):
+        yield from _separable(program.sweep)
+    elif program.sweep:
+        yield from _hamiltonian(program.sweep)
+
+
+def _splitting(of: Splitting) -> Iterator[str]:
+    yield "(m its mass, F the force on it):"
+    for kick, drift, abscissa in zip(of.kicks, of.drifts, of.abscissae, strict=True):
+        if kick != 0:
+            yield f"  p += h*({_number(kick)})*F at t + h*({_number(abscissa)})"
+        if drift != 0:
+            yield f"  q += h*({_number(drift)})*p/m"
+
+
+def _separable(of: SeparableSweep) -> Iterator[str]:
+    yield "(m its mass, F_n the force on it at the points X_n of all):"
+    for n in range(of.points):
+        terms = _combination(of.product[n], "F", of.points)
+        yield f"  X_{n} = q + h*({_number(of.drift[n])})*p/m + h**2/m*({terms}) at t + h*({_number(of.abscissae[n])})"
+    yield f"  q' = q + h*p/m + h**2/m*({_combination(of.end_position, 'F', of.points)})"
+    yield f"  p' = p + h*({_combination(of.end_momentum, 'F', of.points)})"
+
+
+def _hamiltonian(of: HamiltonianSweep) -> Iterator[str]:
+    yield "(V_n = H_p and F_n = -H_q at the points Q_n, P_n of all):"
+    rows = (("Q", "q", of.position, of.position_weights, "V"), ("P", "p", of.momentum, of.momentum_weights, "F"))
+    for n in range(of.points):
+        for letter, start, table, weights, rate in rows:
+            yield f"  {letter}_{n} = {start} + h*({_combination(_weighted(table[n], weights), rate, of.points)})"
+    for start, end, weights, rate in (
+        ("q", of.end_position, of.position_weights, "V"),
+        ("p", of.end_momentum, of.momentum_weights, "F"),
+    ):
+        yield f"  {start}' = {start} + h*({_combination(_weighted(end, weights), rate, of.points)})"
+
+
+def _weighted(row: Sequence[Number], weights: Sequence[Number]) -> list[Number]:
+    return [x * w for x, w in zip(row, weights, strict=True)]
+
+
+def _combination(row: Sequence[Number], letter: str, points: int) -> str:
+    terms = [f"{_number(x)}*{letter}_{n}" for n, x in enumerate(row[:points]) if x != 0]
+    return " + ".join(terms).replace("+ -", "- ") or "0"
+
+
+def _number(x: Number) -> str:
+    return f"{float(x):.{DIGITS}g}"

@@ -1,0 +1,103 @@
+"""Forces on arrays read from text: on an entry whose indices run over whole axes, or at a single place.
+
+target   = array "[" (index | size | whole number) ("," ..)* "]"        q[i], r[i, a], q[0], q[N-1]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sympy import Expr, Symbol
+
+from scvi_codegen.formulas.grammar import parsed
+from scvi_codegen.formulas.indexed import Bound, IndexedParser, term_of
+from scvi_codegen.indices import Access, Array, Loop, Size
+
+__all__ = ["IndexedForce", "parse_force"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndexedForce:
+    """Forces over loops.
+
+    Attributes:
+        loops, slots: as of :class:`IndexedTerm`, of all formulas.
+        targets: the coordinate that each acts on, and its formula.
+    """
+
+    loops: tuple[Loop, ...]
+    slots: tuple[tuple[Symbol, Access], ...]
+    targets: tuple[tuple[Access, Expr], ...]
+
+    def __str__(self) -> str:
+        loops = f" for {', '.join(map(str, self.loops))}" if self.loops else ""
+        return ", ".join(f"{formula} on {access}" for access, formula in self.targets) + loops
+
+
+def parse_force(
+    target: str,
+    text: str,
+    coordinates: Sequence[Array],
+    arrays: Sequence[Array],
+    symbols: Mapping[str, Symbol],
+    tables: Sequence[Array] = (),
+) -> tuple[IndexedForce, ...]:
+    """Read the force on ``q[i]``, every place of an axis, or on a single place, ``q[0]``.
+
+    Args:
+        target: what it acts on.
+        text: its formula, in the indices of the target.
+        coordinates: arrays of the target.
+        arrays, symbols, tables: as of :func:`parse_indexed`.
+
+    Raises:
+        ExpressionError: as :func:`parse_indexed`.
+
+    >>> from scvi_codegen.formulas.indexed import parse_array
+    >>> from scvi_codegen.formulas.symbols import symbol
+    >>> q, v = parse_array("q[N]"), parse_array("q_dot[N]")
+    >>> [str(force) for force in parse_force("q[i]", "-c*q_dot[i]", [q], [q, v], {"c": symbol("c")})]
+    ['-c*q_dot[i] on q[i] for i in N']
+    """
+    reader = _Target(target, {}, coordinates, ())
+    bounds = reader.read()
+    rows: list[dict[str, Bound]] = [{}]
+    for name, axis in bounds.items():
+        values: list[Bound] = [Loop(index=name, first=Size("", 0), end=axis)] if axis.name else [*range(axis.number)]
+        rows = [{**row, name: value} for row in rows for value in values]
+    found = []
+    for row in rows:
+        place, formula = (IndexedParser(given, symbols, arrays, tables) for given in (target, text))
+        place.bound, formula.bound = dict(row), dict(row)
+        slot, expression = parsed(place), parsed(formula)
+        loops = tuple(bound for bound in row.values() if isinstance(bound, Loop))
+        term = term_of(loops, expression, formula.accesses)
+        found.append(IndexedForce(loops=loops, slots=term.slots, targets=((place.accesses[slot], expression),)))
+    return tuple(found)
+
+
+class _Target(IndexedParser):
+    """An entry of an array whose indices run over whole axes."""
+
+    def read(self) -> dict[str, Size]:
+        """The axis of each index."""
+        token = self.take_name("an array of coordinates")
+        if token.text not in self.arrays:
+            known = ", ".join(map(str, self.arrays.values()))
+            self.refuse(f"a force acts on coordinates, {known}, not on '{token.text}'", token.column)
+        array, bounds = self.arrays[token.text], dict[str, Size]()
+        self.expect("[")
+        for number, axis in enumerate(array.axes):
+            if number:
+                self.expect(",")
+            place = self.peek()
+            if place.kind != "name" or place.text in self.sizes:
+                self.size()
+                continue
+            self.check_index(place)
+            if place.text in bounds:
+                self.refuse(f"the index '{place.text}' stands for two axes", place.column)
+            bounds[self.take_name("an index").text] = axis
+        self.expect("]")
+        return bounds

@@ -1,0 +1,256 @@
+"""Model files of sums over indices: those of :mod:`scvi_codegen.models.model_file` with arrays.
+
+    [system]
+    name = "ring"
+    coordinates = ["q[N]"]                              # "r[N, 3]", "u[NX, NY]", several arrays
+    lagrangian = "sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"
+    # dissipation = "sum(i in N, c*q_dot[i]**2/2)"      # Rayleigh's function
+
+    [forces]                                            # on coordinates, at every place or at one; left out: 0
+    # "q[i]" = "-c*q_dot[i]"
+    # "q[0]" = "cos(w*t)"
+
+    [sizes]                                             # where no list or file of numbers says them
+    N = 1000
+
+    [parameters]
+    k = 1.0
+    "m[N]" = 1.0                                        # an array: as [initial] has them
+
+    [tables]                                            # whole numbers; or { file = "bonds.csv" }
+    # "bonds[B, 2]" = [[0, 1], [1, 2]]
+
+    [initial]                                           # of several arrays: [initial.q] with a line each
+    q = "sin(2*pi*i/N)"                                 # a number, a list, { file = "q.npy" }, a formula
+    q_dot = 0.0                                         # or p; left out: 0
+
+    [method]
+    method = "svi:4"
+
+    [run]
+    step = 0.1
+    span = 100.0                                        # or steps
+    every = 10
+
+Hamiltonians, and sections laid over others, are as there.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.formulas.indexed import parse_array
+from scvi_codegen.indices import Array
+from scvi_codegen.lowering.indexed import one_coordinate
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods import fitted
+from scvi_codegen.models.array_values import is_filled, read_array
+from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.model import real
+from scvi_codegen.models.sections import (
+    Document,
+    Section,
+    check_keys,
+    check_one,
+    chosen_method,
+    in_section,
+    laid_over,
+    names_of,
+    read_method,
+    required,
+    text_of,
+)
+
+__all__ = ["read_indexed"]
+
+KEYS = {
+    "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation"),
+    "initial": ("q", "p", "q_dot", "t"),
+    "run": ("step", "span", "steps", "every"),
+}
+SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
+OTHERS = {
+    "": ("inputs",),
+    "system": ("constraints", "inputs", "catalogue", "monitor"),
+    "run": ("tolerance", "controller"),
+}
+"""What other models have."""
+GROUPS = ("q", "p", "q_dot", "parameters", "tables")
+"""Of arrays."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What a file says of an array, and where."""
+
+    array: Array
+    value: Any
+    where: str
+
+
+def read_indexed(document: Document, given: Document, folder: str | os.PathLike[str]) -> IndexedModel:
+    """The model of a file, with the sections ``given`` laid over it.
+
+    Raises:
+        ModelFileError: naming the key at fault.
+    """
+    for layer in (document, given):
+        _check_known(layer)
+    specification = chosen_method(document, given)
+    parameters = _declared(document.get("parameters", {}), given.get("parameters", {}))
+    document = {**laid_over(document, given), "parameters": parameters}
+    tables = {key: in_section("[tables]", partial(parse_array, key)) for key in document.get("tables", {})}
+    system = _read_system(document)
+    method = in_section("[method]", lambda: read_method(fitted(specification, one_coordinate(system))))
+    entries = {
+        **_state_entries(document.get("initial", {}), system),
+        **{
+            ("parameters", array.name): Entry(array, parameters[str(array)], f"[parameters] {array.name}")
+            for array in system.fields
+            if not _is_number(parameters[str(array)])
+        },
+        **{
+            ("tables", table.name): Entry(table, document["tables"][key], f"[tables] {table.name}")
+            for key, table in tables.items()
+        },
+    }
+    numbers = {parameter.name: value for parameter, value in zip(system.parameters, system.defaults, strict=True)}
+    found = _read_arrays(entries, _read_sizes(document.get("sizes", {}), system), folder, numbers)
+    groups = {key: {name: values for (group, name), values in found.items() if group == key} for key in GROUPS}
+    return IndexedModel(
+        system=system,
+        method=method,
+        q=groups["q"],
+        p=groups["p"] or None,
+        velocity=groups["q_dot"] or None,
+        t=real(document.get("initial", {}).get("t", 0.0), "[initial] t"),
+        parameters=groups["parameters"],
+        tables={name: _whole(values, f"[tables] {name}") for name, values in groups["tables"].items()},
+        **_read_run(document.get("run", {})),
+    )
+
+
+def _check_known(document: Document) -> None:
+    """Refuse what sums over indices do not have, in other words than what nobody knows."""
+    for name, section in (("", document), *document.items()):
+        for key in section if name in OTHERS else ():
+            if key in OTHERS[name]:
+                where = f"[{name}] {key}" if name else f"[{key}]"
+                raise ModelFileError(
+                    f"{where} is not for sums over indices: leave it out, or write the system out (expand_sums)"
+                )
+    check_keys(document, SECTIONS, "section")
+    for name, known in KEYS.items():
+        check_keys(document.get(name, {}), known, "key", f"[{name}]")
+
+
+def _declared(section: Section, given: Section) -> dict[str, Any]:
+    """Parameters by declaration, ``m[N]``, with values laid over by name."""
+    names = {key.partition("[")[0]: key for key in section}
+    for name in given:
+        if name not in names:
+            raise ModelFileError(f"the system has no parameter '{name}'")
+    return {**section, **{names[name]: value for name, value in given.items()}}
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, str | list | dict)
+
+
+def _read_system(document: Document) -> IndexedSystem:
+    section, parameters = document.get("system", {}), document["parameters"]
+    check_one(section, "system", "lagrangian", "hamiltonian")
+    kind = "hamiltonian" if "hamiltonian" in section else "lagrangian"
+    defaults = {
+        key: real(value, f"[parameters] {key}") if "[" not in key or _is_number(value) else 1.0
+        for key, value in parameters.items()
+    }
+    given: dict[str, Any] = {
+        "name": text_of(section, "name", "[system]"),
+        "coordinates": names_of(section, "coordinates"),
+        "parameters": defaults,
+        "tables": list(document.get("tables", {})),
+        "momenta": names_of(section, "momenta") if "momenta" in section else None,
+        kind: text_of(section, kind, "[system]"),
+        "forces": {key: text_of(document["forces"], key, "[forces]") for key in document.get("forces", {})},
+        "dissipation": text_of(section, "dissipation", "[system]") if "dissipation" in section else None,
+    }
+    return in_section("[system]", lambda: IndexedSystem.from_text(**given))
+
+
+def _state_entries(section: Section, system: IndexedSystem) -> dict[tuple[str, str], Entry]:
+    """What is said of each array of coordinates, and of its velocities or momenta."""
+    check_one(section, "initial", "p", "q_dot")
+    required(section, "q", "[initial]")
+    names = [array.name for array in system.coordinates]
+    found = {}
+    for key in ("q", "p", "q_dot"):
+        if key not in section:
+            continue
+        value, where = section[key], f"[initial] {key}"
+        if not isinstance(value, dict) or (len(names) == 1 and names[0] not in value):
+            if len(names) > 1:
+                raise ModelFileError(
+                    f"{where} must be a table by array, [initial.{key}] with a line for {', '.join(names)}"
+                )
+            value = {names[0]: value}
+        check_keys(value, names, "array", where)
+        for array in system.coordinates:
+            found[key, array.name] = Entry(array, required(value, array.name, where), f"{where}, {array.name}")
+    return found
+
+
+def _read_sizes(section: Section, system: IndexedSystem) -> dict[str, int]:
+    check_keys(section, system.sizes, "size", "[sizes]")
+    return {
+        name: checked_count(value, f"[sizes] {name}", least=1, error=ModelFileError) for name, value in section.items()
+    }
+
+
+def _read_arrays(
+    entries: Mapping[tuple[str, str], Entry],
+    sizes: Mapping[str, int],
+    folder: str | os.PathLike[str],
+    numbers: Mapping[str, float],
+) -> dict[tuple[str, str], Any]:
+    """Lists and files first: they say sizes, of which the others are filled."""
+    sizes, found = dict(sizes), {}
+    for key, entry in sorted(entries.items(), key=lambda item: is_filled(item[1].value)):
+        values = read_array(entry.array, entry.value, entry.where, folder=folder, sizes=sizes, parameters=numbers)
+        if values.ndim != len(entry.array.axes):
+            raise ModelFileError(f"{entry.where} has the shape {values.shape}, which is not that of {entry.array}")
+        for axis, length in zip(entry.array.axes, values.shape, strict=True):
+            if axis.name and sizes.setdefault(axis.name, length) != length:
+                raise ModelFileError(
+                    f"{entry.where}: {axis} is {length} there, and {sizes[axis.name]} elsewhere or in [sizes]"
+                )
+        found[key] = values
+    return found
+
+
+def _whole(values: Any, where: str) -> Any:
+    whole = np.asarray(values).astype(np.int64)
+    if not np.array_equal(whole, values):
+        raise ModelFileError(f"{where} must be whole numbers")
+    return whole
+
+
+def _read_run(section: Section) -> dict[str, Any]:
+    check_one(section, "run", "span", "steps")
+    if "span" not in section and "steps" not in section:
+        raise ModelFileError("there is no span or steps in [run]")
+    found: dict[str, Any] = {"h": real(required(section, "step", "[run]"), "[run] step")}
+    if "span" in section:
+        found["span"] = real(section["span"], "[run] span")
+    for name, least in (("steps", 0), ("every", 1)):
+        if name in section:
+            found[name] = checked_count(section[name], f"[run] {name}", least=least, error=ModelFileError)
+    return found

@@ -1,0 +1,69 @@
+"""A folder with the C of sums over indices, and a program that runs it from the initial state beside it.
+
+ring_svi/  ring_svi.h  ring_svi.c  support/         the integrator, of any number of coordinates
+           main.c  Makefile                         ``make run`` runs it with a C compiler and libm
+           q.txt  velocity.txt  field_m.txt  ..     arrays, a number a line
+           interface.json                           checksums: what was edited since is not overwritten unasked
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.indexed_compiler import generate_indexed
+from scvi_codegen.kinds import PATH, SWITCH, of, takes
+from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
+from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.package import prefix_of
+from scvi_codegen.rendering.indexed import render_indexed_example
+from scvi_codegen.runtime.indexed_interface import read_arrays, read_state
+
+__all__ = ["generate_sums"]
+
+
+@takes(model=of("an IndexedModel", IndexedModel), folder=PATH, force=SWITCH)
+def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write the integrator of a model of sums over indices into a folder, as :func:`generate_package` does.
+
+    Raises:
+        PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
+        MethodError: for a method without sweeps.
+        StateError: where arrays do not fit.
+    """
+    target = Path(folder)
+    source, interface = generate_indexed(model.system, model.method, prefix=prefix_of(target))
+    problem = read_arrays(interface, model.q, model.parameters, model.tables)
+    arrays = {"q": _flat(problem.state)}
+    moving = "p" if model.velocity is None else "velocity"
+    if (given := getattr(model, moving)) is not None:
+        arrays[moving] = _flat(read_state(interface, given, moving))
+    arrays |= {f"field_{name}": values for name, values in problem.fields.items()}
+    arrays |= {f"table_{name}": values for name, values in problem.places.items()}
+    example = render_indexed_example(
+        source.prefix,
+        title=interface.title,
+        momenta=bool(interface.momenta),
+        numbers=problem.numbers,
+        sizes={name: problem.sizes[name] for name in interface.sizes},
+        fields={f"field_{name}": values.size for name, values in problem.fields.items()},
+        tables={f"table_{name}": values.size for name, values in problem.places.items()},
+        moving=moving if moving in arrays else "",
+        run={"t": model.t, "h": model.h, "steps": model.step_count, "every": model.every},
+    )
+    texts = {**source.files, **example, **{f"{name}.txt": _lines(values) for name, values in arrays.items()}}
+    described = {"title": interface.title, "sizes": problem.sizes}
+    write_folder(target, {**texts, INTERFACE_FILE: record_text(texts, **described)}, force=force)
+    return target
+
+
+def _flat(state: Mapping[str, Any]) -> Any:
+    return np.concatenate([values.reshape(-1) for values in state.values()])
+
+
+def _lines(values: Any) -> str:
+    return "".join(f"{value!r}\n" for value in values.reshape(-1).tolist())

@@ -1,0 +1,135 @@
+"""The certificate of an integrator of sums over indices.
+
+At small sizes, cut out of the given arrays, the loops are held against the system written out (:func:`expand_sums`):
+its equations in 60 digits, its exact motion, its compiled steps; none of these has loops. At the sizes given, rates are
+held against NumPy's, and what is conserved is followed along a run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.kinds import MAPPING, of, takes
+from scvi_codegen.lowering.indexed import one_coordinate
+from scvi_codegen.mechanics.indexed.expansion import expand_sums
+from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.indexed_interface import read_arrays
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.verification.certificate import Certificate, Check, Finding, checked, installed_version
+from scvi_codegen.verification.convergence import convergence_checks
+from scvi_codegen.verification.indexed.small import SmallStepper, small_start
+from scvi_codegen.verification.indexed.whole import WholeStart, whole_checks
+from scvi_codegen.verification.stepping import step_checks
+from scvi_codegen.verification.structure import structure_checks
+from scvi_codegen.verification.subject import State, Subject
+
+__all__ = ["verify_indexed"]
+
+SMALL_STEPS = 40
+ROUNDINGS = 16.0 * SMALL_STEPS
+"""What a step may add up to, over so many steps."""
+
+
+@takes(system=INDEXED, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
+@unwarned()
+def verify_indexed(
+    system: IndexedSystem,
+    method: Method | str,
+    q: ArrayLike | Mapping[str, ArrayLike],
+    p: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    *,
+    velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    h: float,
+    t: float = 0.0,
+    parameters: Mapping[str, ArrayLike] | None = None,
+    tables: Mapping[str, ArrayLike] | None = None,
+    stepper: IndexedStepper | None = None,
+    flags: Sequence[str] = TUNED_FLAGS,
+) -> Certificate:
+    """Measure what the integrator of sums over indices promises: at a few places of these arrays, then at all.
+
+    Args:
+        system, method: what is integrated and how.
+        q, p, velocity, h, t, parameters, tables: as of :meth:`IndexedStepper.integrate`; the state of a certificate is
+            that of the few places.
+        stepper: as built; by default compiled now.
+        flags: of the C compiler.
+
+    Raises:
+        BuildError: without a C compiler.
+        MethodError: for a method without sweeps.
+        StateError: for arrays that do not fit.
+    """
+    began = time.perf_counter()
+    chosen = as_method(method, one_coordinate(system))
+    stepper = stepper or compile_indexed(system, chosen, flags=tuple(flags))
+    run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
+    arrays = read_arrays(stepper.interface, q, parameters, tables)
+    start = WholeStart(system, chosen, stepper, arrays, run.p, run.h, run.t)
+    subject = _subject(start)
+    checks = (
+        *checked(
+            "written out", f"{SMALL_STEPS} steps are those of the system written out", partial(_beside, start, subject)
+        ),
+        *step_checks(subject),
+        *structure_checks(subject),
+        *convergence_checks(subject),
+        *whole_checks(start),
+    )
+    return _certificate(start, subject, checks, time.perf_counter() - began)
+
+
+def _subject(start: WholeStart) -> Subject:
+    """The loops at a few places, as an integrator of the system written out for them."""
+    small = small_start(start.stepper.interface, start.arrays, start.p)
+    given = small.given
+    names = [parameter.name for parameter in start.system.parameters]
+    numbers = dict(zip(names, given.numbers, strict=True))
+    written = expand_sums(start.system, given.sizes, tables=given.places, parameters={**numbers, **given.fields})
+    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (given.state, small.p))
+    stepper = SmallStepper(start.stepper, small, written)
+    return Subject(written, start.method, cast(Stepper, stepper), None, State(q, p, start.t, start.h))
+
+
+def _beside(start: WholeStart, subject: Subject) -> Finding:
+    """The largest difference of states, in units of rounding of the first step."""
+    first = subject.states[0]
+    other = compile_stepper(subject.system, start.method, flags=start.stepper.flags)
+    run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": subject.parameters}
+    own, expected = (each.integrate(first.q, first.p, **run) for each in (subject.stepper, other))
+    apart = np.abs(np.concatenate([own.q - expected.q, own.p - expected.p], axis=1)) / subject.rounding(first)
+    return Finding(float(apart.max()), ROUNDINGS, "in units of rounding of a step")
+
+
+def _certificate(start: WholeStart, subject: Subject, checks: tuple[Check, ...], seconds: float) -> Certificate:
+    stepper, given = start.stepper, subject.given
+    parameters = zip(stepper.interface.parameters, start.arrays.numbers, strict=True)
+    return Certificate(
+        title=stepper.interface.title,
+        system=start.system.name,
+        method=start.method.name,
+        version=installed_version(),
+        checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
+        flags=stepper.flags,
+        q=tuple(given.q.tolist()),
+        p=tuple(given.p.tolist()),
+        t=given.t,
+        h=given.h,
+        parameters=dict(parameters),
+        checks=checks,
+        seconds=seconds,
+    )

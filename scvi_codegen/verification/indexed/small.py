@@ -1,0 +1,233 @@
+"""A few places cut out of given arrays, and the integrator there as one of named coordinates, for certificates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.indices import Array
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, RunArrays, check_accesses
+from scvi_codegen.runtime.indexed_run import IndexedRun
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+
+__all__ = ["SmallStepper", "small_start"]
+
+Numbers = NDArray[np.float64]
+
+WINDOWS = ((5, 6), (4, 4), (3, 3), (3, 2), (2, 2), (2, 1), (6, 6), (8, 8), (12, 12), (16, 16))
+"""Places of a size, rows of a table: the first that fit and make few coordinates; else more."""
+FEW = 9
+"""Coordinates, of which 60 digits take seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmallStart:
+    """Arrays of small sizes, as :meth:`IndexedStepper.start` takes them, and of momenta."""
+
+    given: RunArrays
+    p: dict[str, Numbers]
+
+
+def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers]) -> SmallStart:
+    """A few places of the given arrays, where these are largest, and rows of tables with the places that occur in them.
+
+    Raises:
+        StateError: where no accesses stay within so few.
+    """
+    found = None
+    for window, rows in WINDOWS:
+        start = _cut(interface, given, p, _kept(interface, given, p, window, rows))
+        try:
+            check_accesses(interface, start.given.sizes, start.given.places)
+        except StateError:
+            continue
+        count = sum(values.size for values in start.given.state.values())
+        if count <= FEW:
+            return start
+        found = found or start
+    if found is None:
+        raise StateError("no small sizes were found at which every index stays within its array")
+    return found
+
+
+def _kept(
+    interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
+) -> dict[str, NDArray[np.int64]]:
+    """The places that are kept of each size."""
+    tables = {table.axes[0].name for table in interface.tables}
+    kept = {name: np.arange(min(given.sizes[name], rows)) for name in tables}
+    for name in interface.sizes:
+        if name in kept:
+            continue
+        used = [given.places[table][kept[row], column] for table, row, column, of in _columns(interface) if of == name]
+        known = np.unique(np.concatenate([*used, np.empty(0, dtype=np.int64)]))
+        others = np.setdiff1d(_around(interface, given, p, name, window), known)
+        kept[name] = np.union1d(known, others[: max(0, window - len(known))])
+    return kept
+
+
+def _columns(interface: IndexedInterface) -> Iterator[tuple[str, str, int, str]]:
+    """Table, its size, a column, and the size whose places stand there."""
+    rows = {table.name: table.axes[0].name for table in interface.tables}
+    for access, _ in interface.accesses:
+        for place, axis in zip(access.places, access.array.axes, strict=True):
+            if place.table and axis.name:
+                yield place.table, rows[place.table], place.column, axis.name
+
+
+def _around(
+    interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], size: str, window: int
+) -> NDArray[np.int64]:
+    """Neighbours, around where the first array of that size is largest."""
+    length, centre = given.sizes[size], 0
+    for array in interface.coordinates:
+        axes = [k for k, axis in enumerate(array.axes) if axis.name == size]
+        if axes:
+            others = tuple(k for k in range(len(array.axes)) if k != axes[0])
+            centre = int(np.argmax((np.abs(given.state[array.name]) + np.abs(p[array.name])).max(axis=others)))
+            break
+    first = max(0, min(centre - window // 2, length - window))
+    return np.arange(first, min(length, first + window))
+
+
+def _cut(
+    interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], kept: Mapping[str, NDArray[np.int64]]
+) -> SmallStart:
+    def part(array: Array, values: Numbers) -> Numbers:
+        return np.ascontiguousarray(
+            values[np.ix_(*(kept[axis.name] if axis.name else np.arange(axis.number) for axis in array.axes))]
+        )
+
+    places = {table.name: given.places[table.name][kept[table.axes[0].name]] for table in interface.tables}
+    for table, _, column, size in _columns(interface):
+        old = given.places[table][kept[_row_size(interface, table)], column]
+        new = np.minimum(np.searchsorted(kept[size], old), len(kept[size]) - 1)
+        places[table][:, column] = np.where(kept[size][new] == old, new, old % len(kept[size]))
+    return SmallStart(
+        RunArrays(
+            sizes={name: len(kept[name]) for name in interface.sizes},
+            state={array.name: part(array, given.state[array.name]) for array in interface.coordinates},
+            numbers=given.numbers,
+            fields={array.name: part(array, given.fields[array.name]) for array in interface.fields},
+            places=places,
+        ),
+        {array.name: part(array, p[array.name]) for array in interface.coordinates},
+    )
+
+
+def _row_size(interface: IndexedInterface, table: str) -> str:
+    return next(each.axes[0].name for each in interface.tables if each.name == table)
+
+
+class SmallStepper:
+    """The integrator of arrays at small sizes, with what a certificate asks of one of named coordinates.
+
+    Args:
+        stepper: of any size.
+        start: which sizes, fields and tables.
+        written: the system written out for them, whose parameters have the entries of fields among them.
+    """
+
+    interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
+
+    def __init__(self, stepper: IndexedStepper, start: SmallStart, written: MechanicalSystem) -> None:
+        self.stepper, self.arrays, self.written = stepper, start.given, written
+        self.defaults = [float(value) for value in written.defaults]
+
+    def integrate(
+        self,
+        q: Numbers,
+        p: Numbers,
+        *,
+        h: float,
+        steps: int,
+        t: float = 0.0,
+        parameters: Any = None,
+        options: SolverOptions | None = None,
+    ) -> SimpleNamespace:
+        """Every state, (steps + 1, m), and the iterations of each step. Raises as :meth:`IndexedStepper.integrate`."""
+        run = self._run(q, p, h, t, parameters, options)
+        states, counts, times = [self._flat(run)], [0], [run.t]
+        for _ in range(steps):
+            before = run.iterations
+            run.advance(1)
+            states.append(self._flat(run))
+            counts.append(run.iterations - before)
+            times.append(run.t)
+        both = np.array(states)
+        return SimpleNamespace(t=np.array(times), q=both[:, 0], p=both[:, 1], iterations=np.array(counts))
+
+    def step(
+        self,
+        q: Numbers,
+        p: Numbers,
+        h: float,
+        t: float = 0.0,
+        parameters: Any = None,
+        options: SolverOptions | None = None,
+    ) -> tuple[Numbers, Numbers]:
+        """The state after one step. Raises as :meth:`IndexedStepper.integrate`."""
+        run = self._run(q, p, h, t, parameters, options)
+        run.advance(1)
+        end = self._flat(run)
+        return end[0], end[1]
+
+    def velocity(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
+        """V of a state; StateError of a Hamiltonian."""
+        return _joined(self._run(q, p, 1.0, t, parameters, None).velocity)
+
+    def momentum(self, q: Numbers, v: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
+        """P of positions and velocities."""
+        return v / _joined(self._run(q, v, 1.0, t, parameters, None).inverse_masses)
+
+    def energy(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> float:
+        """Of a state."""
+        return self._run(q, p, 1.0, t, parameters, None).energy
+
+    def _run(
+        self, q: Numbers, p: Numbers, h: float, t: float, parameters: Any, options: SolverOptions | None
+    ) -> IndexedRun:
+        values = self._values(parameters)
+        return self.stepper.start(
+            self._arrays(q),
+            self._arrays(p),
+            h=h,
+            t=t,
+            parameters=values,
+            tables=self.arrays.places,
+            options=options,
+        )
+
+    def _values(self, parameters: Any) -> dict[str, Any]:
+        """Numbers and fields from the values of the system written out, by name or in order."""
+        names = [parameter.name for parameter in self.written.parameters]
+        given = self.defaults if parameters is None else parameters
+        known = dict(given) if isinstance(given, Mapping) else dict(zip(names, given, strict=True))
+        found: dict[str, Any] = {name: known[name] for name in self.stepper.interface.parameters}
+        for array in self.stepper.interface.fields:
+            shape = array.shape(self.arrays.sizes)
+            entries = ["_".join([array.name, *map(str, place)]) for place in np.ndindex(*shape)]
+            found[array.name] = np.array([known[name] for name in entries]).reshape(shape)
+        return found
+
+    def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
+        found, start = {}, 0
+        for name, values in self.arrays.state.items():
+            found[name] = np.asarray(flat)[start : start + values.size].reshape(values.shape)
+            start += values.size
+        return found
+
+    def _flat(self, run: IndexedRun) -> tuple[Numbers, Numbers]:
+        return _joined(run.q), _joined(run.p)
+
+
+def _joined(arrays: Mapping[str, Numbers]) -> Numbers:
+    return np.concatenate([values.reshape(-1) for values in arrays.values()])

@@ -1,0 +1,252 @@
+"""What is measured at the sizes given: rates of the loops beside NumPy's, the way back, and what is conserved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sympy import Expr
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.formulas.on_arrays import on_arrays
+from scvi_codegen.formulas.symbols import DOT
+from scvi_codegen.indices import Access, Loop, Place
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.runtime.indexed_interface import RunArrays
+from scvi_codegen.runtime.indexed_run import IndexedRun
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+from scvi_codegen.verification.certificate import Check, Finding, checked, information
+
+__all__ = ["WholeStart", "whole_checks"]
+
+Numbers = NDArray[np.float64]
+
+EPSILON = 2.0**-52
+ROUNDINGS = 64.0
+MOST_ELEMENTS = 5_000_000
+"""Of the loops of a term, at once in NumPy."""
+SHORT = 2.0**-60
+"""Of h: what is left of a step is the rates at its start, and all of it is what rounding cuts off."""
+NUDGE = 2.0**-30
+"""Relative change of each number by which is told what its rounding changes."""
+WORK, MOST_STEPS = 4_000_000, 1000
+"""Coordinates times steps of the run."""
+RESOLVED = EPSILON
+"""Step error below which what changes the energy is rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class WholeStart:
+    """An integrator at given sizes, and where runs begin."""
+
+    system: IndexedSystem
+    method: Method
+    stepper: IndexedStepper
+    arrays: RunArrays
+    p: Mapping[str, Numbers]
+    h: float
+    t: float
+
+    def array(self, name: str) -> Numbers:
+        """Of positions, momenta or parameters."""
+        momenta = {p.name: q.name for q, p in zip(self.system.coordinates, self.system.momenta, strict=False)}
+        if name in momenta:
+            return self.p[momenta[name]]
+        moving = name.removesuffix(DOT)
+        if moving != name and moving in self.p:
+            return self.p[moving] / _masses(self)[moving]
+        return {**self.arrays.state, **self.arrays.fields}[name]
+
+    def run(self, h: float | None = None) -> IndexedRun:
+        """From the beginning, with another step."""
+        return self.begin(self.arrays.state, self.p, self.h if h is None else h, self.t)
+
+    def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> IndexedRun:
+        """From a state."""
+        names = [parameter.name for parameter in self.system.parameters]
+        numbers = dict(zip(names, self.arrays.numbers, strict=True))
+        return self.stepper.start(
+            q, p, h=h, t=t, parameters={**numbers, **self.arrays.fields}, tables=self.arrays.places
+        )
+
+
+def whole_checks(start: WholeStart) -> Iterator[Check]:
+    """All of them; the long run is made once."""
+    sizes = ", ".join(f"{name} = {size}" for name, size in start.arrays.sizes.items()) or "its size"
+    yield from checked("rates", f"at {sizes} loops give the rates that NumPy adds up", partial(_rates, start))
+    yield from checked("energies", f"at {sizes} kinetic and potential energy are NumPy's", partial(_energies, start))
+    if start.method.symmetric:
+        promise = f"at {sizes} a step with -h undoes the step with h"
+        yield from checked("way back", promise, partial(_reversal, start))
+    yield from _long_run(start, sizes)
+
+
+def _rates(start: WholeStart) -> Finding:
+    """(z1 - z0) / h of a very short step, with what rounding cut off z1."""
+    run, worst = start.run(start.h * SHORT), 0.0
+    run.advance(1)
+    expected, nudged = _numpy_rates(start), _numpy_rates(_nudged(start))
+    ends = ((start.arrays.state, run.q), (start.p, run.p))
+    for (before, after), low, slopes, others in zip(ends, run.carries, expected, nudged, strict=True):
+        size = max((float(np.abs(each).max(initial=0.0)) for each in slopes.values()), default=0.0)
+        noise = max((float(np.abs(each - others[name]).max(initial=0.0)) for name, each in slopes.items()), default=0.0)
+        unit = EPSILON * (size + noise / NUDGE) or 1.0
+        for name, exact in slopes.items():
+            rate = ((after[name] - before[name]) + low[name]) / run.h
+            worst = max(worst, float(np.abs(rate - exact).max(initial=0.0)) / unit)
+    return Finding(worst, ROUNDINGS, "in units of rounding")
+
+
+def _nudged(start: WholeStart) -> WholeStart:
+    """The same with every number of the state a little off."""
+
+    def moved(state: Mapping[str, Numbers]) -> dict[str, Numbers]:
+        return {name: x * (1 + NUDGE * np.cos(1.0 + np.arange(x.size)).reshape(x.shape)) for name, x in state.items()}
+
+    return replace(start, arrays=replace(start.arrays, state=moved(start.arrays.state)), p=moved(start.p))
+
+
+def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+    """dq/dt and dp/dt of every coordinate."""
+    system = start.system
+    found = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in system.state}
+    for term, slopes in system.kernels:
+        at = _Places(start, term.loops)
+        for slot, access in term.slots:
+            if slot.name in slopes:
+                np.add.at(found[access.array.name], at.of(access), at.values(slopes[slot.name], term.slots))
+    for force in system.forces:
+        at = _Places(start, force.loops)
+        for access, formula in force.targets:
+            np.add.at(found[access.array.name], at.of(access), at.values(formula, force.slots))
+    if system.momenta:
+        pairs = list(zip(system.coordinates, system.momenta, strict=True))
+        return {q.name: -found[p.name] for q, p in pairs}, {q.name: found[q.name] for q, _ in pairs}
+    masses = _masses(start)
+    return {name: p / masses[name] for name, p in start.p.items()}, found
+
+
+def _masses(start: WholeStart) -> dict[str, Numbers]:
+    masses = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in start.system.coordinates}
+    for mass in start.system.masses:
+        at = _Places(start, mass.loops)
+        np.add.at(masses[mass.access.array.name], at.of(mass.access), at.values(mass.formula, mass.slots))
+    return masses
+
+
+def _energies(start: WholeStart) -> Finding:
+    system, run = start.system, start.run()
+    masses = {} if system.momenta else _masses(start)
+    kinetic = sum(float(np.sum(start.p[name] ** 2 / mass)) / 2 for name, mass in masses.items())
+    values = [_Places(start, term.loops).values(term.formula, term.slots) for term in system.potentials]
+    potential = -sum(float(np.sum(each)) for each in values)
+    size = kinetic + sum(float(np.sum(np.abs(each))) for each in values)
+    wrong = abs(run.energies[0] - kinetic) + abs(run.energies[1] - potential)
+    count = sum(np.size(each) for each in values) + 1
+    return Finding(wrong / (size or 1.0), ROUNDINGS * EPSILON * float(np.log2(count) + 1), "relative to its terms")
+
+
+class _Places:
+    """All values of the indices of loops, as arrays."""
+
+    def __init__(self, start: WholeStart, loops: Sequence[Loop]) -> None:
+        self.start, self.loops, sizes = start, {loop.index: loop for loop in loops}, start.arrays.sizes
+        pairs = {loop.behind: loop for loop in loops if loop.behind}
+        spans = [(loop, np.arange(loop.first.at(sizes), loop.end.at(sizes))) for loop in loops if not loop.behind]
+        counts = [len(span) * (len(span) - 1) // 2 if loop.index in pairs else len(span) for loop, span in spans]
+        if (total := math.prod(counts)) > MOST_ELEMENTS:
+            raise StateError(f"{total} elements of a sum are more than the {MOST_ELEMENTS} that NumPy adds up")
+        grids = np.meshgrid(*(np.arange(count) for count in counts), indexing="ij")
+        self.index: dict[str, NDArray[np.int64]] = {}
+        for (loop, span), grid in zip(spans, grids, strict=True):
+            if loop.index not in pairs:
+                self.index[loop.index] = span[grid.reshape(-1)]
+                continue
+            first, second = np.triu_indices(len(span), 1)
+            self.index[loop.index], self.index[pairs[loop.index].index] = (
+                span[each[grid.reshape(-1)]] for each in (first, second)
+            )
+
+    def of(self, access: Access) -> tuple[Any, ...]:
+        """Where an access stands."""
+        return tuple(self._place(place) for place in access.places)
+
+    def _place(self, place: Place) -> Any:
+        arrays = self.start.arrays
+        if place.table:
+            return arrays.places[place.table][self.index[place.index], place.column]
+        if not place.index:
+            return place.base.at(arrays.sizes)
+        loop, moved = self.loops[place.index], self.index[place.index] + place.base.number
+        return moved % loop.end.at(arrays.sizes) if loop.periodic else moved
+
+    def values(self, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
+        """Of a formula, at every element."""
+        start = self.start
+        known: dict[Expr, Any] = {slot: start.array(access.array.name)[self.of(access)] for slot, access in slots}
+        known |= dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
+        known[start.system.time] = start.t
+        count = next((len(values) for values in self.index.values()), 1)
+        return np.broadcast_to(on_arrays(formula, known), (count,)) if self.index else on_arrays(formula, known)
+
+
+def _reversal(start: WholeStart) -> Finding:
+    """In units of rounding of what is there: coordinates, and what moves them in a step."""
+    run = start.run()
+    run.advance(1)
+    back = start.begin(run.q, run.p, -run.h, run.t)
+    back.advance(1)
+    inverse = run.inverse_masses or {name: np.ones(()) for name in start.p}
+    lengths = [np.abs(each) for each in (*start.arrays.state.values(), *run.q.values())]
+    lengths += [np.abs(run.h * p * inverse[name]) for state in (start.p, run.p) for name, p in state.items()]
+    size = max(float(each.max(initial=0.0)) for each in lengths) or 1.0
+    apart = [np.abs(back.q[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
+    apart += [np.abs(run.h * inverse[name] * (back.p[name] - p)).max(initial=0.0) for name, p in start.p.items()]
+    return Finding(float(max(apart)) / size, ROUNDINGS * EPSILON, "relative to the largest coordinate")
+
+
+def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
+    """Energy and momentum maps along as many steps as are cheap."""
+    run = start.run()
+    count = sum(values.size for values in start.p.values())
+    steps = int(max(20, min(MOST_STEPS, WORK // count)))
+    before, maps = np.array(run.energies), run.momentum_maps
+    terms = _map_sizes(start)
+    try:
+        run.advance(steps)
+    except StepFailedError as failure:
+        yield from checked("conserved", f"at {sizes} energy and momentum maps", partial(_fail, failure))
+        return
+    walk, where = ROUNDINGS * EPSILON * float(np.sqrt(steps)), f"{steps} steps of {run.h:g}"
+    change = abs(run.energy - before[2]) / (abs(before[0]) + abs(before[1]) or 1.0)
+    if not start.system.changes_energy:
+        if start.method.symplectic and run.step_error < RESOLVED:
+            promise = f"at {sizes} nothing but rounding changes it"
+            yield from checked("energy", promise, partial(Finding, float(change), walk, f"relative, {where}"))
+        else:
+            yield information("energy", f"at {sizes} its change, relative", float(change), where)
+    if start.method.symplectic:
+        for k, name in enumerate(start.stepper.momentum_map_names):
+            off = float(abs(run.momentum_maps[k] - maps[k])) / (terms or 1.0)
+            promise = f"at {sizes} a symmetry conserves it to round-off"
+            yield from checked(name, promise, partial(Finding, off, walk, f"relative to its terms, {where}"))
+
+
+def _fail(failure: StepFailedError) -> None:
+    raise failure
+
+
+def _map_sizes(start: WholeStart) -> float:
+    """A size of the terms of momentum maps: all momenta, and these times positions."""
+    p = np.concatenate([np.abs(values).reshape(-1) for values in start.p.values()])
+    q = np.concatenate([np.abs(values).reshape(-1) for values in start.arrays.state.values()])
+    moved = start.run()
+    moved.advance(1)
+    p = p + np.concatenate([np.abs(values).reshape(-1) for values in moved.p.values()])
+    return float(np.sum(p) + np.sum(p * q) + np.sum(p**2 + q**2) * bool(start.system.momenta))

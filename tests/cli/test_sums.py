@@ -1,0 +1,163 @@
+"""The commands with a model of sums over indices."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from scvi_codegen.cli import main
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.native.building import find_compiler
+
+RING = """
+[system]
+name = "ring"
+coordinates = ["q[N]"]
+lagrangian = "sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"
+
+[sizes]
+N = 8
+
+[parameters]
+k = 1.0
+
+[initial]
+q = "sin(2*pi*i/N)"
+q_dot = "cos(2*pi*i/N) + 1/10"
+
+[method]
+method = "svi:4"
+
+[run]
+step = 0.1
+steps = 20
+every = 5
+"""
+
+
+@pytest.fixture
+def ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A model file in the present folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("ring.toml").write_text(RING)
+    return "ring.toml"
+
+
+def invoke(*words: str) -> Result:
+    return CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
+
+
+def test_run(ring: str) -> None:
+    """What is conserved and where it ends, in words, numbers and files, against normal modes."""
+    result = invoke("run", ring, "-o", "ring.npz")
+    assert result.exit_code == 0, result.output
+    for words in ("ring: 8 coordinates, N = 8", "relative energy error", "momentum of q: changed by", "worst step"):
+        assert words in result.stdout
+    document = json.loads(invoke("run", ring, "--json").stdout)
+    assert document["energy_error"] < 1e-14
+    assert document["momentum_changes"]["momentum of q"] < 1e-14
+    with np.load("ring.npz") as saved:
+        assert saved["q_q"].shape == (5, 8)
+        phase, w = 2 * np.pi * np.arange(8) / 8, 2 * np.sin(np.pi / 8)
+        exact = np.sin(phase) * np.cos(2 * w) + np.cos(phase) * np.sin(2 * w) / w + 0.2
+        assert saved["q_q"][-1] == pytest.approx(exact, abs=1e-9)
+    assert document["final"]["q"]["q"] == pytest.approx(exact, abs=1e-9)
+    assert invoke("run", ring, "--quiet").stdout == ""
+
+
+def test_options(ring: str) -> None:
+    """Size, parameter, step, method."""
+    words = ("--size", "N=12", "--parameter", "k=0", "--step", "0.25", "--span", "2", "--method", "stoermer-verlet")
+    document = json.loads(invoke("run", ring, "--json", *words).stdout)
+    assert (document["sizes"], document["steps"], document["method"]) == ({"N": 12}, 8, "stoermer-verlet")
+    i = np.arange(12)
+    assert document["final"]["q"]["q"] == pytest.approx(
+        np.sin(2 * np.pi * i / 12) + 2 * np.cos(2 * np.pi * i / 12) + 0.2, abs=1e-13
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("run", "--tolerance", "1e-9"), "--tolerance is not for sums over indices"),
+        (("run", "--monitor", "frequency"), "monitor is not for sums over indices"),
+        (("run", "-o", "ring.csv"), "saved as .npz"),
+        (("run", "--size", "N=1.5"), "is a whole number, not 1.5"),
+        (("run", "--parameter", "x=1"), "has no parameter 'x'"),
+        (("run", "--method", "scvi:4"), "no sweeps over positions"),
+        (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not for sums over indices"),
+        (("derive", "--html", "page.html"), "--html is not for sums over indices"),
+    ],
+)
+def test_what_is_not_for_sums(ring: str, words: tuple[str, ...], message: str) -> None:
+    """Exit status 2 and the reason."""
+    result = invoke(words[0], ring, *words[1:])
+    assert result.exit_code == 2
+    assert message in result.output
+    assert "belongs to coordinates that are arrays" in invoke("run", "kepler", "--size", "N=1").output
+
+
+def test_a_failing_step(ring: str) -> None:
+    """Exit status 1, with the states before it."""
+    result = invoke("run", ring, "--step", "9", "--steps", "5", "-o", "ring.npz")
+    assert result.exit_code == 1
+    assert "try a smaller h" in result.output
+    assert Path("ring.npz").is_file()
+
+
+def test_derive(ring: str) -> None:
+    """Terms with their derivatives, and the step; in LaTeX sums are sums."""
+    text = invoke("derive", ring, "--method", "stoermer-verlet").stdout
+    (slope,) = (line.partition(": ")[2] for line in text.splitlines() if "by q[i]:" in line)
+    places = {"q[i+1]": "(3.0)", "q[i]": "(1.0)", "k": "0.5"}
+    for name, value in places.items():
+        slope = slope.replace(name, value)
+    assert float(parse_expression(slope, {})) == 1.0
+    assert "p += h*(0.5)*F" in text
+    assert "Conserved: energy, momentum of q" in text
+    assert r"\sum_{i \in \mathbb{Z}_{N}}" in invoke("derive", ring, "--latex").stdout
+
+
+def test_generate(ring: str) -> None:
+    """A folder whose program gives the states of the command, to round-off."""
+    document = json.loads(invoke("run", ring, "--json").stdout)
+    result = invoke("generate", ring, "-o", "ring_svi")
+    assert result.exit_code == 0, result.output
+    flags = ["-O1", "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wno-psabi", "-Werror"]
+    command = [*find_compiler(), *flags, "main.c", "ring_svi.c", "-lm", "-o", "main"]
+    subprocess.run(command, cwd="ring_svi", check=True)
+    said = subprocess.run(["./main"], cwd="ring_svi", check=True, capture_output=True, text=True).stdout
+    assert said.count("energy =") == 5
+    end = np.loadtxt("ring_svi/end.txt")
+    assert end[:8] == pytest.approx(document["final"]["q"]["q"], abs=1e-14)
+    assert end[8:] == pytest.approx(document["final"]["p"]["q"], abs=1e-14)
+    Path("ring_svi/main.c").write_text("mine")
+    assert "was edited" in invoke("generate", ring, "-o", "ring_svi").output
+    assert invoke("generate", ring, "-o", "ring_svi", "--force").exit_code == 0
+
+
+@pytest.mark.parametrize("axes", ["q[N]", "q[N, 2]", "q[N, M]"])
+def test_pictures(axes: str, tmp_path: Path) -> None:
+    """Of a line in time, of bodies, of a plane."""
+    pytest.importorskip("matplotlib")
+    from scvi_codegen.pictures.arrays import plot_arrays
+    from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory
+
+    shape = {"q[N]": (3, 4), "q[N, 2]": (3, 4, 2), "q[N, M]": (3, 4, 5)}[axes]
+    values = np.arange(np.prod(shape), dtype=float).reshape(shape)
+    nothing = {"observed": None, "energies": values, "maps": values, "inverse_masses": {}, "h": 1.0, "steps": 2}
+    run = IndexedTrajectory(
+        t=np.arange(3.0), q={"q": values}, p={"q": values}, **nothing, iterations=0, step_error=0.0, step_error_t=0.0
+    )
+    ax = plot_arrays(run, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 1000
+    if axes == "q[N, 2]":
+        assert ax.get_lines()[1].get_xdata().tolist() == values[-1, :, 0].tolist()
+    else:
+        drawn = values if axes == "q[N]" else values[-1].T
+        assert np.array_equal(ax.get_images()[0].get_array(), drawn)

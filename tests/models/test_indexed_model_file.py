@@ -1,0 +1,135 @@
+"""Model files of sums over indices: arrays by number, list, file and formula; sizes; what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.formulas.indexed import parse_array
+from scvi_codegen.models.array_values import read_array
+from scvi_codegen.models.model_file import read_model_file
+
+NET = """
+[system]
+name = "net"
+coordinates = ["r[N, 2]"]
+lagrangian = '''
+    sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2)
+    - sum(b in B, k/2*sum(a in 2, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2))
+'''
+
+[parameters]
+k = 2.0
+"m[N]" = "1 + i/N"
+
+[tables]
+"bonds[B, 2]" = { file = "bonds.csv" }
+
+[initial]
+r = { file = "start.npz" }
+q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]
+
+[sizes]
+N = 3
+
+[method]
+method = "svi:2"
+
+[run]
+step = 0.1
+steps = 4
+"""
+
+
+@pytest.fixture
+def net(tmp_path: Path) -> Path:
+    """A model file with a table beside it."""
+    path = tmp_path / "net.toml"
+    path.write_text(NET.replace('r = { file = "start.npz" }\n', ""))
+    (tmp_path / "bonds.csv").write_text("a,b\n0,1\n1,2\n")
+    return path
+
+
+def test_what_a_file_says(net: Path) -> None:
+    """Formulas at every place, a table from a file, and the run by hand."""
+    model = sc.load_indexed_model(net, {"parameters": {"k": 3.0}, "run": {"span": 0.2}})
+    angle = 2 * np.pi * np.arange(3) / 3
+    assert model.q["r"] == pytest.approx(np.stack([np.cos(angle), np.sin(angle)], axis=-1), abs=1e-15)
+    assert model.parameters["m"] == pytest.approx([1, 4 / 3, 5 / 3])
+    assert model.tables["bonds"].tolist() == [[0, 1], [1, 2]]
+    assert model.system.defaults == (3.0,)
+    assert (model.h, model.step_count, model.method.name) == (0.1, 2, sc.SVI(2).name)
+    own = model.integrate()
+    other = sc.compile_indexed(model.system, "svi:2").integrate(
+        model.q["r"], h=0.1, steps=2, tables={"bonds": [[0, 1], [1, 2]]}, parameters={"m": [1, 4 / 3, 5 / 3]}
+    )
+    assert np.array_equal(own.q["r"], other.q["r"])
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (0.5, [0.5, 0.5, 0.5]),
+        ([1, 2, 3.5], [1, 2, 3.5]),
+        ("g*i**2/N - sqrt(4)", [-2, -2 + 9.81 / 3, -2 + 4 * 9.81 / 3]),
+        ("atan2(i, 2) + asinh(i) + exp(-i)", np.arctan2(range(3), 2) + np.arcsinh(range(3)) + np.exp(-np.arange(3.0))),
+        ({"file": "a.npy"}, [7, 8, 9]),
+        ({"file": "a.npz", "array": "y"}, [4, 5, 6]),
+        ({"file": "a.csv"}, [1, 2, 3]),
+    ],
+)
+def test_arrays(value: Any, expected: Any, tmp_path: Path) -> None:
+    """In each way that they may be written."""
+    np.save(tmp_path / "a.npy", [7, 8, 9])
+    np.savez(tmp_path / "a.npz", x=[1, 2, 3], y=[4, 5, 6])
+    (tmp_path / "a.csv").write_text("q,v\n1,0\n2,0\n3,0\n")
+    found = read_array(parse_array("q[N]"), value, "q", folder=tmp_path, sizes={"N": 3}, parameters={"g": 9.81})
+    assert found == pytest.approx(expected, rel=1e-15)
+
+
+def test_an_index_means_one_thing() -> None:
+    """A parameter of its name is refused where a formula of places is read."""
+    with pytest.raises(sc.ModelFileError, match="i is an index in formulas of places"):
+        read_array(parse_array("q[N]"), "i", "q", folder=".", sizes={"N": 3}, parameters={"i": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("N = 3", "M = 3", r"unknown size 'M' in \[sizes\]"),
+        ("N = 3", "N = 0", "N"),
+        ("N = 3", "", "nothing says how large N is"),
+        ('"cos(2*pi*i/N)"', '"cos(2*pi*x/N)"', "x"),
+        ('"cos(2*pi*i/N)"', "\"__import__('os')\"", "strings are not part of the grammar"),
+        ('"cos(2*pi*i/N)", ', "", r"1 formulas: one, or one for each component of r\[N, 2\]"),
+        ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0], [1.0]]", "lists of one length"),
+        ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0]]", "N is 1 there, and 3 elsewhere"),
+        ("bonds.csv", "bonds.txt", "arrays are read from .npy, .npz, .csv files"),
+        ("bonds.csv", "none.csv", "cannot be read"),
+        ("steps = 4", "steps = 4\ntolerance = 1e-9", "tolerance is not for sums over indices"),
+        ("steps = 4", "", "no span or steps"),
+        ("step = 0.1", "", "lacks 'step'"),
+        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not for sums over indices"),
+    ],
+)
+def test_what_is_refused(net: Path, old: str, new: str, message: str) -> None:
+    """With the path, and the key at fault."""
+    text = net.read_text()
+    assert old in text
+    net.write_text(text.replace(old, new, 1))
+    with pytest.raises(sc.ModelFileError, match=message) as caught:
+        read_model_file(net)
+    assert str(caught.value).startswith(str(net))
+
+
+def test_each_kind_has_its_reader(net: Path, tmp_path: Path) -> None:
+    """An error names the other."""
+    with pytest.raises(sc.ModelFileError, match="load_indexed_model"):
+        sc.load_model(net)
+    sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
+    with pytest.raises(sc.ModelFileError, match="read by load_model"):
+        sc.load_indexed_model(tmp_path / "kepler.toml")

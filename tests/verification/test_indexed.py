@@ -1,0 +1,156 @@
+"""Certificates of sums over indices: whole integrators pass, faults of what has loops are caught."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen import indexed_compiler
+from scvi_codegen.cli import main
+from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.rendering.indexed import render_indexed
+from scvi_codegen.rendering.source import Source
+
+RANDOM = np.random.default_rng(3)
+BOND = "(r[bonds[b, 0], a] - r[bonds[b, 1], a])"
+SYSTEMS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "ring": (
+        {
+            "coordinates": ["q[N]"],
+            "parameters": {"k": 1.5},
+            "lagrangian": "sum(i in N, q_dot[i]**2/2)"
+            "- k*sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i-1] - q[i])**4)",
+        },
+        {"q": 0.5 * np.sin(2 * np.pi * np.arange(700) / 700), "velocity": 0.1 * RANDOM.normal(size=700), "h": 0.1},
+    ),
+    "net": (
+        {
+            "coordinates": ["r[N, 2]"],
+            "parameters": {"m[N]": 1, "k[B]": 3, "g": 0.5},
+            "tables": ["bonds[B, 2]"],
+            "lagrangian": "sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2)"
+            f"- sum(b in B, k[b]*sum(a in 2, {BOND}**2 + {BOND}**4)) + g*sum(i < j in N, r[i, 0]*r[j, 0])/40",
+        },
+        {
+            "q": RANDOM.normal(size=(40, 2)),
+            "h": 0.02,
+            "tables": {"bonds": [[k, (7 * k + 3) % 40] for k in range(40)]},
+            "parameters": {"m": 1 + RANDOM.uniform(size=40)},
+        },
+    ),
+    "waves": (
+        {
+            "coordinates": ["q[N]"],
+            "momenta": ["p[N]"],
+            "parameters": {"g": 1},
+            "hamiltonian": "sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2"
+            "- g/4*(q[i]**2 + p[i]**2)**2)",
+        },
+        {"q": 0.3 * RANDOM.normal(size=50), "p": 0.3 * RANDOM.normal(size=50), "h": 0.05},
+    ),
+    "damped": (
+        {
+            "coordinates": ["q[N]"],
+            "parameters": {"c": 0.2, "m[N]": 1},
+            "lagrangian": "sum(i in N, m[i]*q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2)",
+            "forces": {"q[i]": "-c*q_dot[i]**3", "q[N-1]": "cos(t)"},
+        },
+        {"q": RANDOM.normal(size=300), "velocity": RANDOM.normal(size=300), "h": 0.05, "parameters": {"m": 2.0}},
+    ),
+}
+
+
+def certificate(name: str, method: str) -> sc.Certificate:
+    """Of one of the systems."""
+    given, start = SYSTEMS[name]
+    system = sc.IndexedSystem.from_text(name=name, **given)
+    return sc.verify_indexed(system, method, **start, flags=QUICK_FLAGS)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [("ring", "svi:3"), ("net", "svi:2"), ("net", "composition:8"), ("waves", "gauss:2"), ("damped", "svi:2")],
+)
+def test_sound_integrators_pass(name: str, method: str) -> None:
+    """Each promise is measured, but for velocities of a Hamiltonian."""
+    found = certificate(name, method)
+    assert found.passed, found.to_text()
+    assert {check.name for check in found.checks} >= {"written out", "stage equations", "rates", "energies", "way back"}
+    assert [check.name for check in found.not_measured] == ["Legendre transform"] * (name == "waves")
+
+
+FAULTS = {
+    "a ring that closes one place off": ("ring", "svi:2", r"place - size;", "place - size + 1;"),
+    "a part of a ring one too long": ("ring", "svi:2", r"\*end = change;", "*end = change + 1;"),
+    "a force of the other sign": ("net", "svi:2", r"(F\[start_r [^;]*?) \+= ", r"\1 -= "),
+    "the other end of a bond": ("net", "svi:2", r"bonds\[index_b \* 2 \+ 0\]", "bonds[index_b * 2 + 1]"),
+    "friction by velocities at the start": ("damped", "svi:2", r"run->p\[i\] \+ kick\)", "run->p[i] + 0.999 * kick)"),
+    "energy without masses": ("net", "svi:2", r"0\.5 \* inverse_mass\[i\] \* ", "0.5 * "),
+    "positions off at the end": ("ring", "svi:2", r"bent = inverse \* ", "bent = 1.00000001 * inverse * "),
+    "what rounding cuts off is lost": ("ring", "svi:2", r"\*carry = rest - \(new_x - sum\);", "*carry = 0.0;"),
+    "positions by the rates of momenta": ("waves", "gauss:2", r"move\(run, parts.G \+ n,", "move(run, parts.G,"),
+    "a kick too long": ("net", "stoermer-verlet", r"run->h \* KICK\[k\]", "1.000000001 * run->h * KICK[k]"),
+    "a long loop without its second part": (
+        "ring",
+        "stoermer-verlet",
+        r"(add_force_0\([\s\S]*?begin < size_N; begin = )end",
+        r"\1size_N",
+    ),
+}
+QUICK = ("a ring that closes one place off",)
+
+
+@pytest.mark.parametrize(
+    "fault", [pytest.param(name, marks=() if name in QUICK else pytest.mark.full) for name in FAULTS]
+)
+def test_faults_are_caught(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One at a time, in the text of the loops."""
+    name, method, pattern, replacement = FAULTS[fault]
+    edits = 0
+
+    def rendered(program: IndexedProgram) -> Source:
+        nonlocal edits
+        source = render_indexed(program).amalgamated()
+        code, edits = re.subn(pattern, replacement, source.code, count=1)
+        return replace(source, code=code)
+
+    monkeypatch.setattr(indexed_compiler, "render_indexed", rendered)
+    monkeypatch.setattr(indexed_compiler, "remembered_text", lambda *given: given[-1]())
+    found = certificate(name, method)
+    assert edits == 1
+    assert found.broken, found.to_text()
+
+
+def test_a_model_file_is_verified(tmp_path: Path) -> None:
+    """Beside it lies the certificate; the exit status is 0."""
+    path = tmp_path / "oscillators.toml"
+    path.write_text(
+        """
+        [system]
+        name = "oscillators"
+        coordinates = ["q[N]"]
+        lagrangian = "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
+        [initial]
+        q = [0.5, -0.3]
+        q_dot = [0.1, 0.2]
+        [method]
+        method = "stoermer-verlet"
+        [run]
+        step = 0.1
+        steps = 10
+        """
+    )
+    result = CliRunner().invoke(main, ["verify", str(path)])
+    assert result.exit_code == 0, result.output
+    assert "every promise measured is kept" in result.output
+    assert json.loads((tmp_path / "oscillators.certificate.json").read_text())["passed"]
