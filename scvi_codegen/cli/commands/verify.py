@@ -36,9 +36,9 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
 
     MODEL may also be a folder written by 'generate': then the C code in it is what is measured. A step is held against
     the paper's equations in 60 digits and these against the exact motion; order, symplecticity, reversal, momenta,
-    Newton's matrix and identities between methods are measured; with a tolerance or a monitor, of the model or as an
-    option, also what runs make of such steps. The JSON goes into the folder or beside the model file.
-    Sums over indices are measured at a few places, where they are written out, and at the sizes given.
+    Newton's matrix and identities between methods are measured; with a tolerance or a monitor of the model also what
+    runs make of such steps. Sums over indices are measured at a few places, where they are written out, and at the
+    sizes given. The JSON goes into the folder or beside the model file.
 
     \b
     Examples:
