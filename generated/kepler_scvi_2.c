@@ -318,6 +318,7 @@ static const double STAGE_OTHER_BEND[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 #include "support/strays.h"
 
 #ifdef __GNUC__
+#define POINTS 2
 #define LANES 2
 #define HOT static inline __attribute__((always_inline))
 #define SWEEPS_AFTER 0
@@ -331,28 +332,28 @@ LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
 LANES_INVERSE_ROOT(5, (square * square * y), (inverse * inverse * inverse));
 
 static const lanes NODE_TIME = {0.5, 1.0};
-static const lanes COLLOCATION[2] = {{0.75, 1.0}, {-0.25, 0.0}};
+static const lanes COLLOCATION[POINTS * GROUPS] = {0.75, 1.0, -0.25, 0.0};
 static const lanes NODE_END = {1.0, 0.0};
 static const lanes NODE_MASK = {1.0, 1.0};
 static const lanes POINT_TIME = {0.2113248654051871, 0.7886751345948129};
-static const lanes POINT_POSITION[2] = {
-    {0.37799153207185376, 0.9553418012614795},
-    {-0.16666666666666666, -0.16666666666666666}};
-static const lanes POINT_VELOCITY[2] = {
-    {1.5773502691896257, 0.4226497308103742},
-    {-0.5773502691896257, 0.5773502691896257}};
-static const lanes COLLOCATION_T[2] = {{0.75, -0.25}, {1.0, 0.0}};
-static const lanes POINT_POSITION_T[2] = {
-    {0.37799153207185376, -0.16666666666666666},
-    {0.9553418012614795, -0.16666666666666666}};
-static const lanes POINT_VELOCITY_T[2] = {
-    {1.5773502691896257, -0.5773502691896257},
-    {0.4226497308103742, 0.5773502691896257}};
+static const lanes POINT_POSITION[POINTS * GROUPS] = {
+    0.37799153207185376, 0.9553418012614795,
+    -0.16666666666666666, -0.16666666666666666};
+static const lanes POINT_VELOCITY[POINTS * GROUPS] = {
+    1.5773502691896257, 0.4226497308103742,
+    -0.5773502691896257, 0.5773502691896257};
+static const lanes COLLOCATION_T[POINTS * GROUPS] = {0.75, -0.25, 1.0, 0.0};
+static const lanes POINT_POSITION_T[POINTS * GROUPS] = {
+    0.37799153207185376, -0.16666666666666666,
+    0.9553418012614795, -0.16666666666666666};
+static const lanes POINT_VELOCITY_T[POINTS * GROUPS] = {
+    1.5773502691896257, -0.5773502691896257,
+    0.4226497308103742, 0.5773502691896257};
 static const lanes POINT_WEIGHT = {0.5, 0.5};
 static const lanes NODE_CONSISTENCY = {1.0, 0.0};
-static const lanes LAST_ALONE[2] = {{-1.0, -2.0}, {2.0, 3.0}};
-static const lanes LAST[2] = {{-6.0, -20.0}, {4.0, 10.0}};
-static const lanes BEFORE[2] = {{-1.0, -4.0}, {4.0, 15.0}};
+static const lanes LAST_ALONE[POINTS * GROUPS] = {-1.0, -2.0, 2.0, 3.0};
+static const lanes LAST[POINTS * GROUPS] = {-6.0, -20.0, 4.0, 10.0};
+static const lanes BEFORE[POINTS * GROUPS] = {-1.0, -4.0, 4.0, 15.0};
 
 /* E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m). Operations: 19 *, 3 +, 4 -, 1
  * inverse_root_3, 1 inverse_root_5. */
@@ -403,7 +404,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #define KEPT_UNIT(i) (step->h)
 #define RESOLVED 1.0
 #define ERROR_POWER 1.5
-static const lanes HIGHEST = {-1.0, 1.0};
+static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
 
 #include "support/curve_error.h"
 #include "support/sweep_or_stage_error.h"

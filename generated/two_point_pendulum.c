@@ -136,7 +136,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #include "support/strays.h"
 
 #ifdef __GNUC__
-#define LANES 2
+#define POINTS 2
 #define HOT static inline __attribute__((always_inline))
 #define SWEEPS_AFTER 1
 
@@ -146,24 +146,28 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 LANES_LIBRARY_FUNCTION(sin);
 
-static const lanes ABSCISSA[1] = {{0.2113248654051871, 0.7886751345948129}};
-static const lanes DRIFT[1] = {{0.2113248654051871, 0.7886751345948129}};
-static const lanes DRIFT_LOW[1] = {{1.1030435245950743e-17, 1.6725140369678172e-17}};
-static const lanes PRODUCT[2] = {
-    {0.08333333333333333, 0.3110042339640731},
-    {0.022329099369260225, 0.08333333333333333}};
-static const lanes PRODUCT_LOW[2] = {
-    {4.625929269271485e-18, -1.0141146892246857e-17},
-    {8.892883537038856e-19, 4.625929269271485e-18}};
-static const lanes POINT_END_POSITION[1] = {{0.39433756729740643, 0.10566243270259355}};
-static const lanes POINT_END_POSITION_LOW[1] = {{8.362570184839086e-18, 5.515217622975371e-18}};
-static const lanes POINT_END_MOMENTUM[1] = {{0.5, 0.5}};
-static const lanes POINT_END_MOMENTUM_LOW[1] = {{0.0, 0.0}};
-static const lanes LAST_ALONE[2] = {
-    {-0.09967936855888598, -0.37200846792814624},
-    {0.20534180126147955, 0.7663460352255527}};
-static const lanes LAST[2] = {{-0.8823714390099913, -3.2930550415329503}, {0.45972170819961705, 1.7157047723433247}};
-static const lanes BEFORE[2] = {{-0.1323714390099913, -0.4940169358562924}, {0.6606836025229591, 2.4657047723433245}};
+static const lanes ABSCISSA[GROUPS] = {0.2113248654051871, 0.7886751345948129};
+static const lanes DRIFT[GROUPS] = {0.2113248654051871, 0.7886751345948129};
+static const lanes DRIFT_LOW[GROUPS] = {1.1030435245950743e-17, 1.6725140369678172e-17};
+static const lanes PRODUCT[POINTS * GROUPS] = {
+    0.08333333333333333, 0.3110042339640731,
+    0.022329099369260225, 0.08333333333333333};
+static const lanes PRODUCT_LOW[POINTS * GROUPS] = {
+    4.625929269271485e-18, -1.0141146892246857e-17,
+    8.892883537038856e-19, 4.625929269271485e-18};
+static const lanes POINT_END_POSITION[GROUPS] = {0.39433756729740643, 0.10566243270259355};
+static const lanes POINT_END_POSITION_LOW[GROUPS] = {8.362570184839086e-18, 5.515217622975371e-18};
+static const lanes POINT_END_MOMENTUM[GROUPS] = {0.5, 0.5};
+static const lanes POINT_END_MOMENTUM_LOW[GROUPS] = {0.0, 0.0};
+static const lanes LAST_ALONE[POINTS * GROUPS] = {
+    -0.09967936855888598, -0.37200846792814624,
+    0.20534180126147955, 0.7663460352255527};
+static const lanes LAST[POINTS * GROUPS] = {
+    -0.8823714390099913, -3.2930550415329503,
+    0.45972170819961705, 1.7157047723433247};
+static const lanes BEFORE[POINTS * GROUPS] = {
+    -0.1323714390099913, -0.4940169358562924,
+    0.6606836025229591, 2.4657047723433245};
 
 /* L_q at all points. Operations: 3 *, 1 neg, 1 sin. */
 static inline void force_lanes(const lanes *u, lanes t, const double *parameters, lanes *value)
@@ -191,7 +195,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #define KEPT_UNIT(i) (data->square * data->inverse_mass[i])
 #define RESOLVED 1.0
 #define ERROR_POWER 2.0
-static const lanes HIGHEST = {0.5, 0.5};
+static const lanes HIGHEST[GROUPS] = {0.5, 0.5};
 
 #include "support/curve_error.h"
 #include "support/sweep_error.h"

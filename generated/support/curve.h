@@ -28,7 +28,7 @@ static inline double end_velocity(const curve_data *curve, int i)
 static int first_curve(const step_data *step, const double *past, long long steps, curve_data *curve)
 {
   if (steps > 0) {
-    lanes_load(past, curve->z[0]);
+    lanes_load(past, curve->z);
     memcpy(curve->v0, past + 2 * M * LANES, sizeof curve->v0);
     for (int i = 0; i < M; i++)
       curve->v0[i] = end_velocity(curve, i);

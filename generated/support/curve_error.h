@@ -15,14 +15,16 @@ static inline double curve_error(const step_data *step, const sweep_data *data, 
     size[i] = fabs(step->q0[i]) + fabs(dq[i]);
   added = share * largest_number(size) + DBL_MIN;
   for (int i = 0; i < M; i++) {
-    const double *x = memory + i * LANES;
+    const double *x = memory + i * POINTS;
     bend[i] =
         KEPT_VELOCITIES ? fabs(x[KEPT - 1] - x[0]) + fabs(x[KEPT / 2] - x[0]) : fabs(x[0]) + fabs(x[KEPT - 1]);
   }
   for (int i = 0; i < M; i++) {
-    lanes all;
-    memcpy(&all, memory + i * LANES, sizeof all);
-    top[i] = lanes_total(HIGHEST * all);
+    lanes all[GROUPS];
+    memcpy(all, memory + i * POINTS, sizeof all);
+    for (int n = 0; n < GROUPS; n++)
+      all[n] *= HIGHEST[n];
+    top[i] = points_total(all);
   }
   for (int i = 0; i < M; i++) {
     size[i] += added;

@@ -4,14 +4,19 @@
 /* What is kept at the points, of the last step and of the one before. */
 typedef double *history;
 
-static inline void lanes_load(const double *memory, lanes *x)
+/* In memory the points of a coordinate follow each other. */
+static inline void lanes_load(const double *memory, lanes (*x)[M])
 {
-  memcpy(x, memory, sizeof(double) * M * LANES);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      memcpy(&x[n][i], memory + i * POINTS + n * LANES, sizeof(lanes));
 }
 
-static inline void lanes_store(const lanes *x, double *memory)
+static inline void lanes_store(lanes (*x)[M], double *memory)
 {
-  memcpy(memory, x, sizeof(double) * M * LANES);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      memcpy(memory + i * POINTS + n * LANES, &x[n][i], sizeof(lanes));
 }
 
 /* Where to compute what is to be kept. */
@@ -31,18 +36,19 @@ static inline void continue_curve(const step_data *step, const double *past, lon
 {
   const struct guess_tables of_one_length = {LAST_ALONE, LAST, BEFORE};
   const struct guess_tables *tables = step->tables ? step->tables : &of_one_length;
-  lanes before[1][M];
-  lanes_load(past, x[0]);
-  lanes_load(past + M * LANES, before[0]);
+  lanes last[GROUPS][M], before[GROUPS][M];
+  lanes_load(past, last);
+  lanes_load(past + M * POINTS, before);
   for (int i = 0; i < M; i++)
-    x[0][i] = steps == 1 ? apply(tables->alone, 0, x, i)
-                         : apply(tables->last, 0, x, i) + apply(tables->before, 0, before, i);
+    for (int n = 0; n < GROUPS; n++)
+      x[n][i] = steps == 1 ? apply(tables->alone, n, last, i)
+                           : apply(tables->last, n, last, i) + apply(tables->before, n, before, i);
 }
 
 static inline void remember_curve(lanes (*x)[M], history past)
 {
-  memcpy(past + M * LANES, past, sizeof(double) * M * LANES);
-  lanes_store(x[0], past);
+  memcpy(past + M * POINTS, past, sizeof(double) * M * POINTS);
+  lanes_store(x, past);
 }
 
 /* The velocities of a motion on a straight line. */
@@ -50,8 +56,9 @@ static inline int start_velocities(const step_data *step, lanes (*z)[M])
 {
   double v[M];
   const int status = NAME(velocity)(step->t, step->q0, step->p0, step->parameters, v, step->scratch);
-  for (int i = 0; status == OK && i < M; i++)
-    z[0][i] = lanes_of(v[i]);
+  for (int n = 0; status == OK && n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      z[n][i] = lanes_of(v[i]);
   return status;
 }
 

@@ -56,7 +56,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   for (int i = 0; i < M; i++)
     m[i] = lanes_of(0.0);
   if (*steps > 0)
-    lanes_load(past + CURVE_MEMORY, m);
+    memcpy(m, past + CURVE_MEMORY, sizeof m);
   for (int k = 0; needs_sweep(&now); k++) {
     lanes change = lanes_of(0.0), r[M], gamma[M];
     double total, misfit[M], last = now.last;
@@ -109,7 +109,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
   save_curve(&curve, past);
-  lanes_store(m, past + CURVE_MEMORY);
+  memcpy(past + CURVE_MEMORY, m, sizeof m);
   *steps = next_guess(*steps, &now, report);
   return OK;
 }

@@ -32,7 +32,6 @@ REQUIREMENT = re.compile(
 TRIAL_SECONDS = 120
 VECTOR_CALL = b"_ZGV"
 """Begins the names of vector functions, by the vector ABI of x86-64."""
-PROCESSOR = Path("/proc/cpuinfo")
 KEPT = 1e-6
 """Of the energy of the trial, which is kept much better."""
 
@@ -143,7 +142,6 @@ def _compilation() -> Iterator[Equipment]:
         "" if not from_wheel(command) or os.environ.get("CC") else " (extra compiler: the PATH has no cc, gcc or clang)"
     )
     yield Equipment(name="compiler", status=OK, found=f"{' '.join(command)}: {title}{why}")
-    yield from _splitting(title)
     own = os.environ.get(FLAGS_VARIABLE, "")
     yield Equipment(
         name="flags", status=OK, found=" ".join([*TUNED_FLAGS, *([own, f"({FLAGS_VARIABLE})"] if own else [])])
@@ -153,22 +151,6 @@ def _compilation() -> Iterator[Equipment]:
         yield trial
         if trial.status == OK:
             yield _vectors(Path(folder))
-
-
-def _splitting(title: str) -> Iterator[Equipment]:
-    """Whether gcc has to take vectors of eight apart, which it does badly."""
-    try:
-        features = PROCESSOR.read_text(encoding="utf-8").split()
-    except OSError:
-        return
-    if "avx2" in features and "avx512f" not in features and "clang" not in title:
-        yield Equipment(
-            name="vectors of eight",
-            status=LACKS,
-            found="this processor has vectors of four, and gcc takes longer ones apart slowly",
-            remedy="steps of methods with more than four points are several times as quick by clang: CC=clang,\n"
-            f"or CC='python -m ziglang cc' of pip install '{PACKAGE}[compiler]'",
-        )
 
 
 def _trial(folder: Path) -> Equipment:

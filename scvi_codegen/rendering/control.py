@@ -11,23 +11,23 @@ from scvi_codegen.rendering.printer import print_number
 
 __all__ = ["ladder_text"]
 
-HEAD = "/* From what is kept of former steps to a guess of the next: by changes of rung. Before it: vectors.h. */\n"
+HEAD = "/* From what is kept of former steps to a guess of the next: by changes of rung. Before it: points.h. */\n"
 
 
-def ladder_text(ladder: Ladder, lanes: int) -> str:
+def ladder_text(ladder: Ladder) -> str:
     """The header."""
-    return HEAD + "".join(f"{table}\n" for table in _tables(ladder, lanes))
+    return HEAD + "".join(f"{table}\n" for table in _tables(ladder))
 
 
-def _tables(ladder: Ladder, lanes: int) -> Iterator[str]:
+def _tables(ladder: Ladder) -> Iterator[str]:
     """From what is kept of former steps to the next: of the last one, and of each of the last two."""
-    changes = len(ladder.alone)
-    yield table(f"static const lanes LADDER_ALONE[{changes}][{lanes}]", [_columns(each) for each in ladder.alone])
+    changes, size = len(ladder.alone), "[POINTS * GROUPS]"
+    yield table(f"static const lanes LADDER_ALONE[{changes}]{size}", [_columns(each) for each in ladder.alone])
     for name, lines in (("LAST", ladder.last), ("BEFORE", ladder.before)):
         rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
-        yield table(f"static const lanes LADDER_{name}[{changes}][{changes}][{lanes}]", rows)
+        yield table(f"static const lanes LADDER_{name}[{changes}][{changes}]{size}", rows)
 
 
 def _columns(rows: NumberTable) -> list[str]:
-    """Vectors, of which column j is what point j gives to all."""
-    return [f"{{{', '.join(map(print_number, column))}}}" for column in zip(*rows, strict=True)]
+    """Column by column, what point j gives to all."""
+    return [print_number(number) for column in zip(*rows, strict=True) for number in column]

@@ -62,7 +62,8 @@ class SweepText:
     """What the templates write of a sweep.
 
     Attributes:
-        lanes: in a vector.
+        lanes: in a vector, or in several, as the C compiler finds vectors.
+        whole: whether in one.
         meaning: of a lane.
         defines: macro and value that the support headers want.
         functions: lines that make functions of vectors.
@@ -74,6 +75,7 @@ class SweepText:
     """
 
     lanes: int
+    whole: bool
     meaning: Lanes
     defines: Mapping[str, str]
     functions: tuple[str, ...]
@@ -103,7 +105,7 @@ def sweep_text(
     Args:
         sweep: what is written.
         meaning: of a lane.
-        lanes: in a vector.
+        lanes: in all vectors of a point or trajectory.
         fallback: what is tried where it fails.
         kernels: those applied to vectors, if they are not the sweep's own.
     """
@@ -114,6 +116,7 @@ def sweep_text(
     solver = _solver(sweep, fallback) if meaning.are_points else ()
     return SweepText(
         lanes=lanes,
+        whole=not (meaning.are_points and sweep.in_groups),
         meaning=meaning,
         defines={
             "SWEEPS_AFTER": str(sweep.sweeps_after),
@@ -125,7 +128,7 @@ def sweep_text(
         mass=mass,
         support=(*meaning.before, "contraction", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),
-        highest=_vector("HIGHEST", sweep.guess.highest),
+        highest=_groups("HIGHEST", sweep.guess.highest),
     )
 
 
@@ -182,7 +185,7 @@ PrintMatrix: TypeAlias = Callable[[str, NumberTable], str]
 def _printers(meaning: Lanes, points: int) -> tuple[PrintVector, PrintMatrix]:
     """How vectors and matrices over points are written: all points in a vector, or a number each."""
     if meaning.are_points:
-        return (lambda name, values: _lanes(f"{name}[1]", (values,))), _columns
+        return _groups, _columns
     size = f"[{points}]"
 
     def vector(name: str, values: Values) -> str:
@@ -198,13 +201,15 @@ def _numbers(values: Sequence[Number]) -> list[str]:
     return [print_number(value) for value in values]
 
 
-def _lanes(name: str, rows: Sequence[Values]) -> str:
-    return table(f"static const lanes {name}", [_numbers(row) for row in rows])
+def _groups(name: str, values: Values) -> str:
+    """A number for each point."""
+    return table(f"static const lanes {name}[GROUPS]", _numbers(values))
 
 
 def _columns(name: str, rows: NumberTable) -> str:
-    """A table whose column j is a vector, what point j gives to all."""
-    return _lanes(f"{name}[{len(rows[0])}]", tuple(zip(*rows, strict=True)))
+    """A table by columns, what point j gives to all."""
+    columns = zip(*rows, strict=True)
+    return table(f"static const lanes {name}[POINTS * GROUPS]", [_numbers(column) for column in columns], braces=False)
 
 
 def _vector(name: str, values: Values) -> str:

@@ -14,9 +14,10 @@ OPERATOR = re.compile(r" ([-+*/=]) ")
 PROTOTYPE = re.compile(r"^\w+ \w+\([^;{]*\);$", re.MULTILINE)
 
 
-def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]]) -> str:
-    """``declaration = {...};`` of numbers, or of rows of numbers, on one line if they fit."""
-    braced = [row if isinstance(row, str) else f"{{{', '.join(row)}}}" for row in rows]
+def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]], *, braces: bool = True) -> str:
+    """``declaration = {...};`` of numbers, or of rows of numbers, in braces or not, on one line if they fit."""
+    left, right = "{}" if braces else ("", "")
+    braced = [row if isinstance(row, str) else f"{left}{', '.join(row)}{right}" for row in rows]
     line = f"{declaration} = {{{', '.join(braced)}}};"
     if len(line) <= WIDTH:
         return line

@@ -173,7 +173,7 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
     name = f"support/{program.prefix}_ladder.h"
     if not (control and control.ladder and program.sweep):
         return {"control": control, "own_headers": {}}
-    return {"control": control, "own_headers": {name: ladder_text(control.ladder, program.sweep.lanes)}}
+    return {"control": control, "own_headers": {name: ladder_text(control.ladder)}}
 
 
 def render_ensemble(program: Program) -> Source | None:

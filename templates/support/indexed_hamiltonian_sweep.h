@@ -74,7 +74,7 @@ static double unresolved(const run_memory *run, const lanes *velocity, long long
     const double size = fabs(run->q[i]) + moved_by(run, velocity, i) + largest;
     const double ends = fabs(rate.lane[KEPT - 1] - rate.lane[0]) + fabs(rate.lane[KEPT / 2] - rate.lane[0]);
     const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
-    const double top = RESOLVED * run->h * lanes_total(HIGHEST * velocity[i]);
+    const double top = RESOLVED * run->h * lanes_total(HIGHEST[0] * velocity[i]);
     least = larger(least, top * top / (bend * size));
   }
   return least;

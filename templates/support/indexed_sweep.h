@@ -148,7 +148,7 @@ static int examine(const run_memory *run, const lanes *F, const lengths *by, lon
     const double unit = by->square * run->inverse_mass[i];
     const double size = fabs(run->q[i]) + fabs(by->h * run->inverse_mass[i] * run->p[i]) + largest;
     const double bend = fabs(unit) * (fabs(force.lane[0]) + fabs(force.lane[KEPT - 1])) + NEGLIGIBLE * size;
-    const double top = RESOLVED * unit * lanes_total(HIGHEST * F[i]);
+    const double top = RESOLVED * unit * lanes_total(HIGHEST[0] * F[i]);
     faults += 0.0 * F[i];
     least = larger(least, top * top / (bend * size));
   }

@@ -1,6 +1,7 @@
-/* Lanes are points: one vector holds what differs from point to point of a step, and numbers are those of one
- * trajectory. Before it: vectors.h. The same names are in trajectories.h, for sweeps that serve both. */
-enum { GROUPS = 1 }; /* vectors for all points */
+/* Lanes are points: one vector, or several where a register holds fewer, are what differs from point to point of a
+ * step, and numbers are those of one trajectory. Before it: vectors.h. The same names are in trajectories.h, for sweeps
+ * that serve both. */
+enum { GROUPS = POINTS / LANES }; /* vectors for all points */
 
 typedef lanes coordinates[M]; /* what all coordinates have at a point */
 
@@ -51,31 +52,43 @@ static inline weight fused_weights(double a, weight b, weight c)
   return multiply_add(lanes_of(a), b, c);
 }
 
-/* sum_j table_j x_j for all points; column j of a table is what point j gives to all. From eight lanes on in four sums
- * that do not wait for each other. */
-static inline lanes lanes_apply(const lanes *table, const lanes *vector)
+/* What point j gives to those of a group: column j of the table times x at j; x stands `apart` from group to group. */
+static inline lanes given_by(const lanes *table, int group, const lanes *x, int apart, int j)
 {
-  const lane_view *x = (const lane_view *)vector;
-#if LANES >= 8
-  lanes a = table[0] * x->lane[0], b = table[1] * x->lane[1], c = table[2] * x->lane[2], d = table[3] * x->lane[3];
-  for (int j = 4; j < LANES; j += 4) {
-    a += table[j] * x->lane[j];
-    b += table[j + 1] * x->lane[j + 1];
-    c += table[j + 2] * x->lane[j + 2];
-    d += table[j + 3] * x->lane[j + 3];
+  return table[j * GROUPS + group] * ((const lane_view *)(x + j / LANES * apart))->lane[j % LANES];
+}
+
+/* The sum of that over all points. From eight points on in four sums that do not wait for each other. */
+static inline lanes given_by_all(const lanes *table, int group, const lanes *x, int apart)
+{
+#if POINTS >= 8
+  lanes a = given_by(table, group, x, apart, 0), b = given_by(table, group, x, apart, 1);
+  lanes c = given_by(table, group, x, apart, 2), d = given_by(table, group, x, apart, 3);
+  for (int j = 4; j < POINTS; j += 4) {
+    a += given_by(table, group, x, apart, j);
+    b += given_by(table, group, x, apart, j + 1);
+    c += given_by(table, group, x, apart, j + 2);
+    d += given_by(table, group, x, apart, j + 3);
   }
   return (a + b) + (c + d);
 #else
-  lanes a = table[0] * x->lane[0];
-  for (int j = 1; j < LANES; j++)
-    a += table[j] * x->lane[j];
+  lanes a = given_by(table, group, x, apart, 0);
+  for (int j = 1; j < POINTS; j++)
+    a += given_by(table, group, x, apart, j);
   return a;
 #endif
 }
 
+/* sum_j table_nj x_j of one coordinate, for the points of a group. */
 static inline lanes apply(const lanes *table, int group, lanes (*x)[M], int i)
 {
-  return lanes_apply(table, &x[group][i]);
+  return given_by_all(table, group, &x[0][i], M);
+}
+
+/* The same for all points in one vector. */
+static inline lanes lanes_apply(const lanes *table, const lanes *x)
+{
+  return given_by_all(table, 0, x, 1);
 }
 
 static inline double lanes_total(lanes x)
@@ -87,15 +100,30 @@ static inline double lanes_total(lanes x)
   return view.lane[0];
 }
 
+/* The sum over the points of all groups, in the same order however many are in a vector. */
+static inline double points_total(lanes *x)
+{
+  for (int half = GROUPS / 2; half > 0; half /= 2)
+    for (int n = 0; n < half; n++)
+      x[n] += x[n + half];
+  return lanes_total(x[0]);
+}
+
 /* sum_n weights_n x_n; then with the low parts of the weights. */
 static inline number weigh(const weight *weights, lanes (*x)[M], int i)
 {
-  return lanes_total(weights[0] * x[0][i]);
+  lanes part[GROUPS];
+  for (int n = 0; n < GROUPS; n++)
+    part[n] = weights[n] * x[n][i];
+  return points_total(part);
 }
 
 static inline number weigh_twice(const weight *weights, const weight *low, lanes (*x)[M], int i)
 {
-  return lanes_total(multiply_add(weights[0], x[0][i], low[0] * x[0][i]));
+  lanes part[GROUPS];
+  for (int n = 0; n < GROUPS; n++)
+    part[n] = multiply_add(weights[n], x[n][i], low[n] * x[n][i]);
+  return points_total(part);
 }
 
 /* What x is at the first point, and at the last. */
@@ -107,7 +135,7 @@ static inline number at_start(lanes (*x)[M], int i)
 
 static inline number at_end(lanes (*x)[M], int i)
 {
-  const lane_view view = {x[0][i]};
+  const lane_view view = {x[GROUPS - 1][i]};
   return view.lane[LANES - 1];
 }
 

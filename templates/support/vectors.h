@@ -1,5 +1,22 @@
-/* Vectors of LANES numbers, which GCC and Clang map to whatever the processor has. Before it: LANES, a power of two. */
+/* Vectors of LANES numbers, which GCC and Clang map to whatever the processor has. Before it: LANES, a power of two; or
+ * POINTS, of which a vector holds what a register does, as GCC keeps longer vectors in memory. */
 #pragma GCC diagnostic ignored "-Wpsabi" /* everything that takes a vector is static */
+#pragma GCC diagnostic ignored "-Wmissing-braces" /* tables are the same for vectors of any length */
+
+#if defined(__AVX512F__)
+#define WIDEST 8
+#elif defined(__AVX__)
+#define WIDEST 4
+#else
+#define WIDEST 2
+#endif
+#ifndef LANES
+#if POINTS < WIDEST
+#define LANES POINTS
+#else
+#define LANES WIDEST
+#endif
+#endif
 #if defined(__AVX512F__) && LANES >= 8 && !defined(__clang__)
 #pragma GCC target("prefer-vector-width=512") /* loops over lanes become whole vectors, not halves */
 #endif

@@ -58,18 +58,6 @@ def test_a_stepper_is_compiled_and_run_in_a_folder_of_its_own(tmp_path, monkeypa
     assert not (tmp_path / "cache").exists()
 
 
-@pytest.mark.usefixtures("without_trial")
-@pytest.mark.parametrize(
-    ("features", "title", "told"),
-    [("sse2 avx2", "gcc 12", True), ("avx2 avx512f", "gcc 12", False), ("sse2 avx2", "clang 19", False)],
-)
-def test_gcc_on_a_processor_with_short_vectors_is_told(tmp_path, monkeypatch, features, title, told):
-    (tmp_path / "cpuinfo").write_text(f"flags : {features}\n")
-    monkeypatch.setattr(checkup, "PROCESSOR", tmp_path / "cpuinfo")
-    monkeypatch.setattr(checkup, "compiler_title", lambda: title)
-    assert ("vectors of eight" in findings()) == told
-
-
 def test_without_a_compiler_it_says_what_to_install(tmp_path, monkeypatch):
     no_compiler(monkeypatch, tmp_path)
     status, said = doctor()

@@ -174,7 +174,6 @@ def test_inputs_are_met_at_their_breakpoints() -> None:
         ("run FILE --advise 1e-9", "give --tolerance in place of --advise"),
         ("run FILE --ensemble grid.toml", "--ensemble does not go with it"),
         ("run FILE --controller symplectic", "depends on time"),
-        ("verify FILE", "the reversible controller chooses how long steps are"),
         ("generate FILE -o by_controller", "generated folders have no reversible controller"),
     ],
 )

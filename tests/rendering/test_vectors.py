@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import platform
 import shutil
 import subprocess
 
@@ -18,10 +19,12 @@ CHECK = """
 
 void check(const double *x, double *y)
 {
-  lane_view view;
-  memcpy(view.lane, x, sizeof view);
-  view.all = lanes_inverse_root_%d(view.all);
-  memcpy(y, view.lane, sizeof view);
+  for (int n = 0; n < 8; n += LANES) {
+    lane_view view;
+    memcpy(view.lane, x + n, sizeof view);
+    view.all = lanes_inverse_root_%d(view.all);
+    memcpy(y + n, view.lane, sizeof view);
+  }
 }
 """
 
@@ -50,3 +53,28 @@ def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
         exact = np.longdouble(x) ** (np.longdouble(-k) / 2)
         worst = max(worst, float(np.max(np.abs((y - exact) / exact))))
     assert worst < 2 * 2.0**-52 + k * 2.0**-54
+
+
+SHORT, LONG = ("-O1", "-march=x86-64"), ("-O1", "-march=native")
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the lengths of vectors of other processors are not chosen")
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("kepler", sc.SVI(8)),  # in four vectors of two points, or in one of eight
+        ("outer-solar-system", sc.SVI(9)),  # in eight, or in two
+        ("double-pendulum", sc.SVI(5)),  # coupled
+        ("double-pendulum", sc.SVI(4, "gauss-legendre:6")),  # projected
+        ("point-vortices", sc.SVI(6)),  # a Hamiltonian
+    ],
+)
+def test_points_are_in_as_many_vectors_as_registers_want(name, method):
+    given = sc.problem(name)
+    ends = []
+    for flags in (SHORT, LONG):
+        stepper = sc.compile_stepper(given.system, method, flags=flags)
+        p = given.p if given.p is not None else stepper.momentum(given.q, given.velocity)
+        run = stepper.integrate(given.q, p, h=given.step, steps=20)
+        ends.append(np.concatenate([run.q[-1], run.p[-1]]))
+    assert np.abs(ends[0] - ends[1]).max() < 1e-13 * np.abs(ends[1]).max()
