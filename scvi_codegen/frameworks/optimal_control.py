@@ -89,15 +89,13 @@ def optimal_control(
     E. Trelat, Discrete and Continuous Dynamical Systems 35 (2015) 4193.
     """
     ca = imported("casadi", "casadi")
-    if system.constraints or not system.inputs:
-        lacks = "has constraints" if system.constraints else "has no inputs"
-        raise MethodError(f"'{system.name}' {lacks}: give inputs=[..] and independent coordinates, or use casadi_step")
+    _check_controllable(system)
     task = Task(
         ca=ca,
         system=system,
         method=as_method(method, system),
         steps=checked_count(steps, "steps", least=1),
-        duration=interval("duration", duration),
+        duration=_checked_duration(duration),
         start=start,
         end=end,
         cost=cost,
@@ -107,8 +105,6 @@ def optimal_control(
         t=checked_number(t, "the time t"),
         parameters=_parameter_values(system, parameters or {}),
     )
-    if not 0 < task.duration[0] <= task.duration[1] < np.inf:
-        raise StateError(f"a duration is a positive number, or two from the shortest to the longest, not {duration}")
     program = task.program()
     motion = task.motion(program, *program.solved(task.first(guess or {}), options or {}))
     if not motion.solved:
@@ -118,6 +114,20 @@ def optimal_control(
             motion,
         )
     return motion
+
+
+def _check_controllable(system: MechanicalSystem) -> None:
+    if system.constraints or not system.inputs:
+        lacks = "has constraints" if system.constraints else "has no inputs"
+        raise MethodError(f"'{system.name}' {lacks}: give inputs=[..] and independent coordinates, or use casadi_step")
+
+
+def _checked_duration(given: float | tuple[float, float]) -> tuple[float, float]:
+    """The shortest and the longest."""
+    shortest, longest = interval("duration", given)
+    if not 0 < shortest <= longest < np.inf:
+        raise StateError(f"a duration is a positive number, or two from the shortest to the longest, not {given}")
+    return shortest, longest
 
 
 def _parameter_values(system: MechanicalSystem, given: Mapping[str, float]) -> Array:
