@@ -16,6 +16,7 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -66,6 +67,9 @@ TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", 
 
 PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
+
+DECLARATIONS, CONDITION = "declarations.h", re.compile("^#", re.MULTILINE)
+"""What Python is told of a library, and what in it depends on the processor."""
 
 CUT_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
 """With -O3, for text with kernels cut into functions: these passes take gcc a tenth of its time and look for common
@@ -311,7 +315,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
             for name, passes in parts.items():
                 command = [*compiler, "-fPIC", "-std=c99", f"-I{folder}", *flags, *passes, *define, *wanted]
                 ended.enter_context(_finished([*command, "-c", f"{name}.c"], folder))
-            _write_binding(source, folder)
+            _write_binding(_chosen(source, [*compiler, *flags, *wanted], folder), folder)
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
@@ -322,12 +326,25 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
         (folder / f"{name}.o").unlink()
 
 
-def _write_binding(source: Source, folder: Path) -> None:
+def _chosen(source: Source, command: list[str], folder: Path) -> str:
+    """The declarations; where they depend on the processor, as the compiler takes them."""
+    text = "".join(each.declarations for each in source.sources)
+    if not CONDITION.search(text):
+        return text
+    (folder / DECLARATIONS).write_text(text, encoding="utf-8")
+    _run([*command, "-E", "-P", DECLARATIONS, "-o", f"{DECLARATIONS}.i"], folder)
+    chosen = (folder / f"{DECLARATIONS}.i").read_text(encoding="utf-8")
+    for name in (DECLARATIONS, f"{DECLARATIONS}.i"):
+        (folder / name).unlink()
+    return chosen
+
+
+def _write_binding(declarations: str, folder: Path) -> None:
     from cffi import FFI  # only building needs the parser; loading does not
     from cffi.recompiler import make_py_source  # what FFI.emit_python_code calls, without its message on stdout
 
     binding = FFI()
-    binding.cdef("".join(each.declarations for each in source.sources))
+    binding.cdef(declarations)
     binding.set_source(folder.name, None)
     make_py_source(binding, folder.name, str(_binding(folder)), verbose=False)
 

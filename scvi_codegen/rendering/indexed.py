@@ -79,7 +79,7 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
 
 def _sweep_text(program: IndexedProgram) -> SweepText | None:
     sweep, kernels = program.sweep, [each.kernel for each in program.forces]
-    return sweep_text(sweep, POINTS, sweep.lanes, fallback="none", kernels=kernels) if sweep else None
+    return sweep_text(sweep, POINTS, fallback="none", kernels=kernels) if sweep else None
 
 
 def _vector_functions(program: IndexedProgram) -> list[str]:

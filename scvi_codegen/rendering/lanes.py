@@ -62,7 +62,7 @@ class SweepText:
     """What the templates write of a sweep.
 
     Attributes:
-        lanes: in a vector, or in several, as the C compiler finds vectors.
+        lanes: where they are points, in one vector or in several, as the processor wants.
         whole: whether in one.
         meaning: of a lane.
         defines: macro and value that the support headers want.
@@ -98,14 +98,13 @@ class SweepText:
 
 
 def sweep_text(
-    sweep: Sweep, meaning: Lanes, lanes: int, *, fallback: Fallback, kernels: Sequence[Kernel] | None = None
+    sweep: Sweep, meaning: Lanes, *, fallback: Fallback, kernels: Sequence[Kernel] | None = None
 ) -> SweepText:
-    """A sweep in vectors of ``lanes`` lanes.
+    """A sweep in vectors.
 
     Args:
         sweep: what is written.
         meaning: of a lane.
-        lanes: in all vectors of a point or trajectory.
         fallback: what is tried where it fails.
         kernels: those applied to vectors, if they are not the sweep's own.
     """
@@ -115,8 +114,8 @@ def sweep_text(
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
     solver = _solver(sweep, fallback) if meaning.are_points else ()
     return SweepText(
-        lanes=lanes,
-        whole=not (meaning.are_points and sweep.in_groups),
+        lanes=sweep.lanes,
+        whole=meaning.are_points and not sweep.in_groups,
         meaning=meaning,
         defines={
             "SWEEPS_AFTER": str(sweep.sweeps_after),

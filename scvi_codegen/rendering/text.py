@@ -54,8 +54,6 @@ DECLARATIONS = {
 }
 """Inner part of a header by the name of its template."""
 
-ENSEMBLE_LANES = 8
-"""Trajectories at a time: a vector of AVX-512, two of AVX2, four of NEON."""
 
 LARGEST_INLINED = 150
 """Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies
@@ -191,12 +189,11 @@ def render_ensemble(program: Program) -> Source | None:
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
-        "width": ENSEMBLE_LANES,
         "points": len(sweep.guess.abscissae),
         "cut": _is_cut(sweep.kernels),
         "needs_velocities": sweep.kept is Kept.VELOCITIES,
         "hot": "static",
-        "sweep": sweep_text(sweep, TRAJECTORIES, ENSEMBLE_LANES, fallback="none"),
+        "sweep": sweep_text(sweep, TRAJECTORIES, fallback="none"),
     }
     return _render(prefix, context, "ensemble")
 
@@ -300,7 +297,7 @@ def _lane_context(program: Program, fallback: Fallback) -> dict[str, object]:
     if sweep is None:
         return {"sweep": None}
     hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
-    text = sweep_text(sweep, POINTS, sweep.lanes, fallback=fallback)
+    text = sweep_text(sweep, POINTS, fallback=fallback)
     return {"sweep": text, "hot": hot}
 
 

