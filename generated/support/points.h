@@ -52,14 +52,20 @@ static inline weight fused_weights(double a, weight b, weight c)
   return multiply_add(lanes_of(a), b, c);
 }
 
-/* What point j gives to those of a group: column j of the table times x at j; x stands `apart` from group to group. */
-static inline lanes given_by(const lanes *table, int group, const lanes *x, int apart, int j)
+/* What x is at a point; it stands `apart` from group to group. */
+static inline double at_point(const lanes *x, long long apart, int j)
 {
-  return table[j * GROUPS + group] * ((const lane_view *)(x + j / LANES * apart))->lane[j % LANES];
+  return ((const lane_view *)(x + j / LANES * apart))->lane[j % LANES];
+}
+
+/* What point j gives to those of a group: column j of the table times x at j; x stands `apart` from group to group. */
+static inline lanes given_by(const lanes *table, int group, const lanes *x, long long apart, int j)
+{
+  return table[j * GROUPS + group] * at_point(x, apart, j);
 }
 
 /* The sum of that over all points. From eight points on in four sums that do not wait for each other. */
-static inline lanes given_by_all(const lanes *table, int group, const lanes *x, int apart)
+static inline lanes given_by_all(const lanes *table, int group, const lanes *x, long long apart)
 {
 #if POINTS >= 8
   lanes a = given_by(table, group, x, apart, 0), b = given_by(table, group, x, apart, 1);
@@ -109,34 +115,43 @@ static inline double points_total(lanes *x)
   return lanes_total(x[0]);
 }
 
-/* sum_n weights_n x_n; then with the low parts of the weights. */
-static inline number weigh(const weight *weights, lanes (*x)[M], int i)
+/* sum_n weights_n x_n of groups that stand `apart`; then with the low parts of the weights. */
+static inline number weigh_apart(const weight *weights, const lanes *x, long long apart)
 {
   lanes part[GROUPS];
   for (int n = 0; n < GROUPS; n++)
-    part[n] = weights[n] * x[n][i];
+    part[n] = weights[n] * x[n * apart];
   return points_total(part);
+}
+
+static inline number weigh_apart_twice(const weight *weights, const weight *low, const lanes *x, long long apart)
+{
+  lanes part[GROUPS];
+  for (int n = 0; n < GROUPS; n++)
+    part[n] = multiply_add(weights[n], x[n * apart], low[n] * x[n * apart]);
+  return points_total(part);
+}
+
+/* The same of one coordinate. */
+static inline number weigh(const weight *weights, lanes (*x)[M], int i)
+{
+  return weigh_apart(weights, &x[0][i], M);
 }
 
 static inline number weigh_twice(const weight *weights, const weight *low, lanes (*x)[M], int i)
 {
-  lanes part[GROUPS];
-  for (int n = 0; n < GROUPS; n++)
-    part[n] = multiply_add(weights[n], x[n][i], low[n] * x[n][i]);
-  return points_total(part);
+  return weigh_apart_twice(weights, low, &x[0][i], M);
 }
 
 /* What x is at the first point, and at the last. */
 static inline number at_start(lanes (*x)[M], int i)
 {
-  const lane_view view = {x[0][i]};
-  return view.lane[0];
+  return at_point(&x[0][i], M, 0);
 }
 
 static inline number at_end(lanes (*x)[M], int i)
 {
-  const lane_view view = {x[GROUPS - 1][i]};
-  return view.lane[LANES - 1];
+  return at_point(&x[0][i], M, POINTS - 1);
 }
 
 /* What becomes of a change of each point: that of the trajectory. */

@@ -2,7 +2,7 @@
  * their rates there until they rest. Before it: points.h, contraction.h, the tables, forces, which gives the slopes G
  * at X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand behind positions. */
 
-/* The parts of work: y at the points, and slopes there in this step, the last and the one before. */
+/* The parts of work, group after group of points: y there, and slopes in this step, the last and the one before. */
 typedef struct {
   lanes *X, *G, *last, *before;
 } parts_of_work;
@@ -12,7 +12,7 @@ static parts_of_work divide(const run_memory *run, long long n)
   lanes *work = (lanes *)run->work, *slopes_of[3];
   parts_of_work parts;
   for (int k = 0; k < 3; k++)
-    slopes_of[(k + run->turn) % 3] = work + (k + 1) * 2 * n;
+    slopes_of[(k + run->turn) % 3] = work + (k + 1) * GROUPS * 2 * n;
   parts.X = work;
   parts.G = slopes_of[0], parts.last = slopes_of[1], parts.before = slopes_of[2];
   return parts;
@@ -21,27 +21,36 @@ static parts_of_work divide(const run_memory *run, long long n)
 /* Slopes continued from former steps. */
 static void continue_slopes(const run_memory *run, const parts_of_work *parts, long long n)
 {
-  for (long long i = 0; i < 2 * n; i++)
-    parts->G[i] = run->guess == 1
-        ? lanes_apply(LAST_ALONE, &parts->last[i])
-        : lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]);
+  const long long apart = 2 * n;
+  for (int g = 0; g < GROUPS; g++)
+    for (long long i = 0; i < apart; i++)
+      parts->G[g * apart + i] = run->guess == 1
+          ? given_by_all(LAST_ALONE, g, &parts->last[i], apart)
+          : given_by_all(LAST, g, &parts->last[i], apart) + given_by_all(BEFORE, g, &parts->before[i], apart);
 }
 
 /* n places of y from `first` on by their rates, of which a table and weights make increments; returned is the sum of
  * the squares of what that changes, over that of their sizes if these are not absolute. */
-static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, lanes weights,
+static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, const lanes *weights,
     long long first, long long n, int absolute)
 {
+  const long long apart = 2 * n;
   lanes total = lanes_of(0.0);
   double size = 0.0;
   for (long long i = first; i < first + n; i++) {
-    const lanes scaled = weights * rates[i - first], increment = lanes_apply(table, &scaled);
-    const lanes y = run->q[i] + (run->carry_q[i] + increment), moved = y - X[i];
-    const lane_view end = {increment};
-    const double of_one = fabs(run->q[i]) + fabs(end.lane[LANES - 1]);
-    total += moved * moved;
+    lanes scaled[GROUPS], increment[GROUPS];
+    double of_one;
+    for (int g = 0; g < GROUPS; g++)
+      scaled[g] = run->h * weights[g] * rates[g * apart + i - first];
+    for (int g = 0; g < GROUPS; g++) {
+      lanes y, moved;
+      increment[g] = given_by_all(table, g, scaled, 1);
+      y = run->q[i] + (run->carry_q[i] + increment[g]), moved = y - X[g * apart + i];
+      total += moved * moved;
+      X[g * apart + i] = y;
+    }
+    of_one = fabs(run->q[i]) + fabs(at_point(increment, 1, POINTS - 1));
     size += of_one * of_one;
-    X[i] = y;
   }
   return absolute || size == 0.0 ? lanes_total(total) + 0.0 * size : lanes_total(total) / size;
 }
@@ -50,16 +59,15 @@ static double improve(const run_memory *run, lanes *X, const lanes *rates, const
 static int finite_slopes(const lanes *G, long long n)
 {
   lanes faults = lanes_of(0.0);
-  for (long long i = 0; i < 2 * n; i++)
+  for (long long i = 0; i < GROUPS * 2 * n; i++)
     faults += 0.0 * G[i];
   return lanes_total(faults) == 0.0;
 }
 
 /* About how far a coordinate moves in a step. */
-static inline double moved_by(const run_memory *run, const lanes *velocity, long long i)
+static inline double moved_by(const run_memory *run, const lanes *velocity, long long n, long long i)
 {
-  const lane_view rate = {velocity[i]};
-  return fabs(run->h * rate.lane[KEPT / 2]);
+  return fabs(run->h * at_point(&velocity[i], 2 * n, KEPT / 2));
 }
 
 /* What the highest coefficient of the velocities at the points moves a coordinate by, squared, over what they bend it
@@ -68,23 +76,28 @@ static double unresolved(const run_memory *run, const lanes *velocity, long long
 {
   double largest = DBL_MIN, least = 0.0;
   for (long long i = 0; i < n; i++)
-    largest = larger(largest, fabs(run->q[i]) + moved_by(run, velocity, i));
+    largest = larger(largest, fabs(run->q[i]) + moved_by(run, velocity, n, i));
   for (long long i = 0; i < n; i++) {
-    const lane_view rate = {velocity[i]};
-    const double size = fabs(run->q[i]) + moved_by(run, velocity, i) + largest;
-    const double ends = fabs(rate.lane[KEPT - 1] - rate.lane[0]) + fabs(rate.lane[KEPT / 2] - rate.lane[0]);
+    const lanes *rate = &velocity[i];
+    const double size = fabs(run->q[i]) + moved_by(run, velocity, n, i) + largest;
+    const double start = at_point(rate, 2 * n, 0), middle = at_point(rate, 2 * n, KEPT / 2);
+    const double ends = fabs(at_point(rate, 2 * n, KEPT - 1) - start) + fabs(middle - start);
     const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
-    const double top = RESOLVED * run->h * lanes_total(HIGHEST[0] * velocity[i]);
+    const double top = RESOLVED * run->h * weigh_apart(HIGHEST, rate, 2 * n);
     least = larger(least, top * top / (bend * size));
   }
   return least;
 }
 
 /* The end of the step, of n places from `first` on. */
-static void move(run_memory *run, const lanes *rates, lanes end, lanes weights, long long first, long long n)
+static void move(run_memory *run, const lanes *rates, const lanes *end, const lanes *weights, long long first, long long n)
 {
-  for (long long i = first; i < first + n; i++)
-    add_compensated(&run->q[i], &run->carry_q[i], lanes_total(end * (weights * rates[i - first])), 0.0);
+  for (long long i = first; i < first + n; i++) {
+    lanes scaled[GROUPS];
+    for (int g = 0; g < GROUPS; g++)
+      scaled[g] = run->h * weights[g] * rates[g * 2 * n + i - first];
+    add_compensated(&run->q[i], &run->carry_q[i], weigh_apart(end, scaled, 1), 0.0);
+  }
 }
 
 /* Errors of positions become errors of momenta in a sweep, and back in the next: changes are judged in pairs. */
@@ -92,18 +105,17 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
     solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
-  const lanes t = run->t + run->h * ABSCISSA[0];
-  const lanes by_velocity = run->h * POSITION_WEIGHT[0], by_force = run->h * MOMENTUM_WEIGHT[0];
   double first = 0.0, last = INFINITY, change = 0.0, error;
   int status = 0;
   if (run->guess > 0)
     continue_slopes(run, &parts, n);
   else
-    memset(parts.G, 0, sizeof(lanes) * 2 * (size_t)n);
+    memset(parts.G, 0, sizeof(lanes) * GROUPS * 2 * (size_t)n);
   for (int k = 0; status == 0; k++) {
-    const double of_q = improve(run, parts.X, parts.G + n, POSITION, by_velocity, 0, n, options->absolute);
-    const double of_p = improve(run, parts.X, parts.G, MOMENTUM, by_force, n, n, options->absolute);
-    forces(given, parts.X, t, parts.G, 2 * n);
+    const double of_q = improve(run, parts.X, parts.G + n, POSITION, POSITION_WEIGHT, 0, n, options->absolute);
+    const double of_p = improve(run, parts.X, parts.G, MOMENTUM, MOMENTUM_WEIGHT, n, n, options->absolute);
+    for (int g = 0; g < GROUPS; g++)
+      forces(given, parts.X + g * 2 * n, run->t + run->h * ABSCISSA[g], parts.G + g * 2 * n, 2 * n);
     change = k % 2 ? of_q + of_p : change + of_q + of_p;
     if (k == 0 || k % 2)
       continue;
@@ -122,8 +134,8 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
     run->error = error;
     run->error_t = run->t;
   }
-  move(run, parts.G + n, POINT_END_POSITION[0], by_velocity, 0, n);
-  move(run, parts.G, POINT_END_MOMENTUM[0], by_force, n, n);
+  move(run, parts.G + n, POINT_END_POSITION, POSITION_WEIGHT, 0, n);
+  move(run, parts.G, POINT_END_MOMENTUM, MOMENTUM_WEIGHT, n, n);
   run->guess = run->guess > 0 && first < GOOD_GUESS ? 2 : 1;
   run->turn = (run->turn + 1) % 3;
   return OK;

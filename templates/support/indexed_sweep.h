@@ -2,18 +2,20 @@
  * velocity: that of separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h,
  * contraction.h, the tables, forces. */
 
-/* The parts of work: positions at the points (velocities behind them), and forces there in this step, the last and the
- * one before. */
+/* The parts of work, group after group of points: positions of all coordinates (velocities behind them), and forces
+ * there in this step, the last and the one before. */
 typedef struct {
   lanes *X, *F, *last, *before;
 } parts_of_work;
+
+enum { OF_EACH = 1 + VELOCITIES }; /* numbers of a coordinate in X */
 
 static parts_of_work divide(const run_memory *run, long long n)
 {
   lanes *work = (lanes *)run->work, *forces_of[3];
   parts_of_work parts;
   for (int k = 0; k < 3; k++)
-    forces_of[(k + run->turn) % 3] = work + (k + 1 + VELOCITIES) * n;
+    forces_of[(k + run->turn) % 3] = work + (k + OF_EACH) * GROUPS * n;
   parts.X = work;
   parts.F = forces_of[0], parts.last = forces_of[1], parts.before = forces_of[2];
   return parts;
@@ -39,6 +41,12 @@ static inline double drift_of(const run_memory *run, long long i, double *low)
   return drift;
 }
 
+static void forces_at_points(const run_memory *run, const problem *given, const lanes *X, lanes *F, long long n)
+{
+  for (int g = 0; g < GROUPS; g++)
+    forces(given, X + g * OF_EACH * n, run->t + run->h * ABSCISSA[g], F + g * n, n);
+}
+
 /* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate, and its
  * drift. */
 static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
@@ -47,18 +55,20 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
   for (long long i = 0; i < n; i++) {
     double low;
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
-    lanes x = run->q[i] + DRIFT[0] * drift, bend = lanes_of(0.0);
-    if (run->guess == 1)
-      bend = lanes_apply(LAST_ALONE, &parts->last[i]);
-    else if (run->guess > 1)
-      bend = lanes_apply(LAST, &parts->last[i]) + lanes_apply(BEFORE, &parts->before[i]);
-#if VELOCITIES
-    parts->F[i] = bend; /* forces are guessed, of which velocities are made, too */
-    bend = lanes_apply(PRODUCT, &parts->F[i]);
-#endif
-    if (run->guess > 0)
-      x += unit * bend;
-    parts->X[i] = x;
+    for (int g = 0; g < GROUPS; g++) {
+      lanes bend = lanes_of(0.0);
+      if (run->guess == 1)
+        bend = given_by_all(LAST_ALONE, g, &parts->last[i], n);
+      else if (run->guess > 1)
+        bend = given_by_all(LAST, g, &parts->last[i], n) + given_by_all(BEFORE, g, &parts->before[i], n);
+      if (VELOCITIES) /* forces were continued, of which velocities are made, too */
+        parts->F[g * n + i] = bend;
+      parts->X[g * OF_EACH * n + i] = run->q[i] + DRIFT[g] * drift;
+      if (!VELOCITIES && run->guess > 0)
+        parts->X[g * OF_EACH * n + i] += unit * bend;
+    }
+    for (int g = 0; VELOCITIES && g < GROUPS; g++)
+      parts->X[g * OF_EACH * n + i] += unit * given_by_all(PRODUCT, g, &parts->F[i], n);
     largest = larger(largest, fabs(run->q[i]) + fabs(drift));
   }
   return largest;
@@ -72,13 +82,14 @@ static double improve(const run_memory *run, const parts_of_work *parts, const l
   for (long long i = 0; i < n; i++) {
     double low;
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
-    const lanes x = (run->q[i] + DRIFT[0] * drift) + unit * lanes_apply(PRODUCT, &parts->F[i]);
-    const lanes moved = x - parts->X[i];
-    total += moved * moved;
-    parts->X[i] = x;
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes x = (run->q[i] + DRIFT[g] * drift) + unit * given_by_all(PRODUCT, g, &parts->F[i], n);
+      const lanes moved = x - parts->X[g * OF_EACH * n + i];
+      total += moved * moved;
+      parts->X[g * OF_EACH * n + i] = x;
+    }
     if (size) {
-      const lane_view force = {parts->F[i]};
-      const double of_one = fabs(run->q[i]) + fabs(drift) + fabs(unit * force.lane[0]);
+      const double of_one = fabs(run->q[i]) + fabs(drift) + fabs(unit * at_point(&parts->F[i], n, 0));
       *size += of_one * of_one;
     }
   }
@@ -89,12 +100,15 @@ static double improve(const run_memory *run, const parts_of_work *parts, const l
 /* Velocities at the points by the forces; returned is the sum of the squares of what that changes, times h. */
 static double improve_velocities(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
 {
-  lanes total = lanes_of(0.0), *V = parts->X + n;
-  for (long long i = 0; i < n; i++) {
-    const lanes kick = run->carry_p[i] + by->h * lanes_apply(VELOCITY, &parts->F[i]);
-    const lanes v = run->inverse_mass[i] * (run->p[i] + kick), moved = by->h * (v - V[i]);
-    total += moved * moved;
-    V[i] = v;
+  lanes total = lanes_of(0.0);
+  for (int g = 0; g < GROUPS; g++) {
+    lanes *V = parts->X + (g * OF_EACH + 1) * n;
+    for (long long i = 0; i < n; i++) {
+      const lanes kick = run->carry_p[i] + by->h * given_by_all(VELOCITY, g, &parts->F[i], n);
+      const lanes v = run->inverse_mass[i] * (run->p[i] + kick), moved = by->h * (v - V[i]);
+      total += moved * moved;
+      V[i] = v;
+    }
   }
   return lanes_total(total);
 }
@@ -119,10 +133,12 @@ static void last_positions(const run_memory *run, const parts_of_work *parts, co
   for (long long i = 0; i < n; i++) {
     double drift_low;
     const double drift = drift_of(run, i, &drift_low), inverse = run->inverse_mass[i];
-    const lanes sum = lanes_apply(PRODUCT, &parts->F[i]), low = lanes_apply(PRODUCT_LOW, &parts->F[i]);
-    const lanes rest = run->carry_q[i] + DRIFT[0] * drift_low + DRIFT_LOW[0] * drift;
-    parts->X[i] = sum_of_three(lanes_of(run->q[i]), DRIFT[0] * drift + inverse * (by->square * sum),
-        rest + inverse * (by->square * low + by->square_low * sum));
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes sum = given_by_all(PRODUCT, g, &parts->F[i], n), low = given_by_all(PRODUCT_LOW, g, &parts->F[i], n);
+      const lanes rest = run->carry_q[i] + DRIFT[g] * drift_low + DRIFT_LOW[g] * drift;
+      parts->X[g * OF_EACH * n + i] = sum_of_three(lanes_of(run->q[i]), DRIFT[g] * drift + inverse * (by->square * sum),
+          rest + inverse * (by->square * low + by->square_low * sum));
+    }
   }
 }
 
@@ -130,10 +146,8 @@ static void last_positions(const run_memory *run, const parts_of_work *parts, co
 static double largest_at_end(const lanes *X, long long n)
 {
   double largest = DBL_MIN;
-  for (long long i = 0; i < n; i++) {
-    const lane_view at = {X[i]};
-    largest = larger(largest, fabs(at.lane[KEPT - 1]));
-  }
+  for (long long i = 0; i < n; i++)
+    largest = larger(largest, fabs(at_point(&X[i], OF_EACH * n, KEPT - 1)));
   return largest;
 }
 
@@ -144,12 +158,13 @@ static int examine(const run_memory *run, const lanes *F, const lengths *by, lon
   lanes faults = lanes_of(0.0);
   double least = 0.0;
   for (long long i = 0; i < n; i++) {
-    const lane_view force = {F[i]};
     const double unit = by->square * run->inverse_mass[i];
     const double size = fabs(run->q[i]) + fabs(by->h * run->inverse_mass[i] * run->p[i]) + largest;
-    const double bend = fabs(unit) * (fabs(force.lane[0]) + fabs(force.lane[KEPT - 1])) + NEGLIGIBLE * size;
-    const double top = RESOLVED * unit * lanes_total(HIGHEST[0] * F[i]);
-    faults += 0.0 * F[i];
+    const double ends = fabs(at_point(&F[i], n, 0)) + fabs(at_point(&F[i], n, KEPT - 1));
+    const double bend = fabs(unit) * ends + NEGLIGIBLE * size;
+    const double top = RESOLVED * unit * weigh_apart(HIGHEST, &F[i], n);
+    for (int g = 0; g < GROUPS; g++)
+      faults += 0.0 * F[g * n + i];
     least = larger(least, top * top / (bend * size));
   }
   *error = least;
@@ -159,16 +174,19 @@ static int examine(const run_memory *run, const lanes *F, const lengths *by, lon
 /* The state at the end of the step. */
 static void move(run_memory *run, const lanes *F, const lengths *by, long long n)
 {
-  const lanes kick = by->h * POINT_END_MOMENTUM[0];
-  const lanes kick_low = fused_weights(by->h, POINT_END_MOMENTUM[0], -kick) + by->h * POINT_END_MOMENTUM_LOW[0];
+  lanes kick[GROUPS], kick_low[GROUPS];
+  for (int g = 0; g < GROUPS; g++) {
+    kick[g] = by->h * POINT_END_MOMENTUM[g];
+    kick_low[g] = fused_weights(by->h, POINT_END_MOMENTUM[g], -kick[g]) + by->h * POINT_END_MOMENTUM_LOW[g];
+  }
   for (long long i = 0; i < n; i++) {
     double drift_low;
     const double drift = drift_of(run, i, &drift_low), inverse = run->inverse_mass[i];
-    const double sum = lanes_total(multiply_add(POINT_END_POSITION[0], F[i], POINT_END_POSITION_LOW[0] * F[i]));
+    const double sum = weigh_apart_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, &F[i], n);
     const double bent = inverse * (by->square * sum), increment = drift + bent, part = increment - drift;
     const double low = (drift - (increment - part)) + (bent - part) + (drift_low + inverse * (by->square_low * sum));
     add_compensated(&run->q[i], &run->carry_q[i], increment, low);
-    add_compensated(&run->p[i], &run->carry_p[i], lanes_total(multiply_add(kick, F[i], kick_low * F[i])), 0.0);
+    add_compensated(&run->p[i], &run->carry_p[i], weigh_apart_twice(kick, kick_low, &F[i], n), 0.0);
   }
 }
 
@@ -178,16 +196,15 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
 {
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
-  const lanes t = run->t + run->h * ABSCISSA[0];
   double largest = first_positions(run, &parts, &by, n), size = 0.0, first = 0.0, last = INFINITY, error;
   int status = 0;
   improve_velocities(run, &parts, &by, n);
-  forces(given, parts.X, t, parts.F, n);
+  forces_at_points(run, given, parts.X, parts.F, n);
   for (int k = 0; status == 0; k++) {
     double change = improve(run, &parts, &by, n, k == 0 ? &size : NULL);
     change += improve_velocities(run, &parts, &by, n);
     change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
-    forces(given, parts.X, t, parts.F, n);
+    forces_at_points(run, given, parts.X, parts.F, n);
     status = sweep_status(change, last, options, k);
     first = k == 0 ? change : first;
     last = change;
@@ -200,7 +217,7 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   if (largest <= DBL_MIN)
     largest = largest_at_end(parts.X, n);
   improve_velocities(run, &parts, &by, n);
-  forces(given, parts.X, t, parts.F, n);
+  forces_at_points(run, given, parts.X, parts.F, n);
   if (!examine(run, parts.F, &by, n, largest, &error))
     return NOT_FINITE;
   if (run->error == run->error && !(error <= run->error)) {
