@@ -90,7 +90,8 @@ static double unresolved(const run_memory *run, const lanes *velocity, long long
 }
 
 /* The end of the step, of n places from `first` on. */
-static void move(run_memory *run, const lanes *rates, const lanes *end, const lanes *weights, long long first, long long n)
+static void move(run_memory *run, const lanes *rates, const lanes *end, const lanes *weights, long long first,
+    long long n)
 {
   for (long long i = first; i < first + n; i++) {
     lanes scaled[GROUPS];
