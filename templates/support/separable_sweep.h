@@ -37,11 +37,13 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
 }
 
 /* The increments of one step and their low parts. The points X follow q0 + h c v0 + h^2 (a A) F / m until they rest;
- * then once more with all digits of the coefficients. The forces are kept. */
+ * then once more with all digits of the coefficients. The forces are kept. What rounding cuts off coefficients moves
+ * points to the same side in every step; the last sweep alone would leave a part of that, so all have the rest, by the
+ * first forces. */
 HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, number *dq, number *dp,
     const solver_options *options, solver_report *report)
 {
-  coordinates X[GROUPS], base[GROUPS], own[GROUPS], *F = kept(past, own);
+  coordinates X[GROUPS], base[GROUPS], rest[GROUPS], own[GROUPS], *F = kept(past, own);
   number drift[M], drift_low[M], inverse_size[M];
   progress now = before_sweeps();
   int status;
@@ -65,11 +67,15 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     inverse_size[i] = magnitude(step->q0[i]) + magnitude(drift[i]) +
         magnitude(data->square * data->inverse_mass[i] * at_start(F, i));
   invert_sizes(options, 1.0, inverse_size);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      rest[n][i] = step->carry_q[i] + DRIFT[n] * drift_low[i] + DRIFT_LOW[n] * drift[i] +
+          data->inverse_mass[i] * (data->square * apply(PRODUCT_LOW, n, F, i));
   for (int k = 0; needs_sweep(&now); k++) {
     lanes change = lanes_of(0.0);
     for (int i = 0; i < M; i++)
       for (int n = 0; n < GROUPS; n++) {
-        const lanes x = base[n][i] + (data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i);
+        const lanes x = base[n][i] + ((data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i) + rest[n][i]);
         const lanes moved = (x - X[n][i]) * inverse_size[i];
         change += moved * moved;
         X[n][i] = x;
