@@ -43,7 +43,7 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
 HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, number *dq, number *dp,
     const solver_options *options, solver_report *report)
 {
-  coordinates X[GROUPS], base[GROUPS], rest[GROUPS], own[GROUPS], *F = kept(past, own);
+  coordinates X[GROUPS], base[GROUPS], rests[GROUPS], own[GROUPS], *F = kept(past, own);
   number drift[M], drift_low[M], inverse_size[M];
   progress now = before_sweeps();
   int status;
@@ -69,13 +69,13 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   invert_sizes(options, 1.0, inverse_size);
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++)
-      rest[n][i] = step->carry_q[i] + DRIFT[n] * drift_low[i] + DRIFT_LOW[n] * drift[i] +
+      rests[n][i] = step->carry_q[i] + DRIFT[n] * drift_low[i] + DRIFT_LOW[n] * drift[i] +
           data->inverse_mass[i] * (data->square * apply(PRODUCT_LOW, n, F, i));
   for (int k = 0; needs_sweep(&now); k++) {
     lanes change = lanes_of(0.0);
     for (int i = 0; i < M; i++)
       for (int n = 0; n < GROUPS; n++) {
-        const lanes x = base[n][i] + ((data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i) + rest[n][i]);
+        const lanes x = base[n][i] + ((data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i) + rests[n][i]);
         const lanes moved = (x - X[n][i]) * inverse_size[i];
         change += moved * moved;
         X[n][i] = x;
