@@ -68,7 +68,7 @@ TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", 
 PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 """For code that must give the same bits on every IEEE 754 machine with the same libm."""
 
-DECLARATIONS, CONDITION = "declarations.h", re.compile("^#", re.MULTILINE)
+DECLARATIONS, DIRECTIVE = "declarations.h", re.compile("^#", re.MULTILINE)
 """What Python is told of a library, and what in it depends on the processor."""
 
 CUT_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
@@ -315,7 +315,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
             for name, passes in parts.items():
                 command = [*compiler, "-fPIC", "-std=c99", f"-I{folder}", *flags, *passes, *define, *wanted]
                 ended.enter_context(_finished([*command, "-c", f"{name}.c"], folder))
-            _write_binding(_chosen(source, [*compiler, *flags, *wanted], folder), folder)
+            _write_binding(_declarations(source, [*compiler, *flags, *wanted], folder), folder)
         try:
             _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
@@ -326,17 +326,18 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
         (folder / f"{name}.o").unlink()
 
 
-def _chosen(source: Source, command: list[str], folder: Path) -> str:
-    """The declarations; where they depend on the processor, as the compiler takes them."""
+def _declarations(source: Source, command: list[str], folder: Path) -> str:
+    """What Python is told of a library; where that depends on the processor, as the compiler takes it."""
     text = "".join(each.declarations for each in source.sources)
-    if not CONDITION.search(text):
+    if not DIRECTIVE.search(text):
         return text
-    (folder / DECLARATIONS).write_text(text, encoding="utf-8")
-    _run([*command, "-E", "-P", DECLARATIONS, "-o", f"{DECLARATIONS}.i"], folder)
-    chosen = (folder / f"{DECLARATIONS}.i").read_text(encoding="utf-8")
-    for name in (DECLARATIONS, f"{DECLARATIONS}.i"):
-        (folder / name).unlink()
-    return chosen
+    given, found = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
+    given.write_text(text, encoding="utf-8")
+    _run([*command, "-E", "-P", given.name, "-o", found.name], folder)
+    text = found.read_text(encoding="utf-8")
+    given.unlink()
+    found.unlink()
+    return text
 
 
 def _write_binding(declarations: str, folder: Path) -> None:

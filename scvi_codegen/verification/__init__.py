@@ -11,7 +11,6 @@ All is measured at states and parameters a little off those given: nothing hides
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Sequence
 
@@ -29,7 +28,7 @@ from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.verification.certificate import Certificate, Check, Outcome, installed_version
+from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
 from scvi_codegen.verification.identities import identity_checks
@@ -104,7 +103,20 @@ def verify(
         *identity_checks(subject),
         largest_step(subject),
     )
-    return _certificate(stepper, subject, checks, time.perf_counter() - began)
+    return issued(
+        stepper.source.files,
+        title=stepper.title,
+        system=single.name,
+        method=method.name,
+        flags=stepper.flags,
+        q=given.q,
+        p=given.p,
+        t=given.t,
+        h=given.h,
+        parameters={name.name: value for name, value in single.constants.items()},
+        checks=checks,
+        seconds=time.perf_counter() - began,
+    )
 
 
 def _in_own_time(system: MechanicalSystem) -> MechanicalSystem:
@@ -112,25 +124,6 @@ def _in_own_time(system: MechanicalSystem) -> MechanicalSystem:
         return system
     assert system.clock.plain is not None
     return system.clock.plain
-
-
-def _certificate(stepper: Stepper, subject: Subject, checks: tuple[Check, ...], seconds: float) -> Certificate:
-    given = subject.given
-    return Certificate(
-        title=stepper.title,
-        system=subject.system.name,
-        method=subject.method.name,
-        version=installed_version(),
-        checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
-        flags=stepper.flags,
-        q=tuple(given.q.tolist()),
-        p=tuple(given.p.tolist()),
-        t=given.t,
-        h=given.h,
-        parameters={name.name: value for name, value in subject.system.constants.items()},
-        checks=checks,
-        seconds=seconds,
-    )
 
 
 def _newton(

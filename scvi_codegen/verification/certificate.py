@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from functools import partial
@@ -26,7 +27,7 @@ __all__ = [
     "Outcome",
     "checked",
     "information",
-    "installed_version",
+    "issued",
 ]
 
 
@@ -192,7 +193,18 @@ class Certificate:
         write_atomically(path, partial(_write, self.to_json()))
 
 
-def installed_version() -> str:
+def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], **said: Any) -> Certificate:
+    """The certificate of C files by name, for a state, with what else is said in it."""
+    return Certificate(
+        version=_installed_version(),
+        checksum=hashlib.sha256("".join(files.values()).encode()).hexdigest(),
+        q=tuple(map(float, q)),
+        p=tuple(map(float, p)),
+        **said,
+    )
+
+
+def _installed_version() -> str:
     """Of this package."""
     try:
         return importlib.metadata.version("scvi-codegen")

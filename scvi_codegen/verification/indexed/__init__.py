@@ -7,7 +7,6 @@ held against NumPy's, and what is conserved is followed along a run.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -29,7 +28,7 @@ from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.indexed_interface import read_arrays
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.verification.certificate import Certificate, Check, Finding, checked, installed_version
+from scvi_codegen.verification.certificate import Certificate, Finding, checked, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.indexed.small import SmallStepper, small_start
 from scvi_codegen.verification.indexed.whole import WholeStart, whole_checks
@@ -90,7 +89,21 @@ def verify_indexed(
         *convergence_checks(subject),
         *whole_checks(start),
     )
-    return _certificate(start, subject, checks, time.perf_counter() - began)
+    given = subject.given
+    return issued(
+        stepper.source.files,
+        title=stepper.interface.title,
+        system=system.name,
+        method=chosen.name,
+        flags=stepper.flags,
+        q=given.q,
+        p=given.p,
+        t=given.t,
+        h=given.h,
+        parameters=dict(zip(stepper.interface.parameters, arrays.numbers, strict=True)),
+        checks=checks,
+        seconds=time.perf_counter() - began,
+    )
 
 
 def _subject(start: WholeStart) -> Subject:
@@ -113,23 +126,3 @@ def _beside(start: WholeStart, subject: Subject) -> Finding:
     own, expected = (each.integrate(first.q, first.p, **run) for each in (subject.stepper, other))
     apart = np.abs(np.concatenate([own.q - expected.q, own.p - expected.p], axis=1)) / subject.rounding(first)
     return Finding(float(apart.max()), ROUNDINGS, "in units of rounding of a step")
-
-
-def _certificate(start: WholeStart, subject: Subject, checks: tuple[Check, ...], seconds: float) -> Certificate:
-    stepper, given = start.stepper, subject.given
-    parameters = zip(stepper.interface.parameters, start.arrays.numbers, strict=True)
-    return Certificate(
-        title=stepper.interface.title,
-        system=start.system.name,
-        method=start.method.name,
-        version=installed_version(),
-        checksum=hashlib.sha256("".join(stepper.source.files.values()).encode()).hexdigest(),
-        flags=stepper.flags,
-        q=tuple(given.q.tolist()),
-        p=tuple(given.p.tolist()),
-        t=given.t,
-        h=given.h,
-        parameters=dict(parameters),
-        checks=checks,
-        seconds=seconds,
-    )
