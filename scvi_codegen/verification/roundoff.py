@@ -3,14 +3,18 @@
 A step of fixed length changes a state by less than rounding lets a double show; runs therefore carry along what was cut
 off (compensated sums). With them errors walk at random (Brouwer's law), without them, or with coefficients of 53 bits,
 they drift. The first two checks are deterministic: steps so short that the carry is all of them, and a carry so long
-that to forget it anywhere shows. The third is Student's t of what many runs make of an invariant.
+that to forget it anywhere shows. The third is Student's t of what many runs make of an invariant, with sweeps that go
+on until nothing changes. By default they stop when what is left is less than a rounding; it has a sign, and what it
+adds up to is measured by itself.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +23,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.exact.motion import numbers
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.methods import SCVI
+from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble, LaneBlock
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.precision import mp
@@ -47,6 +52,9 @@ WORK, FEWEST_STEPS, MOST_STEPS = 2**14, 2**9, 2**13
 """Steps times coordinates of each run."""
 STUDENT = 7.0
 """Of 63 degrees of freedom: sound code exceeds it once in a billion times."""
+TO_REST = SolverOptions(tolerance=2.0**-68)
+LEFT = 0.25
+"""Part of the tolerance, a rounding, that sweeps may leave, see ``templates/support/contraction.h``."""
 NO_TRUNCATION = 2.0**-56
 """Relative change of the energy in one exact step, below which what changes it is rounding."""
 
@@ -57,8 +65,9 @@ def roundoff_checks(subject: Subject) -> Iterator[Check]:
         ("sums", f"{SHORT_STEPS} steps of h 2^-40 add up to one as long as all", _sums),
         ("low parts", "what rounding cut off a state enters the next step", _low_parts),
         ("ensemble", "lanes take the steps of single runs, with their low parts", _ensemble),
-        ("drift", "the invariants of runs walk at random: Student's t of their mean", _drift),
+        ("drift", "with sweeps that come to rest invariants walk at random: Student's t of their mean", _drift),
         ("drift of ensembles", "the same in lanes", _drift_of_lanes),
+        ("rest of sweeps", "as sweeps stop by default, they move an invariant by part of a rounding a step", _rests),
     ):
         yield from checked(name, promise, partial(measure, subject))
 
@@ -217,16 +226,41 @@ def _keeps_energy(subject: Subject) -> bool:
     return bool(abs(after - before) <= NO_TRUNCATION * abs(before))
 
 
-def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Array]]) -> Finding | None:
-    """Student's t of the changes of each invariant along many runs from states near each other, the largest."""
+@dataclass(frozen=True, slots=True)
+class _Walk:
+    """What many runs from states near each other make of an invariant: mean and spread of its relative changes."""
+
+    name: str
+    steps: int
+    mean: float
+    spread: float
+    runs: int
+
+    @property
+    def student(self) -> float:
+        """Student's t of the mean."""
+        return abs(self.mean) / math.hypot(self.spread, EPSILON / 4) * math.sqrt(self.runs)
+
+    @property
+    def sure(self) -> float:
+        """Of the mean what is no chance, in roundings a step."""
+        return max(abs(self.mean) - STUDENT * self.spread / math.sqrt(self.runs), 0.0) / (EPSILON * self.steps)
+
+    @property
+    def remark(self) -> str:
+        """What was measured, where."""
+        return f"{self.name}, {RUNS} runs of {self.steps} steps"
+
+
+def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Array]]) -> Iterator[_Walk]:
+    """Of each invariant."""
     invariants = _invariants(subject)
     if not invariants:
-        return None
+        return
     given, m = subject.given, len(subject.given.q)
     starts = given.z + SPREAD * subject.scales(given) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
     steps = min(MOST_STEPS, max(FEWEST_STEPS, WORK // m))
     end = run(starts[:, :m], starts[:, m:], steps)
-    worst = Finding(0.0, STUDENT)
     for invariant in invariants:
         before, sizes = invariant.values(starts[:, :m], starts[:, m:], given.t)
         after, _ = invariant.values(*end, given.t + steps * given.h)
@@ -234,22 +268,32 @@ def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Arr
         changes = changes[np.isfinite(changes)]
         if len(changes) < RUNS // 2:
             raise StateError(f"{invariant.name}: runs of {steps} steps fail")
-        spread = np.hypot(np.std(changes, ddof=1), EPSILON / 4)
-        t = float(abs(np.mean(changes)) / spread * np.sqrt(len(changes)))
-        worst = max(worst, Finding(t, STUDENT, f"{invariant.name}, {RUNS} runs of {steps} steps"))
-    return worst
+        yield _Walk(invariant.name, steps, float(np.mean(changes)), float(np.std(changes, ddof=1)), len(changes))
+
+
+def _runs(subject: Subject, options: SolverOptions | None, q: Array, p: Array, steps: int) -> tuple[Array, Array]:
+    """The ends of runs, one by one."""
+    ends = []
+    given: dict[str, Any] = {"h": subject.given.h, "t": subject.given.t, "parameters": subject.parameters}
+    for start in zip(q, p, strict=True):
+        own = subject.stepper.start(*start, **given, options=options)
+        own.skip(steps)
+        ends.append((own.q, own.p))
+    return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
+
+
+def _judged(walks: Iterator[_Walk]) -> Finding | None:
+    """The largest t."""
+    return max((Finding(walk.student, STUDENT, walk.remark) for walk in walks), default=None)
 
 
 def _drift(subject: Subject) -> Finding | None:
-    def run(q: Array, p: Array, steps: int) -> tuple[Array, Array]:
-        ends = []
-        for start in zip(q, p, strict=True):
-            own = subject.stepper.start(*start, h=subject.given.h, t=subject.given.t, parameters=subject.parameters)
-            own.skip(steps)
-            ends.append((own.q, own.p))
-        return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
+    return _judged(_walks(subject, partial(_runs, subject, TO_REST)))
 
-    return _walks(subject, run)
+
+def _rests(subject: Subject) -> Finding | None:
+    walks = _walks(subject, partial(_runs, subject, None))
+    return max((Finding(walk.sure, LEFT, walk.remark) for walk in walks), default=None)
 
 
 def _drift_of_lanes(subject: Subject) -> Finding | None:
@@ -259,8 +303,8 @@ def _drift_of_lanes(subject: Subject) -> Finding | None:
     def run(q: Array, p: Array, steps: int) -> tuple[Array, Array]:
         given = subject.given
         runs = subject.stepper.integrate_ensemble(
-            q, p, h=given.h, steps=steps, every=steps, t=given.t, parameters=subject.parameters
+            q, p, h=given.h, steps=steps, every=steps, t=given.t, parameters=subject.parameters, options=TO_REST
         )
         return runs.q[-1], runs.p[-1]
 
-    return _walks(subject, run)
+    return _judged(_walks(subject, run))

@@ -81,7 +81,7 @@ ROUNDOFF = (
     ),
     ("weights of 53 bits", "round/svi-8", "sweep", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
     ("h^2 of 53 bits", "kepler/svi-3", "prepare_sweep", r"data->square_low = .*;", "data->square_low = 0.0;"),
-    ("drifts of 53 bits", "kepler/svi-3", "sweep", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
+    ("drifts of 53 bits", "oscillator/svi-8", "sweep", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
 )
 
 MUTATIONS = (
@@ -179,7 +179,12 @@ MUTATIONS = (
         r"moved->relative <= options->tolerance",
         "moved->relative <= 1e-5",
     ),
-    text("sweeps accept too early", case("kepler/svi-3"), r"<= options->tolerance \* options->tolerance", "<= 1e-12"),
+    text(
+        "sweeps accept too early",
+        case("kepler/svi-3"),
+        r"tolerance = options->tolerance \* options->tolerance",
+        "tolerance = 1e-12",
+    ),
     text(
         "Newton's residual wrong with kept factors",
         case("pendulum/svi"),

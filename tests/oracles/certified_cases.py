@@ -6,7 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from sabotage import Case
-from samples import driven_duffing, linkage, pumped_cart_pole, pumped_swing, pushed_pendulum, sleigh, turning_wire
+from samples import (
+    driven_duffing,
+    linkage,
+    oscillator,
+    pumped_cart_pole,
+    pumped_swing,
+    pushed_pendulum,
+    sleigh,
+    turning_wire,
+)
 
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -35,6 +44,7 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "kepler": (problem("kepler").system, (0.3, 0.8), (-1.1, 0.4), 0.1),
     "slowed": (reparametrise(problem("kepler").system, "distance"), (0.3, 0.8), (-1.1, 0.4), 0.2),
     "round": (problem("kepler").system, (0.8, 0.1), (0.1, 1.2), 0.35),
+    "oscillator": (oscillator(), (0.7,), (0.2,), 1.5),
     "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
     "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
     "linkage": (linkage(), (0.0, 1.0, 1.94, 1.5), (0.1, 0.2, 0.0, 0.3), 0.02),
@@ -78,8 +88,8 @@ def case(name: str) -> Case:
 
 
 WHOLE = """
-    pendulum/svi driven/svi kepler/svi-3 round/svi-8 double/svi double/lobatto-svi cart/svi pendulum/hermite
-    pendulum/splines pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss
+    pendulum/svi driven/svi kepler/svi-3 round/svi-8 oscillator/svi-8 double/svi double/lobatto-svi cart/svi
+    pendulum/hermite pendulum/splines pendulum/trigonometric vortices/svi kepler/scvi double/scvi double/scvi-gauss
     kepler/printed double/printed double/sc cart/sc kepler/sc-phase-space double/gauss kepler/gauss
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto

@@ -35,6 +35,11 @@ def sweep(system: MechanicalSystem, method: Method) -> Sweep | None:
     return sweep_of(system, discretise(system, method))
 
 
+def oscillator() -> LagrangianSystem:
+    """A mass of 1 on a spring of 1: a method of any degree keeps its energy."""
+    return LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+
+
 def driven_duffing() -> LagrangianSystem:
     return problem("duffing").system.with_parameters(gamma=0.7, omega=1.3)
 
