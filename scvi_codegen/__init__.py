@@ -87,6 +87,7 @@ _HOMES = {
     "indexed_compiler": ("compile_indexed",),
     "mechanics.indexed.expansion": ("expand_sums",),
     "mechanics.indexed.system": ("IndexedSystem",),
+    "models.fmu": ("generate_fmu",),
     "models.model": ("Model",),
     "models.indexed_model": ("IndexedModel",),
     "models.model_file": ("load_indexed_model", "load_model", "save_model"),

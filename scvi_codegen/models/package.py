@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
-__all__ = ["CERTIFICATE_FILE", "generate_package", "load_package", "prefix_of"]
+__all__ = ["CERTIFICATE_FILE", "MODEL", "example_of", "generate_package", "load_package", "model_text", "prefix_of"]
 
 OUTPUTS = 20
 COMPARED = 1e-9
@@ -154,8 +154,8 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
     if single_file:
         source = source.amalgamated()
     texts = source.files
-    texts |= render_example(interface, _example(model, controlled=ADVANCE_TO in source.header), embedded or "double")
-    described = _model_text(model)
+    texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
+    described = model_text(model)
     if described is not None:
         texts["model.toml"] = described
     texts["README.md"] = _readme(
@@ -166,7 +166,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
     return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
 
 
-def _example(model: Model, *, controlled: bool) -> ExampleRun:
+def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     """The whole run of the model in at most about twenty lines of output."""
     from scvi_codegen.models.input_tables import tables_of_example
     from scvi_codegen.rendering.text import ExampleRun
@@ -251,7 +251,7 @@ Time is transformed: steps `h` are of tau, dt = g dtau with the monitor g, and `
 """
 
 
-def _model_text(model: Model) -> str | None:
+def model_text(model: Model) -> str | None:
     """The model file, or ``None`` for a method that a file cannot hold (a quadrature of the user's own)."""
     from scvi_codegen.models.model_file import dump_model
 
