@@ -166,7 +166,9 @@ def test_a_step_that_fails_is_discarded_and_nothing_has_changed(fmu):
     assert one.start(0.5) == one.step(0.5, H) == OK
     before = one.get("t", "q", "p_q")
     assert one.set(u=float("nan")) == OK
-    assert one.step(0.6, H) == DISCARD
+    kept = one.as_bytes(one.kept())
+    assert one.step(0.6, 2.5 * H) == DISCARD
+    assert one.as_bytes(one.kept()) == kept
     assert one.said[-1][:2] == (DISCARD, b"logStatusDiscard")
     assert "NaN" in one.said[-1][2]
     assert (one.last, one.get("t", "q", "p_q")) == (before[0], before)
