@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 
@@ -50,6 +51,7 @@ class IndexedProgram:
         forces, masses: loops.
         sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
         splitting: the kicks and drifts that replace it where the method is explicit.
+        control: steps that choose their length, if they are wanted.
     """
 
     prefix: str
@@ -68,3 +70,9 @@ class IndexedProgram:
     masses: tuple[LoopedKernel, ...]
     sweep: SeparableSweep | HamiltonianSweep | None
     splitting: Splitting | None
+    control: Control | None = None
+
+    @property
+    def error_power(self) -> int:
+        """The power of h with which what a curve leaves unresolved goes; 0 where it tells nothing."""
+        return 0 if self.sweep is None or (self.velocities and self.sweep.points == 1) else self.sweep.error_power

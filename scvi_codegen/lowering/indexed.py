@@ -23,6 +23,7 @@ from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.lowering.solvers.ladder import control_of_sweep
 from scvi_codegen.lowering.solvers.separable import separable_sweep
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -32,7 +33,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 
-__all__ = ["lower_indexed", "one_coordinate"]
+__all__ = ["lower_indexed", "one_coordinate", "with_control"]
 
 
 def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
@@ -78,6 +79,13 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
         sweep=sweep,
         splitting=splitting,
     )
+
+
+def with_control(program: IndexedProgram) -> IndexedProgram | None:
+    """The same with steps that choose their length; ``None`` where its curves tell no error."""
+    if program.sweep is None or not program.error_power:
+        return None
+    return replace(program, control=control_of_sweep(program.sweep))
 
 
 def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> SeparableSweep | HamiltonianSweep:

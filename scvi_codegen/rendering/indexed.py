@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.rendering.control import ladder_text
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
 from scvi_codegen.rendering.lanes import LIBRARY, POINTS, SweepText, sweep_text
@@ -55,12 +56,14 @@ def render_indexed(program: IndexedProgram) -> Source:
         "hot": "static",
     }
     code = environment.get_template("indexed.c.jinja").render(context)
+    control = program.control
+    own = {f"support/{program.prefix}_ladder.h": ladder_text(control.ladder)} if control and control.ladder else {}
     return Source(
         prefix=program.prefix,
         header=environment.get_template("indexed.h.jinja").render(context),
         code=code,
         declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
-        support=tuple((name, support_text(name)) for name in included(code)),
+        support=tuple((name, own.get(name) or support_text(name)) for name in included(code)),
     )
 
 

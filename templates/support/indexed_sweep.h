@@ -49,7 +49,8 @@ static void forces_at_points(const run_memory *run, const problem *given, const 
 
 /* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate, and its
  * drift. */
-static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n,
+    const struct guess_tables *tables, long long guess)
 {
   double largest = DBL_MIN;
   for (long long i = 0; i < n; i++) {
@@ -57,14 +58,15 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
       lanes bend = lanes_of(0.0);
-      if (run->guess == 1)
-        bend = given_by_all(LAST_ALONE, g, &parts->last[i], n);
-      else if (run->guess > 1)
-        bend = given_by_all(LAST, g, &parts->last[i], n) + given_by_all(BEFORE, g, &parts->before[i], n);
+      if (guess == 1)
+        bend = given_by_all(tables->alone, g, &parts->last[i], n);
+      else if (guess > 1)
+        bend = given_by_all(tables->last, g, &parts->last[i], n) +
+            given_by_all(tables->before, g, &parts->before[i], n);
       if (VELOCITIES) /* forces were continued, of which velocities are made, too */
         parts->F[g * n + i] = bend;
       parts->X[g * OF_EACH * n + i] = run->q[i] + DRIFT[g] * drift;
-      if (!VELOCITIES && run->guess > 0)
+      if (!VELOCITIES && guess > 0)
         parts->X[g * OF_EACH * n + i] += unit * bend;
     }
     for (int g = 0; VELOCITIES && g < GROUPS; g++)
@@ -190,13 +192,14 @@ static void move(run_memory *run, const lanes *F, const lengths *by, long long n
   }
 }
 
-/* Sweeps until the points rest; then once more with all digits of the coefficients, and on to the end of the step. */
-static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
-    solver_report *report)
+/* Sweeps until the points rest; then once more with all digits of the coefficients. The tables continue so many steps;
+ * then `guess` is how many are best continued into the next, and `error` what the curve leaves unresolved. */
+static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
+    long long *guess, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
-  double largest = first_positions(run, &parts, &by, n), size = 0.0, first = 0.0, last = INFINITY, error;
+  double largest = first_positions(run, &parts, &by, n, tables, *guess), size = 0.0, first = 0.0, last = INFINITY;
   int status = 0;
   improve_velocities(run, &parts, &by, n);
   forces_at_points(run, given, parts.X, parts.F, n);
@@ -218,14 +221,13 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
     largest = largest_at_end(parts.X, n);
   improve_velocities(run, &parts, &by, n);
   forces_at_points(run, given, parts.X, parts.F, n);
-  if (!examine(run, parts.F, &by, n, largest, &error))
-    return NOT_FINITE;
-  if (run->error == run->error && !(error <= run->error)) {
-    run->error = error;
-    run->error_t = run->t;
-  }
-  move(run, parts.F, &by, n);
-  run->guess = run->guess > 0 && first < GOOD_GUESS ? 2 : 1;
-  run->turn = (run->turn + 1) % 3;
-  return OK;
+  *guess = steps_to_continue(*guess, first);
+  return examine(run, parts.F, &by, n, largest, error) ? OK : NOT_FINITE;
+}
+
+/* On to the end of the step that was solved. */
+static void go_on(run_memory *run, long long n)
+{
+  const lengths by = lengths_of(run->h);
+  move(run, divide(run, n).F, &by, n);
 }
