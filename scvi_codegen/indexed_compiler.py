@@ -11,9 +11,11 @@ Neither the length of the text nor the time to compile it depends on the number 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 
 from scvi_codegen.compiler import c_identifier
+from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.kinds import TEXT, TEXTS, takes
 from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate, with_control
@@ -32,11 +34,15 @@ from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 __all__ = ["compile_indexed", "generate_indexed"]
 
 
-@takes(system=INDEXED, flags=TEXTS, prefix=TEXT)
+SOLVERS = ("fixed-point", "newton")
+
+
+@takes(system=INDEXED, flags=TEXTS, prefix=TEXT, solver=TEXT)
 def compile_indexed(
     system: IndexedSystem,
     method: Method | str,
     *,
+    solver: str = "fixed-point",
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
 ) -> IndexedStepper:
@@ -46,42 +52,46 @@ def compile_indexed(
         system: what moves.
         method: how its motion is discretised, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods, and
             those whose equations sweeps over positions solve: SVI, SC, Runge-Kutta.
+        solver: of the equations of a step: ``"fixed-point"``, sweeps, or ``"newton"`` for stiff systems: Newton's
+            iteration, its linear systems by GMRES from products with the derivatives of the forces alone.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 
     Raises:
         BuildError: if there is no C compiler.
-        MethodError: for a method without such sweeps.
+        MethodError: for a method without such sweeps, and a solver that it does not have.
     """
-    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix)
+    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
     return IndexedStepper(texts.plain, texts.interface, controlled=lambda: texts.controlled, flags=flags)
 
 
 def generate_indexed(
-    system: IndexedSystem, method: Method | str, *, prefix: str | None = None
+    system: IndexedSystem, method: Method | str, *, solver: str = "fixed-point", prefix: str | None = None
 ) -> tuple[Source, IndexedInterface]:
     """The C text, and what a caller must know of it; arguments and errors as of :func:`compile_indexed`."""
-    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix)
+    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
     return texts.plain, texts.interface
 
 
 class _IndexedTexts:
     """The texts of one integrator; equations are derived when one of them is first made."""
 
-    def __init__(self, system: IndexedSystem, method: Method, prefix: str | None) -> None:
-        self.system, self.method = system, method
+    def __init__(self, system: IndexedSystem, method: Method, prefix: str | None, solver: str) -> None:
+        if solver not in SOLVERS:
+            raise MethodError(f"the solver of sums over indices is {' or '.join(SOLVERS)}, not {solver!r}")
+        self.system, self.method, self.solver = system, method, solver
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
 
     @property
     def interface(self) -> IndexedInterface:
         """What a caller must know."""
-        return _interface(self.system, self.method, self.prefix)
+        return replace(_interface(self.system, self.method, self.prefix), solver=self.solver)
 
     @cached_property
     def program(self) -> IndexedProgram:
         """Without steps that choose their length."""
         with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
-            return lower_indexed(self.system, self.method, self.prefix)
+            return lower_indexed(self.system, self.method, self.prefix, newton=self.solver == "newton")
 
     @cached_property
     def plain(self) -> Source:
@@ -100,7 +110,7 @@ class _IndexedTexts:
         return Source.from_json(found) if found else None
 
     def _remembered(self, what: str, make: Callable[[], str]) -> str:
-        return remembered_text((*self.system.key(), *self.method.key(), self.prefix, what), make)
+        return remembered_text((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
 
 
 def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInterface:

@@ -25,6 +25,14 @@ from scvi_codegen.rendering.target import DOUBLE
 
 __all__ = ["render_indexed", "render_indexed_example"]
 
+EXPLICIT_VECTORS, SWEEP_VECTORS = 4, 4
+"""Of work: positions, forces, increments; positions at the points, forces in this step and two before."""
+NEWTON_VECTORS = 4 + 17
+"""Beside these residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
+
+DIRECTION = "V"
+"""What the slots along a direction are read from."""
+
 Lines: TypeAlias = Callable[[int], list[str]]
 """Of a slot, by its number."""
 
@@ -42,7 +50,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
-        "forces": [_force_text(program, each) for each in program.forces],
+        "forces": [_force_text(program, each) for each in (*program.forces, *program.products, *program.diagonals)],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in program.masses],
         "force_names": [each.kernel.name for each in program.forces],
@@ -53,6 +61,8 @@ def render_indexed(program: IndexedProgram) -> Source:
         "vector_functions": _vector_functions(program),
         "coordinates": " + ".join(map(_product, program.coordinates)),
         "sweep": _sweep_text(program),
+        "work": _work(program),
+        "sweep_vectors": SWEEP_VECTORS,
         "hot": "static",
     }
     code = environment.get_template("indexed.c.jinja").render(context)
@@ -80,8 +90,18 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
     return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
 
+def _work(program: IndexedProgram) -> int:
+    """Numbers of a coordinate: vectors over the points, or of leapfrog, four."""
+    if program.sweep is None:
+        return EXPLICIT_VECTORS
+    own = 2 * SWEEP_VECTORS if program.momenta else SWEEP_VECTORS + bool(program.velocities)
+    linear = NEWTON_VECTORS + program.sweep.lanes if program.products else 0
+    return (own + linear) * program.sweep.lanes
+
+
 def _sweep_text(program: IndexedProgram) -> SweepText | None:
-    sweep, kernels = program.sweep, [each.kernel for each in program.forces]
+    applied = (*program.forces, *program.products, *program.diagonals)
+    sweep, kernels = program.sweep, [each.kernel for each in applied]
     return sweep_text(sweep, POINTS, fallback="none", kernels=kernels) if sweep else None
 
 
@@ -138,7 +158,8 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     )
     zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
-    arguments = ["const problem *given", "const lanes *restrict X", "times t", *factor, "lanes *restrict F"]
+    direction = [f"const lanes *{DIRECTION}"] if looped.along else []
+    arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
     values = f"lanes value[{len(looped.targets)}]"
     return nest.function(f"static void add_{looped.kernel.name}", arguments, [*zero, *lines], values=values)
 
@@ -258,7 +279,8 @@ class _Nest:
         """What is known at a level: arguments, parameters."""
         for k, slot in enumerate(self.looped.slots):
             if self.level(slot) == level and self.source:
-                yield f"u[{k}] = {self.source}[{self.place_of(slot)}];"
+                source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
+                yield f"u[{k}] = {source}[{self.place_of(slot)}];"
         for k, access in enumerate(self.looped.given, self.scalars):
             if self.level(access) == level:
                 yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"

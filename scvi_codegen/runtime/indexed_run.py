@@ -31,10 +31,12 @@ from scvi_codegen.runtime.portions import SLICE_SECONDS
 __all__ = ["IndexedMark", "IndexedRun"]
 
 ADVICE = {
-    "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h",
+    "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
+    "or solver='newton' where the fast motions are stiff bonds at rest",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
 }
+NEWTON_ADVICE = {**ADVICE, "not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"}
 CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
 """Of steps that choose their length."""
 MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOICE)
@@ -360,7 +362,8 @@ class IndexedRun:
             self.iterations += report.iterations
             if status:
                 h = 0.0 if self.goal else self.h
-                raise step_failure(status, report, step=self.steps, h=h, advice=ADVICE)
+                advice = NEWTON_ADVICE if self.interface.solver == "newton" else ADVICE
+                raise step_failure(status, report, step=self.steps, h=h, advice=advice)
             if progress is not None:
                 progress(self.steps)
             elapsed = max(time.perf_counter() - began, 1e-6)
