@@ -32,9 +32,9 @@ static double find_residual(linear_system *of, const lanes *X, const lanes *F)
     double low, of_one;
     const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
-      const lanes bent = unit * given_by_all(PRODUCT, g, &F[i], n);
+      const lanes sum = given_by_all(PRODUCT, g, &F[i], n) + given_by_all(PRODUCT_LOW, g, &F[i], n);
       const lanes rest = run->carry_q[i] + DRIFT[g] * low + DRIFT_LOW[g] * drift;
-      of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (bent + rest);
+      of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (unit * sum + rest);
     }
     of_one = fabs(run->q[i]) + fabs(drift) + fabs(at_point(&X[i], n, KEPT - 1) - run->q[i]);
     size += of_one * of_one;
