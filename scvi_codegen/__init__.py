@@ -86,6 +86,7 @@ _HOMES = {
     ),
     "indexed_compiler": ("compile_indexed",),
     "mechanics.indexed.expansion": ("expand_sums",),
+    "mechanics.indexed.gathering": ("GatheredSums", "gather_sums"),
     "mechanics.indexed.system": ("IndexedSystem",),
     "models.fmu": ("generate_fmu",),
     "models.model": ("Model",),

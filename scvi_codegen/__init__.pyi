@@ -50,6 +50,8 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianS
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
 from scvi_codegen.mechanics.indexed.expansion import expand_sums as expand_sums
+from scvi_codegen.mechanics.indexed.gathering import GatheredSums as GatheredSums
+from scvi_codegen.mechanics.indexed.gathering import gather_sums as gather_sums
 from scvi_codegen.mechanics.indexed.system import IndexedSystem as IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise

@@ -8,6 +8,11 @@ typedef lanes coordinates[M]; /* what all coordinates have at a point */
 typedef double number; /* what a trajectory has once */
 typedef lanes weight; /* what each point has, for all trajectories */
 
+/* Tables that continue what is kept at the points: from the last step, or from the last and the one before. */
+struct guess_tables {
+  const lanes *alone, *last, *before;
+};
+
 static inline number number_of(double x)
 {
   return x;

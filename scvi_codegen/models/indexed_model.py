@@ -38,6 +38,7 @@ class IndexedModel:
         t: initial time.
         parameters: numbers, and arrays of them, by name; others keep their defaults.
         tables: whole numbers, (rows, columns), by name.
+        document: the sections of the file that it was read from.
 
     Raises:
         ModelFileError: naming the field; what the arrays are is checked where a run begins.
@@ -55,6 +56,7 @@ class IndexedModel:
     t: float = 0.0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
+    document: Mapping[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_kind(INDEXED, self.system, "system", ModelFileError)

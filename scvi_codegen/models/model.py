@@ -217,7 +217,7 @@ class Model:
         """The inputs, and what they make of the parameters at a time."""
         from scvi_codegen.runtime.driven import checked_inputs, parameters_of
 
-        found = checked_inputs(stepper, self.all_inputs())
+        found = checked_inputs(stepper.interface, self.all_inputs())
         return found, parameters_of(stepper, self.parameters, found)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:

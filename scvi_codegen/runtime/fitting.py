@@ -148,7 +148,7 @@ def fit(
     from scipy.optimize import least_squares  # here: slow to import
 
     measurements = Measurements.checked(
-        stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper, inputs)
+        stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, state=state)
     if measurements.used.sum() < len(model.names):

@@ -188,7 +188,7 @@ class Stepper(Ensembles):
             StepFailedError: if a step fails; its ``trajectory`` holds the states of that piece before.
         """
         stepper = self if events is None else self.with_events(events)
-        data = checked_inputs(self, inputs)
+        data = checked_inputs(self.interface, inputs)
         end = end_of(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         run = stepper.start(

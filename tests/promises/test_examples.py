@@ -32,6 +32,7 @@ SCRIPTS = (
     "curves_and_quadratures",
     "duffing_fit",
     "eccentric_comet",
+    "field_on_two_processes",
     "halo_orbits",
     "hanging_chain",
     "henon_heiles_map",
