@@ -122,6 +122,7 @@ def compile_stepper(
         controlled=texts.remembered("controlled", texts.controlled),
         fallback=texts.remembered("fallback", texts.fallback),
         tangent=texts.remembered("tangent", texts.tangent),
+        curvature=texts.remembered("curvature", partial(texts.tangent, second=True)),
         changes=lambda count: texts.remembered(f"changes {count}", partial(texts.changes, count))(),
         flags=flags,
         events=as_events(events),
@@ -171,15 +172,15 @@ class _Texts:
         """With Newton's iteration, where the text itself borrows it."""
         return render(self.program(fallback=True), fallback="lent") if self.borrows else None
 
-    def tangent(self) -> Source | None:
-        """With derivatives of steps by all they start from; none in transformed time."""
+    def tangent(self, *, second: bool = False) -> Source | None:
+        """With derivatives of steps by all they start from, the second ones, too; none in transformed time."""
         if self.system.integrands:
             return None
         found = self.program(fallback=True)
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
-        return render_derivatives(derivatives_of(self.system, stages, found))
+        return render_derivatives(derivatives_of(self.system, stages, found, second=second))
 
     def changes(self, count: int) -> Source | None:
         """With small changes beside each of many trajectories, where their equations are sums of forces, too."""

@@ -22,7 +22,19 @@ from scvi_codegen.runtime.linearised import Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.retaken import refuse_strays, steps_between
 
-__all__ = ["Gradient", "carried", "carry", "pieces", "pulled_back", "sensitivity", "starts_of"]
+__all__ = [
+    "Gradient",
+    "carried",
+    "carry",
+    "changes_of",
+    "checked_slopes",
+    "finite",
+    "gradient_of",
+    "pieces",
+    "pulled_back",
+    "sensitivity",
+    "starts_of",
+]
 
 MOST_STEPS = 1024
 """Of a piece, where all states are kept."""
@@ -49,18 +61,34 @@ class Gradient:
 
 
 def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
-    """(n, 2m, k) what becomes of (2m, k) directions of (q, p); all 2m without any, the derivative of each state.
+    """(n, 2m, k) what becomes of (2m, k) directions of (q, p), or (2m + parameters + 2, k) of all that is given.
+
+    Without any, of all 2m of (q, p): the derivative of each state.
 
     Raises:
         StateError: for directions of another shape, and states that do not stand at whole steps.
     """
     size = 2 * states.stepper.dimension
-    given = np.eye(size) if directions is None else _finite(directions, "directions")
-    if given.ndim not in (1, 2) or len(given) != size:
-        raise StateError(f"directions have shape ({size},) or ({size}, k), not {given.shape}")
-    changes = np.zeros((given.size // size, states.stepper.given))
-    changes[:, :size] = given.reshape(size, -1).T
-    return _forward(states, changes).reshape(len(states), *given.shape)
+    given = np.eye(size) if directions is None else finite(directions, "directions")
+    changes = changes_of(states, given)
+    return _forward(states, changes).reshape(len(states), size, *given.shape[1:])
+
+
+def changes_of(states: KeptStates, directions: Array) -> Array:
+    """(k, given) changes of all that a run starts from: directions of (q, p), or of (q, p, parameters, t, h).
+
+    Raises:
+        StateError: for directions of another shape.
+    """
+    size, given = 2 * states.stepper.dimension, states.stepper.given
+    if directions.ndim not in (1, 2) or len(directions) not in (size, given):
+        raise StateError(
+            f"directions have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
+            f"parameters, t, h), not {directions.shape}"
+        )
+    changes = np.zeros((directions[0].size, given))
+    changes[:, : len(directions)] = directions.reshape(len(directions), -1).T
+    return changes
 
 
 def sensitivity(states: KeptStates) -> Sensitivity:
@@ -71,13 +99,7 @@ def sensitivity(states: KeptStates) -> Sensitivity:
 
 def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
     """The transpose of :func:`sensitivity` applied to (n, 2m) or (n, 2m, c) slopes of functions by the states."""
-    size, m = 2 * states.stepper.dimension, states.stepper.dimension
-    slopes = _finite(cotangents, "cotangents")
-    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (len(states), size):
-        shape = f"({len(states)}, {size})"
-        raise StateError(
-            f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
-        )
+    size, slopes = 2 * states.stepper.dimension, checked_slopes(states, cotangents)
     seeds = np.zeros((len(states), slopes[0].size // size, states.stepper.given))
     seeds[:, :, :size] = slopes.reshape(len(states), size, -1).transpose(0, 2, 1)
     now = np.zeros_like(seeds[0])
@@ -89,17 +111,34 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
         vectors[-1] += now
         carry(states, starts, numbers, vectors, back=True)
         now = vectors[0]
-    found = (now + seeds[0]).T.reshape(states.stepper.given, *slopes.shape[2:])
+    return gradient_of(states, (now + seeds[0]).T.reshape(states.stepper.given, *slopes.shape[2:]))
+
+
+def checked_slopes(states: KeptStates, cotangents: ArrayLike) -> Array:
+    """(n, 2m) or (n, 2m, c) as they are; StateError for another shape."""
+    size, slopes = 2 * states.stepper.dimension, finite(cotangents, "cotangents")
+    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (len(states), size):
+        shape = f"({len(states)}, {size})"
+        raise StateError(
+            f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
+        )
+    return slopes
+
+
+def gradient_of(states: KeptStates, found: Array) -> Gradient:
+    """From (given, ..) slopes."""
+    m = states.stepper.dimension
     return Gradient(
         q=found[:m],
-        p=found[m:size],
-        parameters=found[size:-2],
+        p=found[m : 2 * m],
+        parameters=found[2 * m : -2],
         t=found[-2],
         h=found[-1] if _has_one_length(states) else None,
     )
 
 
-def _finite(given: ArrayLike, name: str) -> Array:
+def finite(given: ArrayLike, name: str) -> Array:
+    """An array of numbers; StateError where some are none."""
     array = real_array(given, name)
     if not np.isfinite(array).all():
         raise StateError(f"there are {name} that are not finite")

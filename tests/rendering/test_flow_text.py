@@ -41,6 +41,10 @@ def test_compiles_without_a_warning(name, compiler, tmp_path):
 
 def test_compiles_with_the_interface_of_xla(tmp_path):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
-    source = with_xla_flow(compile_stepper(*CASES["kepler"]).derivatives, "0").amalgamated()
+    stepper, flags = compile_stepper(*CASES["kepler"]), ["-isystem", jax.ffi.include_dir()]
+    source = with_xla_flow(stepper.derivatives, "0").amalgamated()
     check_style(source.code)
-    compile_with("gcc", ["-isystem", jax.ffi.include_dir()], source, tmp_path)
+    compile_with("gcc", flags, source, tmp_path)
+    second = with_xla_flow(stepper.second_derivatives, "0", second=True).amalgamated()
+    check_style(second.code)
+    compile_with("gcc", flags, second, tmp_path)
