@@ -132,9 +132,17 @@ class CompiledMethod:
 
     def _linearised(self, source: Source | None, what: str) -> Binding:
         if source is None:
-            raise MethodError(f"there are no {what} of the steps of '{self.title}'")
+            raise MethodError(f"there are no {what} of the steps of '{self.title}'{self._why_not()}")
         binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
         return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
+
+    def _why_not(self) -> str:
+        if not self.interface.energy_parameter:
+            return ""
+        return (
+            ": in transformed time the energy of the start is a parameter of every step, and time an integral along them. "
+            "Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
+        )
 
     def _load_fallback(self) -> building.Library:
         source = self.fallback

@@ -18,20 +18,23 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.kept_states import KeptStates
-from scvi_codegen.runtime.linearised import Sensitivity, Starts
+from scvi_codegen.runtime.linearised import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.retaken import refuse_strays, steps_between
 
 __all__ = [
     "Gradient",
+    "backward",
     "carried",
     "carry",
     "changes_of",
     "checked_slopes",
     "finite",
+    "forward",
     "gradient_of",
     "pieces",
     "pulled_back",
+    "seeds_of",
     "sensitivity",
     "starts_of",
 ]
@@ -70,17 +73,17 @@ def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
     """
     size = 2 * states.stepper.dimension
     given = np.eye(size) if directions is None else finite(directions, "directions")
-    changes = changes_of(states, given)
-    return _forward(states, changes).reshape(len(states), size, *given.shape[1:])
+    found, _ = forward(states, changes_of(states.stepper, given))
+    return found.reshape(len(states), size, *given.shape[1:])
 
 
-def changes_of(states: KeptStates, directions: Array) -> Array:
+def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
     """(k, given) changes of all that a run starts from: directions of (q, p), or of (q, p, parameters, t, h).
 
     Raises:
         StateError: for directions of another shape.
     """
-    size, given = 2 * states.stepper.dimension, states.stepper.given
+    size, given = 2 * stepper.dimension, stepper.given
     if directions.ndim not in (1, 2) or len(directions) not in (size, given):
         raise StateError(
             f"directions have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
@@ -93,16 +96,28 @@ def changes_of(states: KeptStates, directions: Array) -> Array:
 
 def sensitivity(states: KeptStates) -> Sensitivity:
     """Of all states, by all that the run started from."""
-    columns = _forward(states, np.eye(states.stepper.given))
+    columns, _ = forward(states, np.eye(states.stepper.given))
     return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_one_length(states))
 
 
 def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
     """The transpose of :func:`sensitivity` applied to (n, 2m) or (n, 2m, c) slopes of functions by the states."""
-    size, slopes = 2 * states.stepper.dimension, checked_slopes(states, cotangents)
-    seeds = np.zeros((len(states), slopes[0].size // size, states.stepper.given))
-    seeds[:, :, :size] = slopes.reshape(len(states), size, -1).transpose(0, 2, 1)
-    now = np.zeros_like(seeds[0])
+    slopes = checked_slopes(states.stepper, len(states), cotangents)
+    seeds = seeds_of(states.stepper, slopes)
+    found = backward(states, seeds, np.zeros_like(seeds[0]))
+    return gradient_of(states, found.T.reshape(states.stepper.given, *slopes.shape[2:]))
+
+
+def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
+    """(n, c, given) from (n, 2m) or (n, 2m, c)."""
+    size = 2 * stepper.dimension
+    seeds = np.zeros((len(slopes), slopes[0].size // size, stepper.given))
+    seeds[:, :, :size] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
+    return seeds
+
+
+def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
+    """(c, given) slopes at the start, from those by each state and, now, by all that is behind the last."""
     for first, last in reversed(list(pieces(states))):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
@@ -111,14 +126,15 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
         vectors[-1] += now
         carry(states, starts, numbers, vectors, back=True)
         now = vectors[0]
-    return gradient_of(states, (now + seeds[0]).T.reshape(states.stepper.given, *slopes.shape[2:]))
+    start: Array = now + seeds[0]
+    return start
 
 
-def checked_slopes(states: KeptStates, cotangents: ArrayLike) -> Array:
-    """(n, 2m) or (n, 2m, c) as they are; StateError for another shape."""
-    size, slopes = 2 * states.stepper.dimension, finite(cotangents, "cotangents")
-    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (len(states), size):
-        shape = f"({len(states)}, {size})"
+def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
+    """(n, 2m) or (n, 2m, c) as they are; StateError for another shape than of so many states."""
+    size, slopes = 2 * stepper.dimension, finite(cotangents, "cotangents")
+    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (count, size):
+        shape = f"({count}, {size})"
         raise StateError(
             f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
         )
@@ -145,8 +161,8 @@ def finite(given: ArrayLike, name: str) -> Array:
     return array
 
 
-def _forward(states: KeptStates, changes: Array) -> Array:
-    """(n, 2m, count) what becomes of (count, given) changes at the start."""
+def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
+    """(n, 2m, count) what becomes of (count, given) changes at the start, and (count, given) at the end."""
     size = 2 * states.stepper.dimension
     found = np.empty((len(states), size, len(changes)))
     found[0] = changes[:, :size].T
@@ -158,7 +174,7 @@ def _forward(states: KeptStates, changes: Array) -> Array:
         kept = np.flatnonzero(numbers[1:] > 0) + 1
         found[numbers[kept]] = vectors[kept, :, :size].transpose(0, 2, 1)
         changes = vectors[-1]
-    return found
+    return found, changes
 
 
 def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:

@@ -18,8 +18,9 @@ from scvi_codegen.runtime.gradients import (
 )
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.kept_states import KeptStates
+from scvi_codegen.runtime.linearised import LinearisedMethod
 
-__all__ = ["hessian_product"]
+__all__ = ["bent_back", "checked_function", "hessian_product"]
 
 
 def hessian_product(
@@ -35,15 +36,37 @@ def hessian_product(
         directions: of (q, p), or of (q, p, parameters, t, h).
         curvatures: (n, 2m, 2m) F'', of each state.
     """
-    size, slopes = 2 * states.stepper.dimension, checked_slopes(states, cotangents)
-    if slopes.ndim == 3:
-        raise StateError(f"cotangents are those of one function, ({len(states)}, {size}), not {slopes.shape}")
+    slopes, bends = checked_function(states.stepper, len(states), cotangents, curvatures)
     given = finite(directions, "directions")
-    changes = changes_of(states, given)
-    bends = _checked_curvatures(states, curvatures)
+    changes = changes_of(states.stepper, given)
+    found = bent_back(states, slopes, bends, changes, np.zeros((2, *changes.shape)))
+    return gradient_of(states, found[1].T.reshape(states.stepper.given, *given.shape[1:]))
+
+
+def checked_function(
+    stepper: LinearisedMethod, count: int, cotangents: ArrayLike, curvatures: ArrayLike | None
+) -> tuple[Array, Array]:
+    """(n, 2m) and (n, 2m, 2m) first and second slopes of one function of so many states."""
+    size, slopes = 2 * stepper.dimension, checked_slopes(stepper, count, cotangents)
+    if slopes.ndim == 3:
+        raise StateError(f"cotangents are those of one function, ({count}, {size}), not {slopes.shape}")
+    shape = (count, size, size)
+    bends = np.broadcast_to(0.0, shape) if curvatures is None else finite(curvatures, "curvatures")
+    if bends.shape != shape:
+        raise StateError(f"curvatures, second slopes by (q, p) of each state, have shape {shape}, not {bends.shape}")
+    return slopes, bends
+
+
+def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, now: Array) -> Array:
+    """(2, k, given) slopes at the start and their changes, where what is behind the last state has those of ``now``.
+
+    Args:
+        slopes, bends: (n, 2m), (n, 2m, 2m) of the function.
+        changes: (k, given) at the start.
+        now: (2, k, given).
+    """
     between = list(pieces(states))
     at_starts = _changes_at_starts(states, between, changes)
-    now = np.zeros((2, *changes.shape))
     for (first, last), start in zip(reversed(between), reversed(at_starts), strict=True):
         starts, numbers = starts_of(states, first, last)
         moved = np.zeros((len(numbers), *changes.shape))
@@ -55,18 +78,8 @@ def hessian_product(
         vectors[-1] += now
         states.stepper.bend(starts, moved, vectors, states.parameters, states.options)
         now = vectors[0]
-    now = now + _seeds(slopes[:1], bends[:1], changes[np.newaxis])[0]
-    return gradient_of(states, now[1].T.reshape(states.stepper.given, *given.shape[1:]))
-
-
-def _checked_curvatures(states: KeptStates, given: ArrayLike | None) -> Array:
-    """(n, 2m, 2m), zeros without any."""
-    size = 2 * states.stepper.dimension
-    shape = (len(states), size, size)
-    bends = np.broadcast_to(0.0, shape) if given is None else finite(given, "curvatures")
-    if bends.shape != shape:
-        raise StateError(f"curvatures, second slopes by (q, p) of each state, have shape {shape}, not {bends.shape}")
-    return bends
+    first_slopes: Array = now + _seeds(slopes[:1], bends[:1], changes[np.newaxis])[0]
+    return first_slopes
 
 
 def _changes_at_starts(states: KeptStates, between: list[tuple[int, int]], changes: Array) -> list[Array]:
