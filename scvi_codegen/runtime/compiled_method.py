@@ -140,8 +140,8 @@ class CompiledMethod:
         if not self.interface.energy_parameter:
             return ""
         return (
-            ": in transformed time the energy of the start is a parameter of every step, and time an integral along them. "
-            "Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
+            ": in transformed time the energy of the start is a parameter of every step, and time an integral along "
+            "them. Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
         )
 
     def _load_fallback(self) -> building.Library:
