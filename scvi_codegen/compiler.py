@@ -16,7 +16,8 @@
 Beside the way: :func:`scvi_codegen.derivation.equations.derive` writes the equations out as the paper prints them, and
 :func:`scvi_codegen.exact.step.derived_step` solves them in 60 digits; both read a ``StageSystem`` of their own.
 :mod:`scvi_codegen.frameworks` puts many steps and their derivatives behind the C text that has those of one step, for
-JAX and CasADi, and :func:`scvi_codegen.frameworks.casadi_step.casadi_step` a ``StageSystem`` as equations into CasADi.
+JAX, PyTorch and CasADi, and :func:`scvi_codegen.frameworks.casadi_step.casadi_step` a ``StageSystem`` as equations into
+CasADi.
 
 Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
 kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so the second time is quick.

@@ -11,7 +11,7 @@ from dataclasses import replace
 from scvi_codegen.rendering.environment import support_text
 from scvi_codegen.rendering.source import Source, included
 
-__all__ = ["casadi_name", "with_casadi_flow", "with_xla_flow"]
+__all__ = ["casadi_name", "with_casadi_flow", "with_flow_of_rows", "with_xla_flow"]
 
 XLA_PARTS = ("states", "push", "pull")
 """Values, changes of values, slopes by what is given."""
@@ -31,6 +31,27 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
     handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
     headers = ("flow", "xla_flow", *(("flow_second", "xla_second") if second else ()))
     return _behind(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers)
+
+
+def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
+    """A text with derivatives of steps, and the flow of many rows, ``<prefix>_flow_rows``.
+
+    Args:
+        derivatives: the text.
+        second: whether it has second derivatives, for ``<prefix>_bend_rows``.
+    """
+    prefix = derivatives.prefix
+    shape, rest = (
+        "long long steps, long long every, int count, long long rows",
+        f"double *found, {prefix}_report *report",
+    )
+    declared = f"int {prefix}_flow_rows(int part, {shape}, const double *x, const double *given, {rest});\n"
+    if second:
+        declared += (
+            f"int {prefix}_bend_rows({shape}, const double *x, const double *slopes, const double *changes, {rest});\n"
+        )
+    headers = ("flow", "rows_flow", *(("flow_second", "rows_second") if second else ()))
+    return _behind(derivatives, "\n", headers, declared)
 
 
 def casadi_name(prefix: str) -> str:
