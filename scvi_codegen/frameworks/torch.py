@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import Flow, imported
+from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.kinds import of, takes
-from scvi_codegen.native import building
-from scvi_codegen.native.binding import Binding
-from scvi_codegen.rendering.flow import with_flow_of_rows
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["TorchFlow", "torch_flow"]
@@ -39,7 +36,7 @@ def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Tor
     return flow
 
 
-class TorchFlow(Flow):
+class TorchFlow(FlowOfRows):
     """The states of a motion, as a function that PyTorch differentiates."""
 
     def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
@@ -60,7 +57,7 @@ class TorchFlow(Flow):
         """
         import torch
 
-        from scvi_codegen.frameworks.torch_functions import States
+        from scvi_codegen.frameworks.torch_functions import StatesAlong
 
         m, count = self.stepper.dimension, len(self.stepper.parameters)
         values = self.parameter_values(parameters)
@@ -69,21 +66,9 @@ class TorchFlow(Flow):
             values = torch.stack(each, -1) if values else torch.zeros(0, dtype=torch.float64)
         vectors = [_vector(q, m, "q"), _vector(p, m, "p"), _vector(values, count, "parameters")]
         numbers = [_binary64(t, "t").unsqueeze(-1), _binary64(h, "h").unsqueeze(-1)]
-        found = States.apply(_beside(*vectors, *numbers), self)
+        found = StatesAlong.apply(_beside(*vectors, *numbers), self)
         found = found if self.every else found[..., -1, :]
         return found[..., :m], found[..., m:]
-
-    @cached_property
-    def library(self) -> Binding:
-        """Its C functions, compiled when first asked for."""
-        source = with_flow_of_rows(self.derivatives)
-        return Binding(building.load(source, flags=self.stepper.flags), source.prefix)
-
-    @cached_property
-    def second_library(self) -> Binding:
-        """The same with second derivatives."""
-        source = with_flow_of_rows(self.second_derivatives, second=True)
-        return Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
 
 def _binary64(value: Any, name: str) -> Any:

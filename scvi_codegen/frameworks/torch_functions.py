@@ -1,31 +1,29 @@
 """The flow of PyTorch: four functions in C, and the rules by which PyTorch differentiates and maps them.
 
-``States`` has the values; ``Push``, linear in its second argument, is the derivative applied to changes, ``Pull`` its
-transpose applied to slopes, ``Bend``, linear in slopes and in changes, how ``Pull`` changes with the start. Changes
+``StatesAlong`` has the values; ``Push``, linear in its second argument, is the derivative applied to changes, ``Pull``
+its transpose applied to slopes, ``Bend``, linear in slopes and in changes, how ``Pull`` changes with the start. Changes
 and slopes have an axis of their own, of those that share a trajectory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native.options import step_failure
 
-if TYPE_CHECKING:
-    from scvi_codegen.frameworks.torch import TorchFlow
-
-__all__ = ["States"]
+__all__ = ["StatesAlong"]
 
 STATES, PUSH, PULL = range(3)
 NO_MEMORY = 6
 
 
 def _call(
-    binding: Any, name: str, flow: TorchFlow, counts: Sequence[int], x: Any, given: Sequence[Any], shape: Any
+    binding: Any, name: str, flow: FlowOfRows, counts: Sequence[int], x: Any, given: Sequence[Any], shape: Any
 ) -> Any:
     """What a C function finds for all rows of x."""
     found = torch.empty(shape, dtype=torch.float64)
@@ -46,11 +44,11 @@ def _summed(parts: Sequence[Any]) -> Any:
     return sum(parts[1:], parts[0]) if parts else None
 
 
-class States(torch.autograd.Function):  # type: ignore[misc]  # torch is not there for mypy
+class StatesAlong(torch.autograd.Function):  # type: ignore[misc]  # torch is not there for mypy
     """(.., n, 2m) states from (.., given) numbers (q, p, parameters, t, h)."""
 
     @staticmethod
-    def forward(x: Any, flow: TorchFlow) -> Any:
+    def forward(x: Any, flow: FlowOfRows) -> Any:
         """The values."""
         shape = (*x.shape[:-1], flow.kept, 2 * flow.stepper.dimension)
         return _call(flow.library, "flow_rows", flow, (STATES, 0), x, (x,), shape)
@@ -75,9 +73,9 @@ class States(torch.autograd.Function):  # type: ignore[misc]  # torch is not the
         return Push.apply(x, change.unsqueeze(-2), ctx.flow).squeeze(-3)
 
     @staticmethod
-    def vmap(info: Any, axes: Any, x: Any, flow: TorchFlow) -> Any:
+    def vmap(info: Any, axes: Any, x: Any, flow: FlowOfRows) -> Any:
         """Of a batch of starts."""
-        return States.apply(x.movedim(axes[0], 0), flow), 0
+        return StatesAlong.apply(x.movedim(axes[0], 0), flow), 0
 
 
 def _mapped(function: Callable[[], Any]) -> Any:
@@ -118,7 +116,7 @@ class Push(_Linear):
     vmap = _mapped(lambda: Push)
 
     @staticmethod
-    def forward(x: Any, changes: Any, flow: TorchFlow) -> Any:
+    def forward(x: Any, changes: Any, flow: FlowOfRows) -> Any:
         shape = (*changes.shape[:-1], flow.kept, 2 * flow.stepper.dimension)
         return _call(flow.library, "flow_rows", flow, (PUSH, changes.shape[-2]), x, (changes,), shape)
 
@@ -144,7 +142,7 @@ class Pull(_Linear):
     vmap = _mapped(lambda: Pull)
 
     @staticmethod
-    def forward(x: Any, slopes: Any, flow: TorchFlow) -> Any:
+    def forward(x: Any, slopes: Any, flow: FlowOfRows) -> Any:
         shape = (*slopes.shape[:-2], x.shape[-1])
         return _call(flow.library, "flow_rows", flow, (PULL, slopes.shape[-3]), x, (slopes,), shape)
 
@@ -171,7 +169,7 @@ class Bend(_Linear):
     vmap = _mapped(lambda: Bend)
 
     @staticmethod
-    def forward(x: Any, slopes: Any, changes: Any, flow: TorchFlow) -> Any:
+    def forward(x: Any, slopes: Any, changes: Any, flow: FlowOfRows) -> Any:
         given, count = (slopes, changes), changes.shape[-2]
         return _call(flow.second_library, "bend_rows", flow, (count,), x, given, changes.shape)
 
