@@ -26,6 +26,7 @@ _HOMES = {
     "frameworks.controlled": ("ControlledMotion",),
     "frameworks.optimal_control": ("optimal_control",),
     "frameworks.jax": ("JaxFlow", "jax_flow"),
+    "frameworks.torch": ("TorchFlow", "torch_flow"),
     "frameworks.rebound": ("GravitatingBodies", "from_rebound", "to_rebound"),
     "files.cache": ("CacheInfo", "cache_info", "clear_cache"),
     "compiler": ("compile_stepper", "generate_source"),
