@@ -22,8 +22,11 @@ from checkout import ROOT, copied, run
 from operators import Place, places
 
 PACKAGE = ("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables")
+DERIVING = ("ir", "lowering", "rendering", "methods", "mechanics", "formulas", "tables")
+"""What all cases come from; of the others one shows as much."""
 NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
 """Words for people; their tests are of words."""
+OF_C = ("support/*.h", "*.c.jinja", "parts/*.c.jinja", "parts/newton/*.c.jinja")
 CERTIFIED = (
     "kepler/svi-3",
     "cart/svi",
@@ -33,7 +36,29 @@ CERTIFIED = (
     "kepler/composition",
     "double/verlet",
 )
+MOST_CASES = 4
 NEAR: dict[str, tuple[str, ...]] = {
+    "templates/support/indexed": (
+        "runtime/test_indexed.py",
+        "verification/test_indexed.py",
+        "rendering/test_indexed.py",
+    ),
+    "templates/indexed": ("runtime/test_indexed.py", "rendering/test_indexed.py"),
+    "templates/main": ("models/test_package.py",),
+    "templates/parts/main": ("models/test_package_inputs.py",),
+    "templates/support/constraints": ("methods/test_constraints.py", "methods/test_rolling.py"),
+    "templates/support/density": ("runtime/test_density.py",),
+    "templates/support/exchanges": ("runtime/test_exchanges.py",),
+    "templates/support/inputs": ("runtime/test_driven.py", "models/test_package_inputs.py"),
+    "templates/support/push": ("runtime/test_sensitivity.py", "runtime/test_deviations.py"),
+    "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
+    "templates/support/flow": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
+    "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
+    "templates/support/xla": ("frameworks/test_jax.py", "rendering/test_flow_text.py"),
+    "templates/support/float": ("rendering/test_c_text.py",),
+    "templates/support/lent": ("runtime/test_fallback.py",),
+    "templates/support/borrowed": ("runtime/test_fallback.py",),
+    "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
     "templates/support/events": ("runtime/test_events.py",),
     "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
     "templates/support/control": ("runtime/test_controlled_steps.py", "lowering/test_ladder.py"),
@@ -46,7 +71,6 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/trajectories": ("runtime/test_ensemble.py", "runtime/test_drift.py"),
     "templates/": (
         "lowering/test_contraction.py",
-        "lowering/test_counts.py",
         "runtime/test_quantities.py",
         "lowering/test_collocation_solver.py",
         "runtime/test_stepper.py",
@@ -86,7 +110,8 @@ MOST_WORDS = 160
 def drawn(count: int, seed: int, only: str) -> list[Place]:
     """As many faults of C as of Python, of each file about as many as it has lines."""
     python = [path for room in PACKAGE for path in (ROOT / "scvi_codegen" / room).rglob("*.py")]
-    kinds = (list((ROOT / "templates/support").glob("*.h")), [path for path in python if path.name not in NOT_TRIED])
+    templates = [path for way in OF_C for path in (ROOT / "templates").glob(way)]
+    kinds = (templates, [path for path in python if path.name not in NOT_TRIED])
     chooser, chosen = random.Random(seed), []
     for files in kinds:
         own = [place for path in sorted(files) for place in places(ROOT, str(path.relative_to(ROOT)))]
@@ -95,26 +120,33 @@ def drawn(count: int, seed: int, only: str) -> list[Place]:
     return [place for pair in zip(*chosen, strict=False) for place in pair] if all(chosen) else chosen[0] or chosen[1]
 
 
-def near(path: str) -> tuple[str, ...]:
-    """The test files that stand next to a file; the longest beginning decides."""
+def near(path: str) -> list[str]:
+    """The test files that stand next to a file: that of its name, and those of the longest beginning of its path."""
     key = max((key for key in NEAR if path.startswith(key)), key=len)
-    return tuple(f"tests/{name}" for name in NEAR[key])
+    own = sorted(str(found.relative_to(ROOT)) for found in ROOT.glob(f"tests/*/test_{Path(path).stem}.py"))
+    return list(dict.fromkeys([*own, *(f"tests/{name}" for name in NEAR[key])]))
 
 
 def noticed(copy: Path, place: Place) -> tuple[str, str]:
     """What noticed a fault, and in which words; ``""`` if nothing did."""
-    cases = [case for case in CERTIFIED if not place.path.startswith("templates") or place.path in used(copy)[case]]
+    cases = [case for case in CERTIFIED if certifies(copy, case, place.path)][:MOST_CASES]
     code, output = run(copy, sys.executable, "tests/faults/certify.py", *cases) if cases else (0, "")
     if code == 3:
         return "stillborn", output[:MOST_WORDS]
     if code:
         return "certificate", output[:MOST_WORDS]
-    existing = [name for name in near(place.path) if (copy / name).exists()]
-    for name in existing:
+    for name in near(place.path):
         code, output = run(copy, sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", name)
         if code:
             return name, output[:MOST_WORDS]
     return "", ""
+
+
+def certifies(copy: Path, case: str, path: str) -> bool:
+    """Whether the certificate of a case has to do with a file."""
+    if path.startswith("templates/support"):
+        return path in used(copy)[case]
+    return path.startswith(("templates", *(f"scvi_codegen/{room}" for room in DERIVING))) or case == CERTIFIED[0]
 
 
 USED: dict[str, set[str]] = {}
