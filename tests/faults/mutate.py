@@ -64,12 +64,18 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/control": ("runtime/test_controlled_steps.py", "lowering/test_ladder.py"),
     "templates/support/legendre": ("runtime/test_given_velocities.py", "runtime/test_stepper.py"),
     "templates/support/clock": ("runtime/test_clock.py", "mechanics/test_transformed_time.py"),
-    "templates/support/newton": ("lowering/test_newton.py", "lowering/test_stiff_newton.py"),
-    "templates/support/band": ("lowering/test_newton.py", "lowering/test_ordering.py"),
+    "templates/support/newton": (
+        "lowering/test_iterations.py",
+        "lowering/test_newton.py",
+        "lowering/test_stiff_newton.py",
+    ),
+    "templates/support/band": ("lowering/test_band.py", "lowering/test_newton.py"),
     "templates/support/crowd": ("runtime/test_ensemble.py",),
     "templates/support/many": ("runtime/test_ensemble.py",),
     "templates/support/trajectories": ("runtime/test_ensemble.py", "runtime/test_drift.py"),
     "templates/": (
+        "lowering/test_iterations.py",
+        "lowering/test_sweeps.py",
         "lowering/test_contraction.py",
         "runtime/test_quantities.py",
         "lowering/test_collocation_solver.py",
@@ -95,6 +101,22 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_clock.py",
         "runtime/test_distributed.py",
     ),
+    "scvi_codegen/runtime/indexed": ("runtime/test_indexed.py", "models/test_indexed_model_file.py"),
+    **{
+        f"scvi_codegen/runtime/{stem}": ("runtime/test_deviations.py", "runtime/test_tangents.py")
+        for stem in ("changes_in_lanes", "spreading", "nearby", "growth", "deviations")
+    },
+    **{
+        f"scvi_codegen/runtime/{stem}": ("runtime/test_sensitivity.py", "runtime/test_periodic.py")
+        for stem in ("gradients", "linearised", "compiled_method", "periodic")
+    },
+    "scvi_codegen/runtime/driven": ("runtime/test_driven.py", "runtime/test_driven_ensemble.py"),
+    "scvi_codegen/runtime/longest": ("runtime/test_longest_step.py",),
+    "scvi_codegen/runtime/constrain": ("methods/test_constraints.py", "methods/test_rolling.py"),
+    "scvi_codegen/lowering/indexed": ("lowering/test_indexed_sums.py", "runtime/test_indexed.py"),
+    "scvi_codegen/rendering/indexed": ("rendering/test_indexed.py", "runtime/test_indexed.py"),
+    "scvi_codegen/mechanics/indexed": ("mechanics/test_indexed.py", "runtime/test_indexed.py"),
+    "scvi_codegen/formulas/indexed": ("formulas/test_indexed.py", "runtime/test_indexed.py"),
     "scvi_codegen/native": ("native",),
     "scvi_codegen/mechanics": ("mechanics",),
     "scvi_codegen/files": ("files", "results/test_recording.py", "results/test_ensemble_files.py"),
