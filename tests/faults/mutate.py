@@ -13,6 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import re
+import shutil
 import sys
 import tempfile
 from collections import Counter
@@ -125,7 +127,11 @@ NEAR: dict[str, tuple[str, ...]] = {
 }
 
 
-MOST_WORDS = 160
+OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
+PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *OF_CLANG)
+NOTHING_RUN = 4
+"""Status of pytest where a name was cut."""
+MOST_WORDS = 300
 """Of a result: characters of what noticed the fault."""
 
 
@@ -158,10 +164,16 @@ def noticed(copy: Path, place: Place) -> tuple[str, str]:
     if code:
         return "certificate", output[:MOST_WORDS]
     for name in near(place.path):
-        code, output = run(copy, sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", name)
+        code, output = run(copy, *PYTEST, name)
         if code:
             return name, output[:MOST_WORDS]
     return "", ""
+
+
+def fails_anyway(copy: Path, words: str) -> bool:
+    """Whether the test that noticed a fault does so without one: something it needs is not there."""
+    failed = re.search(r"tests/\S+\.py::.*?(?= - |$)", words)
+    return failed is not None and run(copy, *PYTEST, failed[0])[0] not in (0, NOTHING_RUN)
 
 
 def certifies(copy: Path, case: str, path: str) -> bool:
@@ -202,6 +214,8 @@ def main() -> None:
             (copy / place.path).write_text(place.applied(text))
             by, words = noticed(copy, place)
             (copy / place.path).write_text(text)
+            if by not in ("", "stillborn", "certificate") and fails_anyway(copy, words):
+                raise SystemExit(f"without the fault, too: {words}")
             known[fault] = by
             with given.results.open("a") as results:
                 results.write(json.dumps({"fault": fault, "caught by": by, "words": words}) + "\n")
