@@ -161,10 +161,10 @@ def test_every_part_of_a_text_has_a_part_in_its_name():
         replace(whole, declarations=f"{whole.declarations}double more(void);"),
         replace(whole, support=(("support/a.h", "/* b */"),)),
         replace(whole, support=(("support/b.h", "/* a */"),)),
-        replace(whole, events=None),
-        replace(whole, events=source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")),
+        replace(whole, beside=None),
+        replace(whole, beside=source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")),
     ]
-    assert {field.name for field in fields(Source)} == {"prefix", *TEXTS, "support", "events"}
+    assert {field.name for field in fields(Source)} == {"prefix", *TEXTS, "support", "beside"}
     names = [building.fingerprint(each, flags=FAST) for each in (whole, *changed)]
     assert len(set(names)) == len(names)
 
