@@ -104,5 +104,6 @@ def test_the_citation_is_of_this_version():
     released = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1:]
     unreleased = [entry.split()[0] for entry in released if "(unreleased)" in entry.splitlines()[0]]
     cited = next(line for line in citation.splitlines() if line.startswith("version:")).split()[1]
-    assert cited == scvi_codegen.__version__ or scvi_codegen.__version__ in unreleased
+    version, developed, _ = scvi_codegen.__version__.partition(".dev")
+    assert version in unreleased if developed else cited == version
     assert f"license: {project['license']}" in citation
