@@ -152,6 +152,13 @@ def test_eccentric_comet_keeps_its_energy(output_of):
     assert regular[4] < 1e-9
 
 
+def test_a_field_in_two_parts_has_the_bits_of_one(output_of):
+    bits, states, *times = output_of("field_on_two_processes").splitlines()
+    assert bits == "two processes have the bits of one: True"
+    assert states == "and the states of the compiled integrator: True"
+    assert len(times) == 4
+
+
 def test_every_way_to_choose_steps_is_as_good_as_it_says(output_of):
     """Over a thousand periods; in docs/steps.md ten thousand."""
     rows = [line[28:].split() for line in output_of("which_step").splitlines()[1:]]
