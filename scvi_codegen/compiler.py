@@ -324,6 +324,7 @@ def describe(
         exchange_names=program.exchanges,
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,
+        conserves_energy=not system.changes_energy and not system.inputs,
         energy_parameter=system.clock.energy.name if system.clock else "",
     )
 

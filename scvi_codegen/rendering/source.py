@@ -116,6 +116,7 @@ class Interface:
         inputs: names of functions of time given as data, each five of the parameters.
         energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
         monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
+        conserves_energy: whether the motion does; not known of folders of version 0.1.
     """
 
     prefix: str
@@ -139,6 +140,7 @@ class Interface:
     exchange_names: tuple[str, ...] = ()
     constraints: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
+    conserves_energy: bool = False
 
     @property
     def dimension(self) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import warn_of_long_steps
+from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.integrator import Integrator
@@ -49,6 +49,7 @@ class Run(Memory):
         else:
             trajectory = record(self, steps, every=every, progress=progress)
         warn_of_long_steps(trajectory, before=before)
+        warn_of_lost_energy(trajectory)
         return trajectory
 
 

@@ -18,7 +18,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.runtime.accuracy import warn_of_long_steps
+from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, entered, parameters_of
@@ -233,8 +233,9 @@ class Stepper(Ensembles):
 
 
 def _said(trajectory: Trajectory) -> Trajectory:
-    """The same, after what is to be said of its worst step."""
+    """The same, after what is to be said of its worst step, and of its energy."""
     warn_of_long_steps(trajectory)
+    warn_of_lost_energy(trajectory)
     return trajectory
 
 

@@ -89,6 +89,25 @@ class TestAnotherRoot:
             stepper.integrate(q, p, h=h, steps=2)
 
 
+class TestLostEnergy:
+    def test_of_a_near_collision_is_said(self, kepler):
+        """Each step keeps its tolerance; at the pericentre, 5e-7 from the centre, the speed is a thousandfold."""
+        with pytest.warns(sc.AccuracyWarning, match=r"energy went from -1 to \S+ though each step.*smaller tolerance"):
+            far = kepler.integrate([1.0, 0.0], [0.0, 1e-3], t_end=3.0, tolerance=1e-6)
+        energy = far.energy()
+        assert abs(energy[-1] - energy[0]) > 1e-3
+
+    @pytest.mark.filterwarnings("error")
+    def test_nothing_is_said_where_it_is_kept_or_need_not_be(self, kepler):
+        kepler.integrate([1.0, 0.0], [0.0, 1e-3], t_end=3.0)
+        driven = sc.LagrangianSystem.from_text(
+            name="driven", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2 + 5*q*sin(t)"
+        )
+        run = sc.compile_stepper(driven, "svi:4").integrate([0.1], [0.0], t_end=20.0, tolerance=1e-8)
+        energy = run.energy()
+        assert abs(energy[-1] - energy[0]) > 1.0
+
+
 class TestPromises:
     def test_a_collision_nearly_is_run_through_or_refused(self):
         state = "--q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
