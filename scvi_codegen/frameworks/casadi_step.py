@@ -132,9 +132,16 @@ class _Written:
                     values = self.ca.vertcat(*(next(results) for _ in scatter.results))
                     for r, entry in enumerate(scatter.table.entries[n]):
                         if entry:
-                            factor = float(scatter.scale * weight * entry)
+                            factor = float(scatter.scale * weight * entry) * self._growth(family.abscissae[n])
                             rows[r] += factor * self.h ** (scatter.power + powers[r]) * values
-        return rows
+        return [*rows[:-1], rows[-1] / self._growth(1)]
+
+    def _growth(self, abscissa: Any) -> Any:
+        """What damping makes of a weight at a point of the step: e^(gamma c h) of it."""
+        if self.stages.damping == 0:
+            return 1.0
+        (rate,) = numeric(self.ca, [self.stages.damping], own_parameters(self.system))(*self.ca.vertsplit(self.parameters))
+        return self.ca.exp(float(abscissa) * rate * self.h)
 
     def end_position(self) -> Any:
         """q1."""

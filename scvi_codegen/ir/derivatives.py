@@ -31,11 +31,13 @@ class Derivatives:
     Attributes:
         program: solved by Newton's iteration.
         by_given: one a family.
+        damping: slopes of the rate of a damping, by parameters.
         lanes: changes that are carried along at a time.
     """
 
     program: Program
     by_given: tuple[GivenSlopes, ...]
+    damping: GivenSlopes | None = None
     lanes: int = 8
 
     @property
@@ -46,7 +48,8 @@ class Derivatives:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that the program lacks."""
-        return tuple(each.kernel for each in self.by_given if each.kernel)
+        slopes = (*self.by_given, *((self.damping,) if self.damping else ()))
+        return tuple(each.kernel for each in slopes if each.kernel)
 
     @property
     def given(self) -> int:
@@ -55,16 +58,23 @@ class Derivatives:
 
     @property
     def slopes(self) -> int:
-        """Numbers at all points: by h, by arguments, by parameters and time."""
+        """Numbers at all points: by h, by arguments, by parameters and time, by a damping."""
+        damped = bool(self.damping)
         return sum(
-            family.points * (family.slope.arguments + len(family.slope.results) + len(given.entries))
+            family.points
+            * (family.slope.arguments + len(family.slope.results) + len(given.entries) + damped * family.slope.values)
             for family, given in self.families
         )
+
+    @property
+    def at_points(self) -> int:
+        """Changes of arguments and results at the points of a family."""
+        return max(family.points * (family.slope.arguments + family.slope.values) for family in self.program.families)
 
     @property
     def memory(self) -> int:
         """Doubles beside those of a step: slopes; changes of what is given, of unknowns, twice, of rows and points."""
         program = self.program
-        points = max(family.points * (family.slope.arguments + family.slope.values) for family in program.families)
-        wide = self.given + 2 * program.unknowns + program.sites * (program.blocks + 1) + points
+        wide = self.given + 2 * program.unknowns + program.sites * (program.blocks + 1) + self.at_points
+        wide += bool(self.damping)  # changes of gamma h
         return self.slopes + wide * self.lanes

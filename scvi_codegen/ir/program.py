@@ -104,6 +104,7 @@ class Program:
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
         exchanges: names of what forces give: energy, and momentum maps; none without forces.
         constraints: what keeps the motion on them, or ``None``.
+        damping: the rate of a uniform damping, if there is one.
         inputs: the place of the first of the five parameters of each function of time that is data, by name.
     """
 
@@ -143,6 +144,7 @@ class Program:
     exchanges: tuple[str, ...] = ()
     constraints: Constraints | None = None
     inputs: tuple[tuple[str, int], ...] = ()
+    damping: Kernel | None = None
 
     @property
     def dimension(self) -> int:
@@ -171,7 +173,8 @@ class Program:
         sums = {kernel.name: kernel for kernel in along}
         maps = (self.momentum_kernel,) if self.momentum_kernel else ()
         integrands = (self.integrals.kernel,) if self.integrals else ()
-        bound = (self.constraints.kernel, self.constraints.motion) if self.constraints else ()
+        bound: tuple[Kernel, ...] = (self.constraints.kernel, self.constraints.motion) if self.constraints else ()
+        bound += (self.damping,) if self.damping else ()
         return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands, *bound)
 
     @property

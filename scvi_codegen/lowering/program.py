@@ -28,14 +28,14 @@ from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.constraints import lowered_constraints
 from scvi_codegen.lowering.families import has_action, lowered_family
-from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
+from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.mechanics.exchanges import exchanges
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.method import Method, is_symplectic
+from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.shapes import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import legendre_functional
@@ -112,6 +112,7 @@ def lower(
         integrals=_integrals(system, method, stages),
         exchanges=_exchanges(system, stages),
         constraints=constraints,
+        damping=damping_kernel(system),
         inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
@@ -230,9 +231,15 @@ def notes_of(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
     order = "no order claimed" if method.order is None else f"order {method.order}"
     return (
         order,
-        "symplectic" if is_symplectic(method, system) else "not symplectic",
+        _geometry(method, system),
         "symmetric" if method.symmetric else "not symmetric",
     )
+
+
+def _geometry(method: Method, system: MechanicalSystem) -> str:
+    if is_symplectic(method, system):
+        return "symplectic"
+    return f"{'conformally' if is_conformally_symplectic(method, system) else 'not'} symplectic"
 
 
 def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:

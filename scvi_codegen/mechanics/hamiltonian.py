@@ -23,6 +23,7 @@ from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number,
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation, given_expression
 from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, of, takes
+from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
 from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -73,6 +74,7 @@ class HamiltonianSystem(MechanicalSystem):
         hamiltonian=TEXT,
         momenta=NAMES,
         parameters=MAPPING,
+        damping=TEXT,
         inputs=NAMES,
     )
     def from_text(
@@ -84,6 +86,7 @@ class HamiltonianSystem(MechanicalSystem):
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
+        damping: str | None = None,
         inputs: Sequence[str] = (),
     ) -> HamiltonianSystem:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
@@ -95,6 +98,8 @@ class HamiltonianSystem(MechanicalSystem):
             momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
+            damping: the rate at which all momenta shrink, a formula of parameters
+                (:mod:`scvi_codegen.mechanics.damping`).
             inputs: names of functions of time that are given as data with each run
                 (:mod:`scvi_codegen.mechanics.inputs`).
 
@@ -122,6 +127,7 @@ class HamiltonianSystem(MechanicalSystem):
             defaults=tuple(number(given, value) for given, value in values.items()),
             hamiltonian=read(hamiltonian),
             forces=forces_by_coordinate(variables, forces or {}, read),
+            damping=damping_rate(damping, read),
             inputs=tuple(inputs),
         )
 
@@ -145,6 +151,7 @@ class HamiltonianSystem(MechanicalSystem):
         time: Symbol | None = None,
         parameters: Mapping[Symbol | str, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
+        damping: Expr | float | None = None,
         inputs: Sequence[Any] = (),
     ) -> HamiltonianSystem:
         """Take H from a SymPy expression, in plain symbols or in functions of time.
@@ -159,16 +166,18 @@ class HamiltonianSystem(MechanicalSystem):
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
             forces: expression by coordinate, in coordinates, momenta and time.
+            damping: the rate at which all momenta shrink, an expression in parameters.
             inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
         hamiltonian = given_expression(hamiltonian, "Hamiltonian")
         acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        rate = damping_rate(damping, lambda given: given_expression(given, "damping"))
         own = tuple(given_name(each) for each in inputs)
         given = with_inputs(named_parameters(parameters), own)
         translation = Translation(
             hamiltonian,
             coordinates,
-            tuple(acting.values()),
+            (*acting.values(), rate),
             momenta=momenta,
             time=time,
             parameters=tuple(given),
@@ -188,6 +197,7 @@ class HamiltonianSystem(MechanicalSystem):
                 {translation.rules.get(q, q): f for q, f in acting.items()},
                 lambda given: translation.apply(given, "forces").xreplace(driven),
             ),
+            damping=translation.apply(rate, "damping").xreplace(driven),
             inputs=own,
         )
 
@@ -252,6 +262,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         hamiltonian=hamiltonian,
         clock=system.clock,
         forces=tuple(f.xreplace(velocities) for f in system.forces),
+        damping=system.damping,
         inputs=system.inputs,
     )
 
@@ -281,6 +292,7 @@ def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
         lagrangian=lagrangian,
         clock=system.clock,
         forces=tuple(f.xreplace(momenta) for f in system.forces),
+        damping=system.damping,
         inputs=system.inputs,
     )
 

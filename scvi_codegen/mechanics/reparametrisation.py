@@ -71,9 +71,9 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or "
             f"{REVERSIBLE}"
         )
-    if system.forces:
+    if system.forces or system.damping != 0:
         raise SystemDefinitionError(
-            f"forces act on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
+            f"{'forces act' if system.forces else 'damping acts'} on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
             f"controlled steps (t_end=...), or {REVERSIBLE}"
         )
     if system.constraints:

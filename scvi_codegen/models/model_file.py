@@ -8,6 +8,7 @@
                                                         # time; without a step tolerance = 0
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
+    # damping = "gamma"                                 # the rate at which all momenta shrink; left out: 0
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
     # inputs = ["u"]                                    # functions of time that are data
 
@@ -108,7 +109,7 @@ __all__ = [
 
 Kind = TypeVar("Kind")
 
-FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "constraints")
+FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
 RUN_KEYS = ("step", "tolerance", "controller", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
@@ -296,6 +297,7 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     name, coordinates = text_of(section, "name", "[system]"), names_of(section, "coordinates")
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
     common["forces"] = {key: text_of(forces, key, "[forces]") for key in forces}
+    common["damping"] = text_of(section, "damping", "[system]") if "damping" in section else None
     common["inputs"] = names_of(section, "inputs") if "inputs" in section else ()
     if "hamiltonian" in section:
         if "constraints" in section:
