@@ -50,6 +50,20 @@ FORCES_AND_INPUTS = (
     ),
 )
 
+DAMPING = (
+    text("weights that do not grow", case("damped/svi"), r"lanes_of_number\(growth\) \* ABSCISSA", "0.0 * ABSCISSA"),
+    text("weights of the middle", case("damped/svi"), r"exp\(growth \* abscissa\[n\]\)", "exp(growth / 2)"),
+    text("a momentum that is not damped", case("damped/svi"), r"data->damping\.shrunk \* dp\[i\] \+ .*;", "dp[i];"),
+    text("damping by 1 - gamma h", case("damped/svi"), r"exponential_less_1\(-growth\)", "-growth"),
+    text(
+        "slopes by the rate lost",
+        case("damped/svi"),
+        r"flow\(back, growth, step->h \* slope\[e\].*;",
+        ";",
+    ),
+    text("slopes of what grows by h alone", case("damped/svi"), r"flow\(0, p, -at->p1\[i\], at->grown\);", ";"),
+)
+
 HAMILTONIANS = (
     function("H_pt lost", case("swing/sc"), mechanics, "_along", without_rates_of("t")),
     function(
@@ -172,9 +186,9 @@ C_TEXT = (
     (
         "half of the last row",
         "double/svi",
-        "push_step",
-        r"at->v \+ M \+ i, 1, at->rows",
-        "at->v + M + i, 0.5, at->rows",
+        "end_momentum",
+        r"flow\(0, p, 1, at->rows",
+        "flow(0, p, 0.5, at->rows",
     ),
     (
         "positions that unknowns move by 1, not by h",
@@ -207,6 +221,7 @@ C_TEXT = (
 )
 BESIDE = (
     *FORCES_AND_INPUTS,
+    *DAMPING,
     *HAMILTONIANS,
     *CONSTRAINTS,
     here(

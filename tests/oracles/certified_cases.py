@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from sabotage import Case
 from samples import (
+    damped_pendulum,
     driven_duffing,
     linkage,
     oscillator,
@@ -51,6 +52,7 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "sleigh": (sleigh(), (0.3, -0.4, 0.5), (1.155222551473559, 0.8681156930772079, 0.56), 0.1),
     "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
     "pushed": (pushed_pendulum(), (0.6,), (-0.3,), 0.1),
+    "damped": (damped_pendulum(), (0.6, 0.2), (-0.3, 0.5), 0.1),
     "swing": (pumped_swing(), (0.6,), (-0.3,), 0.1),
     "field": (problem("charged-particle").system, (0.6, 0.3, -0.2), (-0.3, 0.4, 0.5), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
@@ -94,7 +96,7 @@ WHOLE = """
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
-    slowed/svi-3 pushed/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
+    slowed/svi-3 pushed/svi damped/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)
 REVERSIBLE = replace(case("kepler/svi-3"), monitor="frequency")

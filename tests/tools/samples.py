@@ -94,6 +94,17 @@ def pushed_pendulum() -> LagrangianSystem:
     )
 
 
+def damped_pendulum() -> LagrangianSystem:
+    """On a cart that a spring holds; all momenta damped at a rate of two parameters, and L with time."""
+    return LagrangianSystem.from_text(
+        name="damped pendulum",
+        coordinates=["x", "a"],
+        lagrangian="m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)",
+        parameters={"m": 2.0, "c": 0.4, "r": 0.7},
+        damping="c*r",
+    )
+
+
 def pumped_swing() -> HamiltonianSystem:
     """A Hamiltonian with time, rubbed and pushed."""
     return HamiltonianSystem.from_text(
