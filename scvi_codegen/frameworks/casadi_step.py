@@ -140,8 +140,8 @@ class _Written:
         """What damping makes of a weight at a point of the step: e^(gamma c h) of it."""
         if self.stages.damping == 0:
             return 1.0
-        (rate,) = numeric(self.ca, [self.stages.damping], own_parameters(self.system))(*self.ca.vertsplit(self.parameters))
-        return self.ca.exp(float(abscissa) * rate * self.h)
+        rate = numeric(self.ca, [self.stages.damping], tuple(own_parameters(self.system)))
+        return self.ca.exp(float(abscissa) * rate(*self.ca.vertsplit(self.parameters))[0] * self.h)
 
     def end_position(self) -> Any:
         """q1."""

@@ -35,10 +35,11 @@ from scvi_codegen.mechanics.exchanges import exchanges
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.shapes import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
-from scvi_codegen.tables.basis import legendre_functional
+from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 __all__ = ["lower"]
@@ -133,11 +134,17 @@ def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str,
 
 
 def _stage_curve(stages: StageSystem) -> StageCurve | None:
-    """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations."""
+    """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations.
+
+    Constraints give the velocity at the end by itself, as good as the step. What that of the curve is off it by is the
+    first coefficient that the curve does not have: it tells more than the last that it has, and of one velocity, too.
+    """
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
-    if isinstance(shape, Velocities) and 1 < len(shape.blocks) == len(set(shape.blocks)) and _moves(stages, shape):
-        degree = len(shape.blocks) - 1
-        highest = tuple((4 * degree - 2) * x for x in legendre_functional(shape.blocks, degree))
+    held = any(block.name == END_VELOCITY for block in stages.blocks)
+    if isinstance(shape, Velocities) and len({*shape.blocks}) + held > 1 and _moves(stages, shape):
+        degree = len(shape.blocks) - 1 + held
+        highest = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one) if held else ()
+        highest = tuple((4 * degree - 2) * x for x in highest or legendre_functional(shape.blocks, degree))
         highest += (mp.zero,) * (count - len(highest))
         bends = [(0, degree), (0, (degree + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
@@ -155,7 +162,9 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
 def _moves(stages: StageSystem, shape: Velocities) -> bool:
     """Whether the velocities, the first blocks, are all that moves positions, and momenta are no unknowns."""
     own = len(shape.blocks)
-    return all(block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks))
+    return own == len({*shape.blocks}) and all(
+        block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks)
+    )
 
 
 def _distinct(points: Vector) -> bool:

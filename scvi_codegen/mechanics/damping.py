@@ -1,4 +1,4 @@
-"""Uniform linear damping: one rate gamma for all momenta, and a phase area that shrinks by exactly exp(-gamma h) a step.
+"""Uniform damping: one rate gamma for all momenta, and a phase area that shrinks by exactly exp(-gamma h) a step.
 
 With damping the motion is that of the action of Caldirola and Kanai,
 

@@ -8,7 +8,8 @@ an L without time by the work of the force,
 SVI and their kin keep the first to round-off, with the integral by the method's own quadrature along its own curve
 (forced discrete Noether theorem: J. E. Marsden, M. West, Acta Numerica 10 (2001), theorem 3.2.1), and meet the second
 with their order. Damping is in both the force -gamma p; of a momentum map what it takes is known beforehand, all but
-exp(-gamma h) of it a step, and the integral has the order of the method. The curve of SCVI(s) is no stationary one: it meets both with the order of the curve, s + 1.
+exp(-gamma h) of it a step, and the integral has the order of the method. The curve of SCVI(s) is no stationary one: it
+meets both with the order of the curve, s + 1.
 """
 
 from __future__ import annotations

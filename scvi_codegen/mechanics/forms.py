@@ -114,7 +114,7 @@ class Forms:
 
     @cached_property
     def euler_lagrange(self) -> tuple[Expr, ...]:
-        """E = L_vv a + L_vq v + L_vt - L_q + gamma L_v, m expressions in (q, v, a, t), zero on trajectories (paper (2)).
+        """E = L_vv a + L_vq v + L_vt - L_q + gamma L_v, m expressions in (q, v, a, t), 0 on trajectories (paper (2)).
 
         Of a Hamiltonian: d/dt (v - H_p) = a - H_pq v + H_pp H_q - H_pt, in (q, v, a, p, t) with v = H_p.
         """
@@ -190,7 +190,11 @@ class Forms:
     def split(self) -> bool:
         """Whether H = T(p) + V(q, t), as seen in the structure of its derivatives; forces may depend on q and t."""
         system = self.system
-        if not system.auxiliaries or system.damping != 0 or system.time in set().union(*(v.free_symbols for v in self.legendre)):
+        if (
+            not system.auxiliaries
+            or system.damping != 0
+            or system.time in set().union(*(v.free_symbols for v in self.legendre))
+        ):
             return False
         return not jacobian(self.legendre, system.coordinates) and not jacobian(
             self.force, (*system.velocities, *system.auxiliaries)

@@ -42,6 +42,6 @@ def _check_damping(system: MechanicalSystem, method: Method, stages: StageSystem
     if system.damping != 0 and not isinstance(stages.shape, Velocities):
         raise MethodError(
             f"{method.name} does not take the damping of '{system.name}', which weighs L_q and L_v at the points of a "
-            "quadrature: take an SVI, or a Runge-Kutta method in phase space. As forces, \"-gamma*p\", every method "
+            'quadrature: take an SVI, or a Runge-Kutta method in phase space. As forces, "-gamma*p", every method '
             "takes it, though area does not shrink by exactly exp(-gamma h)"
         )

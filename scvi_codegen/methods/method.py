@@ -159,7 +159,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Whether they multiply dq ^ dp by exp(-gamma h), gamma the damping, nothing else taking from it or adding to it."""
+    """Whether they multiply dq ^ dp by exp(-gamma h), gamma the damping, with nothing else that changes it."""
     return method.symplectic and not system.forces and not any(velocities_held(system))
 
 

@@ -74,7 +74,10 @@ def _symplecticity(subject: Subject) -> Finding:
 
 
 def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
-    """(2m, 2m) sizes of J^T Omega J - Omega, the latter shrunk by damping, and of their noise, each in units of the areas of its two coordinates."""
+    """(2m, 2m) sizes of J^T Omega J - Omega, and of their noise, each in units of the areas of its two coordinates.
+
+    Omega is shrunk by the damping of a step.
+    """
     m, J = len(around.scales) // 2, around.matrix
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(around.scales, around.scales)
     areas = np.tile(around.scales[:m] * around.scales[m:], 2)

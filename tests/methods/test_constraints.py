@@ -205,6 +205,24 @@ def test_parts_of_steps_events_and_chosen_steps():
     assert np.abs(run.events[0].q[:, 0]).max() < 1e-12
 
 
+@pytest.mark.parametrize("s", [1, 2, 3, 4])
+def test_the_error_of_a_step_is_told_by_the_velocity_at_its_end(s):
+    """Told by the curve alone it was 1500 times too much with degree 3 (the median), and not told with degree 1."""
+    pendulum = LagrangianSystem.from_text(
+        name="angle", coordinates=["a"], lagrangian="l**2*a_dot**2/2 + g*l*cos(a)", parameters={"g": G, "l": 1.5}
+    )
+    stepper, exact, found = compile_stepper(rod(), lobatto(s)), compile_stepper(pendulum, SVI(8)), []
+    for a, w in np.random.default_rng(0).uniform((-3, -5), (3, 5), (20, 2)):
+        run = stepper.integrate(on_circle(a), velocity=1.5 * w * np.array([np.cos(a), np.sin(a)]), h=0.1, steps=1)
+        angle = exact.integrate([a], velocity=[w], h=0.05, steps=2).q[-1, 0]
+        found.append(run.step_error / (np.abs(run.q[-1] - on_circle(angle)).max() / 1.5))
+    assert 0.2 < np.median(found) < 300.0
+    assert min(found) > 0.01
+    free = stepper.integrate(on_circle(1.0), velocity=[0.0, 0.0], t_end=1.0, tolerance=1e-6)
+    angle = exact.integrate([1.0], velocity=[0.0], h=0.05, steps=20).q[-1, 0]
+    assert np.abs(free.q[-1] - on_circle(angle)).max() < 3e-4
+
+
 def test_positions_do_not_follow_constraints_that_jump():
     """A pendulum whose hook moves by data: a kink is an impulse, the same for all steps, and a jump is refused."""
     system = LagrangianSystem.from_text(
