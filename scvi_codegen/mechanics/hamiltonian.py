@@ -19,13 +19,13 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation, given_expression
 from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, of, takes
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -101,7 +101,7 @@ class HamiltonianSystem(MechanicalSystem):
             damping: the rate at which all momenta shrink, a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
             inputs: names of functions of time that are given as data with each run
-                (:mod:`scvi_codegen.mechanics.inputs`).
+                (:mod:`scvi_codegen.formulas.inputs`).
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"

@@ -11,13 +11,13 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation, given_expression
 from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, Kind, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -112,7 +112,7 @@ class LagrangianSystem(MechanicalSystem):
             constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``;
                 linear in velocities those of wheels and skates (:mod:`scvi_codegen.mechanics.constraints`).
             inputs: names of functions of time that are given as data with each run
-                (:mod:`scvi_codegen.mechanics.inputs`).
+                (:mod:`scvi_codegen.formulas.inputs`).
 
         >>> oscillator = LagrangianSystem.from_text(
         ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",

@@ -74,8 +74,8 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
     if system.forces or system.damping != 0:
         acting = "forces act" if system.forces else "damping acts"
         raise SystemDefinitionError(
-            f"{acting} on '{system.name}': the energy, on whose level time is transformed, is not kept. Take controlled "
-            f"steps (t_end=...), or {REVERSIBLE}"
+            f"{acting} on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
+            f"controlled steps (t_end=...), or {REVERSIBLE}"
         )
     if system.constraints:
         raise SystemDefinitionError(

@@ -30,12 +30,12 @@ from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.inputs import inputs_by_name
 from scvi_codegen.formulas.parts import identity
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import of
 from scvi_codegen.mechanics.damping import check_damping
-from scvi_codegen.mechanics.inputs import inputs_by_name
 
 __all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
 
@@ -76,7 +76,7 @@ class MechanicalSystem(ABC):
             Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
         damping: the rate gamma at which all momenta shrink beside what else they do, a formula of parameters, 0 if
             they do not (:mod:`scvi_codegen.mechanics.damping`).
-        inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.mechanics.inputs`).
+        inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
         constraints: what a Lagrangian's motion keeps at 0, in (q, t), or linear in v
             (:mod:`scvi_codegen.mechanics.constraints`).
     """
