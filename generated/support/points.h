@@ -23,6 +23,16 @@ static inline number magnitude(number x)
   return fabs(x);
 }
 
+static inline number exponential(number x)
+{
+  return exp(x);
+}
+
+static inline number exponential_less_1(number x)
+{
+  return expm1(x);
+}
+
 /* The largest of M numbers: of many in as many parts as a vector has, which do not wait for each other. */
 static inline number largest_number(const number *x)
 {
