@@ -8,7 +8,7 @@ integrated as well, by methods that do not need one (:attr:`~scvi_codegen.method
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +23,8 @@ from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, of, takes
+from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -63,7 +64,10 @@ class HamiltonianSystem(MechanicalSystem):
                 f"{len(self.coordinates)} coordinates, but {len(self.momenta)} momenta: list one each"
             )
         if self.constraints:
-            raise SystemDefinitionError(f"'{self.name}' has constraints, which are kept where a Lagrangian is given")
+            raise SystemDefinitionError(
+                f"'{self.name}' has constraints, which are kept where a Lagrangian is given: leave them out here, and "
+                "take lagrangian_of(system, constraints=[...]), whose momenta are the same"
+            )
         self._check("Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
@@ -75,6 +79,7 @@ class HamiltonianSystem(MechanicalSystem):
         momenta=NAMES,
         parameters=MAPPING,
         damping=TEXT,
+        constraints=TEXTS,
         inputs=NAMES,
     )
     def from_text(
@@ -87,6 +92,7 @@ class HamiltonianSystem(MechanicalSystem):
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
         damping: str | None = None,
+        constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
     ) -> HamiltonianSystem:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
@@ -100,6 +106,7 @@ class HamiltonianSystem(MechanicalSystem):
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
             damping: the rate at which all momenta shrink, a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
+            constraints: none; :func:`lagrangian_of` takes them.
             inputs: names of functions of time that are given as data with each run
                 (:mod:`scvi_codegen.formulas.inputs`).
 
@@ -128,6 +135,7 @@ class HamiltonianSystem(MechanicalSystem):
             hamiltonian=read(hamiltonian),
             forces=forces_by_coordinate(variables, forces or {}, read),
             damping=damping_rate(damping, read),
+            constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
 
@@ -267,14 +275,31 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     )
 
 
-@takes(system=of("a HamiltonianSystem", HamiltonianSystem))
-@lru_cache(maxsize=64)
-def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
+@takes(system=of("a HamiltonianSystem", HamiltonianSystem), constraints=TEXTS)
+def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ()) -> LagrangianSystem:
     """The Lagrangian p . v - H of a Hamiltonian, p expressed by v = dH/dp (paper, section 1.1).
+
+    Args:
+        system: the Hamiltonian.
+        constraints: of the motion, as of :meth:`LagrangianSystem.from_text`: with them p' = -H_q + G^T lambda. Momenta
+            are those of the Hamiltonian.
 
     Raises:
         SystemDefinitionError: where d2H/dp2 is singular, or v = dH/dp has no closed solution that SymPy finds.
     """
+    found = _lagrangian_of(system)
+    if not constraints:
+        return found
+    known = {x.name: x for x in (*system.coordinates, *found.velocities, system.time, *system.parameters)}
+    known |= {name: symbol(name) for name in system.inputs}
+    driven = input_formulas(system.inputs, system.time)
+    return replace(
+        found, constraints=constraints_of(constraints, lambda g: parse_expression(g, known).xreplace(driven))
+    )
+
+
+@lru_cache(maxsize=64)
+def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
     if not system.is_regular:
         raise SystemDefinitionError(
             f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine momenta"
@@ -307,7 +332,7 @@ def lagrangian_twin(system: MechanicalSystem) -> LagrangianSystem | None:
 @lru_cache(maxsize=64)
 def _twin(system: HamiltonianSystem) -> LagrangianSystem | None:
     try:
-        return lagrangian_of(system)
+        return _lagrangian_of(system)
     except SystemDefinitionError:
         return None
 

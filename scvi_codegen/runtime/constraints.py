@@ -37,10 +37,12 @@ def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayL
 
 
 def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
-    """(n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states."""
+    """(n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states; forces in t, also where time is transformed."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((len(times), len(stepper.constraints)))
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
+    if stepper.interface.energy_parameter:
+        values /= stepper.rates(positions, momenta, parameters)[:, np.newaxis]
     return values
 
 
