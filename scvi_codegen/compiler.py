@@ -40,6 +40,7 @@ from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
+from scvi_codegen.lowering.solvers.rattle import rattle_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.changes import with_changes
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
@@ -288,6 +289,7 @@ def program_of(
         sweep=sweep,
         splitting=splitting,
         newton=newton,
+        rattle=rattle_of(system, stages) if solver == "auto" else None,
         symmetries=tracked,
     )
 

@@ -20,6 +20,7 @@ import sympy
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.ir.constraints import Rattle
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
@@ -54,6 +55,7 @@ def lower(
     sweep: Sweep | None = None,
     splitting: Splitting | None = None,
     newton: bool = True,
+    rattle: Rattle | None = None,
     symmetries: Sequence[Symmetry] = (),
 ) -> Program:
     """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
@@ -66,6 +68,7 @@ def lower(
         splitting: the explicit solver that replaces both
         (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
         newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
+        rattle: what is tried before Newton's iteration, if a step is one of RATTLE.
         symmetries: whose momentum maps are emitted.
     """
     m, sites = system.dimension, sites_of(stages, system.dimension)
@@ -114,6 +117,7 @@ def lower(
         exchanges=_exchanges(system, stages),
         constraints=constraints,
         damping=damping_kernel(system),
+        rattle=rattle,
         inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )

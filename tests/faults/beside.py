@@ -64,6 +64,16 @@ DAMPING = (
     text("slopes of what grows by h alone", case("damped/svi"), r"flow\(0, p, -at->p1\[i\], at->grown\);", ";"),
 )
 
+RATTLES = tuple(
+    text(f"{what}, rods/rattle", case("rods/rattle"), *edit)
+    for what, *edit in (
+        ("a hidden constraint without g_t", r"value \+ M, lambda\)", "value + M + CONSTRAINTS, lambda)"),
+        ("half of the force at the end", r"now\.force\[i\] \+ force\[i\]", "now.force[i] + force[i] / 2"),
+        ("constraints of the start of a step", r"constraints\(u, step->t \+ step->h", "constraints(u, step->t"),
+        ("masses that are not inverted", r"now\.inverse_mass\[i\] = 1 / now", "now.inverse_mass[i] = now"),
+    )
+)
+
 HAMILTONIANS = (
     function("H_pt lost", case("swing/sc"), mechanics, "_along", without_rates_of("t")),
     function(
@@ -222,6 +232,7 @@ C_TEXT = (
 BESIDE = (
     *FORCES_AND_INPUTS,
     *DAMPING,
+    *RATTLES,
     *HAMILTONIANS,
     *CONSTRAINTS,
     here(

@@ -17,6 +17,7 @@ from scvi_codegen import (
     LagrangianSystem,
     MethodError,
     StateError,
+    StepFailedError,
     StoermerVerlet,
     SystemDefinitionError,
     change_coordinates,
@@ -90,6 +91,32 @@ def test_degree_1_is_rattle():
         assert_allclose(found[0], q1, atol=1e-15)
         assert_allclose(found[1], p1, atol=1e-13)
         q, p = q1, p1
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_rattle_is_solved_for_multipliers_alone_where_masses_are_constant(moving):
+    """To the states of Newton's iteration; also by steps that choose their length, and where one fails."""
+    chain = LagrangianSystem.from_text(
+        name="two masses",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="m*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - 9.81*(m*y1 + y2) - x1*sin(t)",
+        parameters={"m": 2.0, "w": 0.2},
+        constraints=[f"x1**2 + y1**2 = (1 + w*sin(3*t)*{int(moving)})**2", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+        forces={"x2": "cos(t)*y2"},
+    )
+    ours, newton = (compile_stepper(chain, lobatto(1), solver=solver) for solver in ("auto", "newton"))
+    assert "held_force(" in ours.source.amalgamated().code
+    assert "held_force(" not in newton.source.amalgamated().code
+    assert "held_force(" not in compile_stepper(chain, lobatto(2)).source.amalgamated().code
+    start = newton.project([0.6, -0.8, 1.5, -0.4], newton.momentum([0.6, -0.8, 1.5, -0.4], [0.1] * 4, 0.0))
+    for way in ({"h": 0.01, "steps": 100}, {"h": -0.03, "steps": 20}, {"t_end": 0.5, "tolerance": 1e-4}):
+        one, other = (stepper.integrate(*start, **way) for stepper in (ours, newton))
+        assert one.steps == other.steps
+        assert np.abs(one.q - other.q).max() < 1e-12
+        assert np.abs(one.p - other.p).max() < 1e-11
+        assert np.abs(one.constraint_values()).max() < 2e-14
+    with pytest.raises(StepFailedError):
+        ours.integrate(*start, h=30.0, steps=1)
 
 
 def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():

@@ -18,6 +18,7 @@ from samples import (
     pushed_pendulum,
     sleigh,
     turning_wire,
+    two_rods,
 )
 
 from scvi_codegen.mechanics.reparametrisation import reparametrise
@@ -55,12 +56,14 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
     "pushed": (pushed_pendulum(), (0.6,), (-0.3,), 0.1),
     "damped": (damped_pendulum(), (0.6, 0.2), (-0.3, 0.5), 0.1),
+    "rods": (two_rods(), (0.6, -0.8, 1.4, -1.4), (0.8, 0.6, 0.7, 0.0), 0.05),
     "swing": (pumped_swing(), (0.6,), (-0.3,), 0.1),
     "field": (problem("charged-particle").system, (0.6, 0.3, -0.2), (-0.3, 0.4, 0.5), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
 }
 METHODS: dict[str, Callable[[], Method]] = {
     "svi": lambda: SVI(2),
+    "rattle": lambda: SVI(1, "gauss-lobatto:2"),
     "svi-3": lambda: SVI(3),
     "svi-8": lambda: SVI(8),
     "lobatto-svi": lambda: SVI(2, "gauss-lobatto:3"),
@@ -98,7 +101,7 @@ WHOLE = """
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
-    slowed/svi-3 pushed/svi damped/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
+    slowed/svi-3 pushed/svi damped/svi rods/rattle pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)
 REVERSIBLE = replace(case("kepler/svi-3"), monitor="frequency")

@@ -70,6 +70,17 @@ def linkage() -> LagrangianSystem:
     )
 
 
+def two_rods() -> LagrangianSystem:
+    """One mass below the other, the upper rod of changing length: constant masses, a step is one of RATTLE."""
+    return LagrangianSystem.from_text(
+        name="two rods",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="m*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - g*(m*y1 + y2)",
+        parameters={"m": 2.0, "g": 3.0},
+        constraints=["x1**2 + y1**2 = (1 + sin(t)/9)**2", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+    )
+
+
 def sleigh() -> LagrangianSystem:
     """Chaplygin's, between springs: its blade at (x, y) goes where it points, its mass is d ahead of it."""
     return LagrangianSystem.from_text(
