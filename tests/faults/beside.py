@@ -52,7 +52,7 @@ FORCES_AND_INPUTS = (
 
 DAMPING = (
     text("weights that do not grow", case("damped/svi"), r"lanes_of_number\(growth\) \* ABSCISSA", "0.0 * ABSCISSA"),
-    text("weights of the middle", case("damped/svi"), r"exp\(growth \* abscissa\[n\]\)", "exp(growth / 2)"),
+    text("weights of the middle", case("damped/svi"), r"\)\(growth \* abscissa\[n\]\)", ")(growth / 2)"),
     text("a momentum that is not damped", case("damped/svi"), r"data->damping\.shrunk \* dp\[i\] \+ .*;", "dp[i];"),
     text("damping by 1 - gamma h", case("damped/svi"), r"exponential_less_1\(-growth\)", "-growth"),
     text(

@@ -109,12 +109,13 @@ def test_rattle_is_solved_for_multipliers_alone_where_masses_are_constant(moving
     assert "held_force(" not in newton.source.amalgamated().code
     assert "held_force(" not in compile_stepper(chain, lobatto(2)).source.amalgamated().code
     start = newton.project([0.6, -0.8, 1.5, -0.4], newton.momentum([0.6, -0.8, 1.5, -0.4], [0.1] * 4, 0.0))
-    for way in ({"h": 0.01, "steps": 100}, {"h": -0.03, "steps": 20}, {"t_end": 0.5, "tolerance": 1e-4}):
-        one, other = (stepper.integrate(*start, **way) for stepper in (ours, newton))
+    for way, bound in (({"h": 0.01, "steps": 100}, 1e-12), ({"h": -0.03, "steps": 20}, 1e-12), ({"t_end": 0.5}, 1e-8)):
+        exactly = {} if "h" in way else {"tolerance": 1e-4}
+        one, other = (stepper.integrate(*start, **way, **exactly) for stepper in (ours, newton))
         assert one.steps == other.steps
-        assert np.abs(one.q - other.q).max() < 1e-12
-        assert np.abs(one.p - other.p).max() < 1e-11
-        assert np.abs(one.constraint_values()).max() < 2e-14
+        assert np.abs(one.q - other.q).max() < bound
+        assert np.abs(one.p - other.p).max() < 10 * bound
+        assert np.abs(one.constraint_values()).max() < max(0.1 * bound, 2e-14)
     with pytest.raises(StepFailedError):
         ours.integrate(*start, h=30.0, steps=1)
 
