@@ -11,7 +11,7 @@ from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.contenders.held_bodies import (
     HELD,
     Held,
-    Motion,
+    HeldRun,
     motion_in_angles,
     mujoco_motion,
     our_motion,
@@ -31,7 +31,7 @@ STEPS = (10000, 5000, 2000, 1000)
 """Of MuJoCo, whose own default is 5000."""
 INTEGRATORS = ("Euler", "implicitfast", "RK4")
 
-Move = Callable[[float, int], Motion]
+Move = Callable[[float, int], HeldRun]
 
 
 def run_held(plan: Plan, say: Say) -> ResultTable:

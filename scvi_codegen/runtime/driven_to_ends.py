@@ -29,7 +29,7 @@ from scvi_codegen.runtime.driven import (
 from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble, driven_start
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters
-from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, States
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, LaneStates
 from scvi_codegen.runtime.ensemble_trajectory import OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.integrator import Integrator
@@ -136,7 +136,7 @@ class DrivenToEnds(EnsembleToEnds):
     def _first_parameters(self, j: int) -> Array:
         return self._values(j, entered(self.t0, self.goals[j].t_end))
 
-    def _states(self, j: int, run: Memory, heed: Heed) -> tuple[States, str]:
+    def _states(self, j: int, run: Memory, heed: Heed) -> tuple[LaneStates, str]:
         pieces: list[Trajectory] = []
         try:
             way = stretches(run, self.data, self.goals[j].t_end, partial(self._values, j))

@@ -41,7 +41,7 @@ def steps_of_ensemble(h: float | None, steps: int | None, **others: object) -> t
     return h, steps
 
 
-class States(Protocol):
+class LaneStates(Protocol):
     """Of a trajectory, as far as they are kept."""
 
     @property
@@ -170,7 +170,7 @@ class EnsembleToEnds:
         found: Array = self.parameters[j]
         return found
 
-    def _states(self, j: int, run: Memory, heed: Heed) -> tuple[States, str]:
+    def _states(self, j: int, run: Memory, heed: Heed) -> tuple[LaneStates, str]:
         """What is kept of trajectory j, and why it ended."""
         try:
             if self.t_eval is None:

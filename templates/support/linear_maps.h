@@ -165,7 +165,8 @@ static void scatter_wide(const point_family *f, real h, real growth, int back, i
       for (int n = 0; n < f->points; n++)
         for (int r = first; r <= B; r++)
           flow(back, rows + (loop->first + i) * (B + 1) + r,
-              GROWN(f->weight[n], growth, f->abscissa[n]) * scale * loop->table[n * (B + 1) + r], value + n * f->results + loop->offset + i);
+              GROWN(f->weight[n], growth, f->abscissa[n]) * scale * loop->table[n * (B + 1) + r],
+              value + n * f->results + loop->offset + i);
   }
 }
 

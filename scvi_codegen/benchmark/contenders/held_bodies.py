@@ -22,7 +22,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["HELD", "Held", "Motion", "motion_in_angles", "mujoco_motion", "our_motion"]
+__all__ = ["HELD", "Held", "HeldRun", "motion_in_angles", "mujoco_motion", "our_motion"]
 
 GRAVITY = 9.81
 PARTS = 10
@@ -94,7 +94,7 @@ HELD: Mapping[str, Callable[[], Held]] = {"chain": lambda: hanging_chain(LINKS),
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class HeldRun:
     """Of a run: processor seconds of its steps, largest change of energy, and of a rod's length as a part of it."""
 
     seconds: float
@@ -102,7 +102,7 @@ class Motion:
     stretch: float
 
 
-def our_motion(held: Held, method: str) -> Callable[[float, int], Motion]:
+def our_motion(held: Held, method: str) -> Callable[[float, int], HeldRun]:
     """By constraints in Cartesian coordinates."""
     n = len(held.masses)
     kinetic = " + ".join(f"{held.masses[i]!r}*(x{i}_dot**2 + y{i}_dot**2)/2" for i in range(n))
@@ -122,7 +122,7 @@ def our_motion(held: Held, method: str) -> Callable[[float, int], Motion]:
     return _by(stepper, q, p, lambda x: _stretch(held, x.reshape(n, 2)))
 
 
-def motion_in_angles(held: Held, method: str) -> Callable[[float, int], Motion]:
+def motion_in_angles(held: Held, method: str) -> Callable[[float, int], HeldRun]:
     """The same for an open chain in the angles of its rods, which leave nothing to hold."""
     n = len(held.masses)
     lengths, angles = [held.length(i, j) for i, j in held.rods], [f"a{k}" for k in range(n)]
@@ -141,10 +141,10 @@ def motion_in_angles(held: Held, method: str) -> Callable[[float, int], Motion]:
     return _by(stepper, q, np.zeros(n), lambda x: 0.0)
 
 
-def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float]) -> Callable[[float, int], Motion]:
+def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float]) -> Callable[[float, int], HeldRun]:
     """Runs of a stepper, so many steps of h."""
 
-    def move(h: float, steps: int) -> Motion:
+    def move(h: float, steps: int) -> HeldRun:
         run, seconds, energies, worst = stepper.start(q, p, h=h), 0.0, [float(stepper.energy(q, p))], 0.0
         for _ in range(PARTS):
             began = time.process_time()
@@ -152,7 +152,7 @@ def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float])
             seconds += time.process_time() - began
             energies.append(float(stepper.energy(run.q, run.p)))
             worst = max(worst, stretch(run.q))
-        return Motion(seconds, float(np.ptp(energies)), worst)
+        return HeldRun(seconds, float(np.ptp(energies)), worst)
 
     return move
 
@@ -167,7 +167,7 @@ def _stretch(held: Held, places: Array) -> float:
     return found
 
 
-def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callable[[float, int], Motion]:
+def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callable[[float, int], HeldRun]:
     """By MuJoCo: hinges, and where a loop is closed its equality, as soft as it is or as stiff as a step allows.
 
     Raises:
@@ -175,7 +175,7 @@ def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callab
     """
     import mujoco
 
-    def move(h: float, steps: int) -> Motion:
+    def move(h: float, steps: int) -> HeldRun:
         model = mujoco.MjModel.from_xml_string(_document(held, integrator, h, stiff=stiff))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -188,7 +188,7 @@ def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callab
             energies.append(float(data.energy.sum()))
             places = data.site_xpos[:, [0, 2]]
             stretch = max(stretch, _stretch(held, places[: len(held.masses)]))
-        return Motion(seconds, float(np.ptp(energies)), stretch)
+        return HeldRun(seconds, float(np.ptp(energies)), stretch)
 
     return move
 
