@@ -10,9 +10,7 @@ from samples import (
     damped_pendulum,
     driven_duffing,
     linkage,
-from samples import (
     oscillator,
-)
     pumped_cart_pole,
     pumped_swing,
     pushed_pendulum,
