@@ -4,7 +4,7 @@
 #ifdef DAMPED
 #define GROWN(weight, growth, abscissa) ((weight) * MATH(exp)((growth) * (abscissa)))
 #else
-#define GROWN(weight, growth, abscissa) (weight)
+#define GROWN(weight, growth, abscissa) ((void)(growth), (weight))
 #endif
 
 /* WIDTH changes at a time. */
