@@ -41,6 +41,7 @@ from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
+from scvi_codegen.lowering.solvers.rattle import rattle_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.changes import with_changes
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
@@ -175,7 +176,7 @@ class _Texts:
 
     def tangent(self, *, second: bool = False) -> Source | None:
         """With derivatives of steps by all they start from, the second ones, too; none in transformed time."""
-        if self.system.integrands:
+        if self.system.integrands or (second and self.system.damping):
             return None
         found = self.program(fallback=True)
         if not found.newton:  # explicit steps
@@ -290,6 +291,7 @@ def program_of(
         sweep=sweep,
         splitting=splitting,
         newton=newton,
+        rattle=rattle_of(system, stages) if solver == "auto" else None,
         symmetries=tracked,
     )
 

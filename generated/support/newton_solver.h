@@ -24,9 +24,9 @@ static int remake_factors(const step_data *step, const real *point, const newton
   return linearise(&then, data, &shape);
 }
 
-/* The increments by Newton's iteration, from the stages of the step before, extrapolated, and from the straight line if
- * there are none or they lead nowhere. Memory holds the stages, and where factors go from step to step the point of the
- * factors; guess says whether the first (1) or both (2) are of use. */
+/* The increments by RATTLE where a step is one, else by Newton's iteration, from the stages of the step before,
+ * extrapolated, and from the straight line if there are none or they lead nowhere. Memory holds the stages, and where
+ * factors go from step to step the point of the factors; guess says whether the first (1) or both (2) are of use. */
 static int solve(const step_data *step, const solver_data *unused, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {
@@ -35,7 +35,10 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   (void)unused;
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, &data) : 1;
-  if (*guess) {
+#ifdef RATTLE
+  status = rattle(step, memory, *guess > 0, &data, dp, options, report);
+#endif
+  if (status != OK && *guess) {
     gather(EXTRAPOLATION[0], B, 1, memory, M, data.z, 1, B);
     gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data.z + M * B, 1, B);
     status = newton(step, &data, NULL, NULL, dp, &keep, options, report);

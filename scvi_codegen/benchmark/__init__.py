@@ -16,6 +16,7 @@
     start_up      from text to the first step
     compile_times the same for larger systems (in compile_systems), by what takes the time
     mechanisms    from SymPy's bodies and loads to a motion, beside lambdify and PyDy (in multibody)
+    held          bodies held by rods, beside MuJoCo (in held_bodies): energies and lengths at equal time
     sums          sums over indices at equal error, beside C by hand (lattices.c), SciPy and REBOUND; and how time grows
     builds        the same text by several compilers, and for several processors
 
@@ -41,6 +42,7 @@ from scvi_codegen.benchmark.compositions import run_compositions
 from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.hand_written import run_hand_written
+from scvi_codegen.benchmark.held import run_held
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.mechanisms import run_mechanisms
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
@@ -68,6 +70,7 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "start-up": run_start_up,
     "compile": run_compile_times,
     "mechanisms": run_mechanisms,
+    "held": run_held,
     "sums": run_sums,
     "growth": run_growth,
     "builds": run_builds,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-__all__ = ["FLOOR", "Point", "common_error", "frontier", "time_at"]
+__all__ = ["FLOOR", "Point", "common_error", "error_at", "frontier", "time_at"]
 
 FLOOR = 1e-13
 """Errors below count as equal to it: there they are round-off and luck."""
@@ -59,6 +59,23 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
     loose, tight = curve[after - 1], curve[after]
     share = math.log(loose.error / wanted) / math.log(loose.error / max(tight.error, LEAST))
     return loose.seconds * math.pow(tight.seconds / loose.seconds, share)
+
+
+def error_at(points: Iterable[Point], seconds: float) -> float | None:
+    """The error that is reached in a time, as :func:`time_at`; ``None`` in less than the fastest setting takes.
+
+    >>> round(error_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 2.0), 12)
+    1e-06
+    """
+    curve = frontier(points)
+    if not curve or seconds < curve[0].seconds:
+        return None
+    if seconds >= curve[-1].seconds:
+        return curve[-1].error
+    after = next(n for n, point in enumerate(curve) if point.seconds > seconds)
+    loose, tight = curve[after - 1], curve[after]
+    share = math.log(seconds / loose.seconds) / math.log(tight.seconds / loose.seconds)
+    return loose.error * math.pow(max(tight.error, LEAST) / loose.error, share)
 
 
 def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:

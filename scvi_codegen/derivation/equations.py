@@ -229,7 +229,8 @@ class _Writer:
         """q_{k+1} and p_{k+1}."""
         number_q, number_p = self.stages.end_numbers
         position = self._gathered(self.stages.end_position, 0, power=0, scale=sympy.S.One)
-        end = self._rows()[-1]
+        shrunk = sympy.exp(-self.stages.damping * self.step)
+        end = [[shrunk * sympy.Add(*terms)] for terms in self._rows()[-1]] if shrunk != 1 else self._rows()[-1]
         return (
             tuple(Equation(number_q, "end", value) for value in position),
             tuple(Equation(number_p, "IDEL", sympy.Add(*terms)) for terms in end),
@@ -261,7 +262,7 @@ class _Writer:
 
     def _scatter(self, family: PointFamily, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
         arguments = self._arguments(family, n)
-        weight = self._named(family.weight_names[n], family.weights[n])
+        weight = self._named(family.weight_names[n], family.weights[n]) * self._growth(family, n)
         for scatter in family.scatters:
             values = [result.xreplace(arguments) for result in scatter.results]
             for r, power in enumerate(powers):
@@ -272,13 +273,21 @@ class _Writer:
                 for i, value in enumerate(values):
                     rows[r][i].append(factor * value)
 
+    def _growth(self, family: PointFamily, n: int) -> sympy.Expr:
+        """What damping makes of a weight."""
+        if self.stages.damping == 0:
+            return sympy.S.One
+        return sympy.exp(self.stages.damping * self._abscissa(family, n) * self.step)
+
+    def _abscissa(self, family: PointFamily, n: int) -> sympy.Expr:
+        """Where point n is on the step, by its name."""
+        prefix, abscissa = "d" if family.name == "quadrature" else "c", family.abscissae[n]
+        return self._named("" if abscissa in (0, 1) else f"{prefix}_{n + 1}", abscissa)
+
     def _arguments(self, family: PointFamily, n: int) -> dict[sympy.Symbol, sympy.Expr]:
-        prefix = "d" if family.name == "quadrature" else "c"
-        abscissa = family.abscissae[n]
-        name = "" if abscissa in (0, 1) else f"{prefix}_{n + 1}"
         replaced = {}
         if any(self.system.time in result.free_symbols for result in family.results):
-            replaced[self.system.time] = self.time + self._named(name, abscissa) * self.step
+            replaced[self.system.time] = self.time + self._abscissa(family, n) * self.step
         for gather in family.gathers:
             values = self._gathered(gather.table, n, power=gather.power, scale=_fraction(gather.scale))
             replaced |= dict(zip(gather.arguments, values, strict=True))

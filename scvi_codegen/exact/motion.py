@@ -87,9 +87,12 @@ class ExactMotion:
 
     @cached_property
     def _by_position(self) -> list[sympy.Expr]:
-        """DL/dq + f, or dH/dq - f."""
+        """DL/dq + f - gamma p, or dH/dq - f + gamma p."""
         slopes = [self.system.formula.diff(q) for q in self.system.coordinates]
         sign = -1 if self.hamiltonian else 1
+        if self.system.damping != 0:
+            momenta = self.system.auxiliaries or self._slopes
+            slopes = [x - sign * self.system.damping * p for x, p in zip(slopes, momenta, strict=True)]
         return [x + sign * f for x, f in zip(slopes, self.system.forces, strict=True)] if self.system.forces else slopes
 
     @cached_property

@@ -66,6 +66,7 @@ class DerivedStep:
             None if family.scalar is None else Tape([family.scalar], own)
             for family, own in zip(stages.families, symbols, strict=True)
         ]
+        self.damping = Tape([stages.damping], system.parameters)
         self.blocks = _slices(stages.block_sizes(system.dimension))
         self.rows = _slices(stages.row_sizes(system.dimension))
         self.arguments = [_slices([len(gather.arguments) for gather in family.gathers]) for family in stages.families]
@@ -156,7 +157,8 @@ class DerivedStep:
                 scalar = self.scalars[f]
                 assert scalar is not None  # or there would be no slopes
                 (value,) = scalar(self._point(family, n, arguments[n], known))
-                total += scale * weight * known.h ** (1 + family.scalar_power) * value
+                grown = self._growth(family.abscissae[n], known)
+                total += scale * weight * grown * known.h ** (1 + family.scalar_power) * value
         return total
 
     def _straight(self, known: _Known) -> Numbers:
@@ -197,7 +199,13 @@ class DerivedStep:
     def _factor(self, family: PointFamily, s: int, n: int, r: Any, known: _Known) -> Number:
         scatter = family.scatters[s]
         scale = mp.mpf(scatter.scale.numerator) / scatter.scale.denominator
-        return scale * family.weights[n] * known.h ** (scatter.power + self.powers[r])
+        grown = self._growth(family.abscissae[n], known)
+        return scale * family.weights[n] * grown * known.h ** (scatter.power + self.powers[r])
+
+    def _growth(self, c: Number, known: _Known) -> Number:
+        """What damping makes of a weight at a point c of the step: e^(gamma c h) of it."""
+        (rate,) = self.damping(self.motion.parameters)
+        return mp.exp(rate * c * known.h)
 
     def _rows(self, z: Numbers, known: _Known) -> Numbers:
         """The equations, and p1."""
@@ -258,7 +266,7 @@ class DerivedStep:
 
     def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
         q = self._gathered(numbers(self.stages.end_position.entries[0]), self.system.dimension, z, known)
-        return SolvedStep(unknowns=tuple(z), q=tuple(q), p=tuple(rows[self.rows[-1]]))
+        return SolvedStep(unknowns=tuple(z), q=tuple(q), p=tuple(rows[self.rows[-1]] / self._growth(mp.one, known)))
 
 
 def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:

@@ -12,10 +12,10 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_parameters
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 from scvi_codegen.mechanics.constraints import constraint_rates, positions_held
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.inputs import input_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["Ends", "numeric", "own_parameters", "read"]

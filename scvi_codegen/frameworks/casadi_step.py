@@ -14,11 +14,11 @@ from typing import Any
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ArgumentError, MethodError
+from scvi_codegen.formulas.inputs import PARTS
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.frameworks.casadi_ends import Ends, numeric, own_parameters, read
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.kinds import SWITCH, TEXTS, takes
-from scvi_codegen.mechanics.inputs import PARTS
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
@@ -132,9 +132,16 @@ class _Written:
                     values = self.ca.vertcat(*(next(results) for _ in scatter.results))
                     for r, entry in enumerate(scatter.table.entries[n]):
                         if entry:
-                            factor = float(scatter.scale * weight * entry)
+                            factor = float(scatter.scale * weight * entry) * self._growth(family.abscissae[n])
                             rows[r] += factor * self.h ** (scatter.power + powers[r]) * values
-        return rows
+        return [*rows[:-1], rows[-1] / self._growth(1)]
+
+    def _growth(self, abscissa: Any) -> Any:
+        """What damping makes of a weight at a point of the step: e^(gamma c h) of it."""
+        if self.stages.damping == 0:
+            return 1.0
+        rate = numeric(self.ca, [self.stages.damping], tuple(own_parameters(self.system)))
+        return self.ca.exp(float(abscissa) * rate(*self.ca.vertsplit(self.parameters))[0] * self.h)
 
     def end_position(self) -> Any:
         """q1."""

@@ -6,7 +6,24 @@ from dataclasses import dataclass
 
 from scvi_codegen.ir.kernel import Kernel
 
-__all__ = ["Constraints"]
+__all__ = ["Constraints", "Rattle"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rattle:
+    """What steps of RATTLE need where masses are constant and diagonal.
+
+    Attributes:
+        force: L_q at u = q.
+        mass: M (no arguments).
+        products: (e, f) of slopes of constraints by the same coordinate.
+        entries: of each product the two constraints (k, l).
+    """
+
+    force: Kernel
+    mass: Kernel
+    products: tuple[tuple[int, int], ...]
+    entries: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -34,12 +34,14 @@ class Derivatives:
         curvatures: one a family, or none where first derivatives are all that is wanted. Of results phi and all that
             they depend on, y = (u, parameters, time): at (u, multipliers mu of phi, changes dy) the slopes of mu . phi
             by y, as they change along dy; ``None`` where phi is linear.
+        damping: slopes of the rate of a damping, by parameters.
         lanes: changes that are carried along at a time.
     """
 
     program: Program
     by_given: tuple[GivenSlopes, ...]
     curvatures: tuple[Kernel | None, ...] = ()
+    damping: GivenSlopes | None = None
     lanes: int = 8
 
     @property
@@ -51,7 +53,8 @@ class Derivatives:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that the program lacks."""
-        return tuple(each for each in (*(given.kernel for given in self.by_given), *self.curvatures) if each)
+        given = (*self.by_given, *((self.damping,) if self.damping else ()))
+        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures) if each)
 
     @property
     def bent(self) -> tuple[int, int]:
@@ -66,25 +69,28 @@ class Derivatives:
 
     @property
     def slopes(self) -> int:
-        """Numbers at all points: by h, by arguments, by parameters and time."""
+        """Numbers at all points: by h, by arguments, by parameters and time, by a damping."""
+        damped = bool(self.damping)
         return sum(
-            family.points * (family.slope.arguments + len(family.slope.results) + len(given.entries))
+            family.points
+            * (family.slope.arguments + len(family.slope.results) + len(given.entries) + damped * family.slope.values)
             for family, given, _ in self.families
         )
+
+    @property
+    def at_points(self) -> int:
+        """Changes of arguments and results at the points of a family."""
+        return max(family.points * (family.slope.arguments + family.slope.values) for family in self.program.families)
 
     @property
     def memory(self) -> int:
         """Doubles beside those of a step: slopes; changes of what is given, of unknowns, twice, of rows and points."""
         program = self.program
         wide = self.given + 2 * program.unknowns + program.sites * (program.blocks + 1) + self.at_points
+        wide += bool(self.damping)  # changes of gamma h
         if self.curvatures:
             wide += 4 * self.given + 2 * program.unknowns + 3 * self.at_points
         return self.slopes + wide * self.lanes + self.places
-
-    @property
-    def at_points(self) -> int:
-        """Arguments and results of all points of a family, the most of them."""
-        return max(family.points * (family.slope.arguments + family.slope.values) for family in self.program.families)
 
     @property
     def places(self) -> int:

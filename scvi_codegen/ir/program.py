@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.ir.constraints import Constraints
+from scvi_codegen.ir.constraints import Constraints, Rattle
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
@@ -104,6 +104,8 @@ class Program:
         integrals: what is integrated along a run, or ``None``; the first is the time that passes.
         exchanges: names of what forces give: energy, and momentum maps; none without forces.
         constraints: what keeps the motion on them, or ``None``.
+        damping: the rate of a uniform damping, if there is one.
+        rattle: what is tried before Newton's iteration, where a step is one of RATTLE.
         inputs: the place of the first of the five parameters of each function of time that is data, by name.
     """
 
@@ -143,6 +145,8 @@ class Program:
     exchanges: tuple[str, ...] = ()
     constraints: Constraints | None = None
     inputs: tuple[tuple[str, int], ...] = ()
+    damping: Kernel | None = None
+    rattle: Rattle | None = None
 
     @property
     def dimension(self) -> int:
@@ -171,8 +175,22 @@ class Program:
         sums = {kernel.name: kernel for kernel in along}
         maps = (self.momentum_kernel,) if self.momentum_kernel else ()
         integrands = (self.integrals.kernel,) if self.integrals else ()
-        bound = (self.constraints.kernel, self.constraints.motion) if self.constraints else ()
+        bound: tuple[Kernel, ...] = (self.constraints.kernel, self.constraints.motion) if self.constraints else ()
+        bound += (self.damping,) if self.damping else ()
+        bound += (self.rattle.force, self.rattle.mass) if self.rattle else ()
         return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands, *bound)
+
+    @property
+    def held_places(self) -> tuple[int, ...]:
+        """The place of each constraint among them, in the order of the sites."""
+        own = self.places[self.dimension :]
+        return tuple(sorted(own).index(place) for place in own)
+
+    @property
+    def held_reach(self) -> int:
+        """How far constraints that meet are apart at most, each in its place."""
+        places = self.held_places
+        return max(abs(places[k] - places[j]) for k, j in self.rattle.entries) if self.rattle else 0
 
     @property
     def action(self) -> bool:

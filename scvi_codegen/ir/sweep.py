@@ -111,6 +111,11 @@ class Sweep(ABC):
         return None
 
     @property
+    def damping(self) -> Kernel | None:
+        """The rate of a uniform damping, a number of the parameters, where there is one."""
+        return None
+
+    @property
     def integral_part(self) -> str:
         """The part that integrates along the curve; ``""`` where nothing is integrated."""
         return ""

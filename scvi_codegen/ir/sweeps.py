@@ -175,12 +175,14 @@ class CoupledSweep(PointSweep):
         velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, with other points than
             blocks; else empty.
         mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+        damping: its rate, if there is one.
     """
 
     blocks: int
     velocity: NumberTable
     projection: NumberTable
     mass_entries: tuple[tuple[int, int], ...]
+    damping: Kernel | None = None
 
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
@@ -204,8 +206,8 @@ class CoupledSweep(PointSweep):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Weights, a mass, the sweep."""
-        return ("point_weights", self.mass_part, "coupled_sweep")
+        """Weights, which damping changes, a mass, the sweep."""
+        return (*(("damped_points",) if self.damping else ()), "point_weights", self.mass_part, "coupled_sweep")
 
     @property
     def integral_part(self) -> str:

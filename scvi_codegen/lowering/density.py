@@ -34,10 +34,7 @@ def density_of(system: MechanicalSystem, monitor: str | Expr) -> Control:
     forms = forms_of(system)
     rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))
     if system.auxiliaries:
-        slopes = gradient(system.formula, system.coordinates)
-        forces = system.forces or (sympy.S.Zero,) * system.dimension
-        for i, (momentum, force) in enumerate(zip(system.auxiliaries, forces, strict=True)):
-            rates[momentum] = force - slopes.get(i, sympy.S.Zero)
+        rates |= dict(zip(system.auxiliaries, forms.thrust, strict=True))
     rates[system.time] = sympy.S.One
     variables = list(rates)
     change = sympy.Add(*(slope * rates[variables[i]] for i, slope in gradient(g, variables).items()))

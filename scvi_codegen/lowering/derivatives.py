@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from sympy import Add, Mul, S, Symbol
+from collections.abc import Sequence
+
+from sympy import Add, Expr, Mul, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes
@@ -23,22 +25,26 @@ def derivatives_of(
     Args:
         second: whether second derivatives are wanted, too.
     """
+    given = tuple(_given_slopes(system, family.name, family.results, family.arguments) for family in stages.families)
     return Derivatives(
         program=program,
-        by_given=tuple(_given_slopes(system, family) for family in stages.families),
+        by_given=given,
         curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
+        damping=_given_slopes(system, "damping", (stages.damping,), ()) if program.damping else None,
     )
 
 
-def _given_slopes(system: MechanicalSystem, family: PointFamily) -> GivenSlopes:
-    entries = jacobian(family.results, (*system.parameters, system.time))
+def _given_slopes(
+    system: MechanicalSystem, name: str, results: Sequence[Expr], arguments: Sequence[Symbol]
+) -> GivenSlopes:
+    entries = jacobian(results, (*system.parameters, system.time))
     if not entries:
         return GivenSlopes(entries=(), kernel=None)
     kernel = system_kernel(
         system,
-        f"{family.name}_by_given",
+        f"{name}_by_given",
         entries.values(),
-        of=family.arguments,
+        of=arguments,
         purpose="The non-zero derivatives with respect to parameters and time.",
     )
     return GivenSlopes(entries=tuple(entries), kernel=kernel)

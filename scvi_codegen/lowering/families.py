@@ -24,7 +24,7 @@ def has_action(system: MechanicalSystem) -> bool:
 
     Nor does it where forces act, or constraints hold: momenta are not its slopes.
     """
-    if system.forces or system.constraints:
+    if system.forces or system.constraints or system.damping != 0:
         return False
     return not isinstance(system, HamiltonianSystem) or system.is_regular
 

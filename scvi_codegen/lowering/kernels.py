@@ -11,7 +11,7 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["integrand_kernel", "system_kernel"]
+__all__ = ["damping_kernel", "integrand_kernel", "system_kernel"]
 
 
 def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) -> Kernel | None:
@@ -19,6 +19,13 @@ def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) 
     if not system.integrands:
         return None
     return system_kernel(system, name, system.integrands, of=of, purpose="What is integrated along the curve.")
+
+
+def damping_kernel(system: MechanicalSystem) -> Kernel | None:
+    """The rate of a uniform damping; ``None`` without one."""
+    if system.damping == 0:
+        return None
+    return system_kernel(system, "damping", (system.damping,), of=(), purpose="The rate gamma of the damping.")
 
 
 def system_kernel(

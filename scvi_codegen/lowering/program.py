@@ -20,6 +20,7 @@ import sympy
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.ir.constraints import Rattle
 from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
@@ -28,17 +29,18 @@ from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.constraints import lowered_constraints
 from scvi_codegen.lowering.families import has_action, lowered_family
-from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
+from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.mechanics.exchanges import exchanges
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.method import Method, is_symplectic
+from scvi_codegen.methods.constraints import END_VELOCITY
+from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.shapes import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
-from scvi_codegen.tables.basis import legendre_functional
+from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
 __all__ = ["lower"]
@@ -53,6 +55,7 @@ def lower(
     sweep: Sweep | None = None,
     splitting: Splitting | None = None,
     newton: bool = True,
+    rattle: Rattle | None = None,
     symmetries: Sequence[Symmetry] = (),
 ) -> Program:
     """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
@@ -65,6 +68,7 @@ def lower(
         splitting: the explicit solver that replaces both
         (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
         newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
+        rattle: what is tried before Newton's iteration, if a step is one of RATTLE.
         symmetries: whose momentum maps are emitted.
     """
     m, sites = system.dimension, sites_of(stages, system.dimension)
@@ -112,6 +116,8 @@ def lower(
         integrals=_integrals(system, method, stages),
         exchanges=_exchanges(system, stages),
         constraints=constraints,
+        damping=damping_kernel(system),
+        rattle=rattle,
         inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
@@ -132,11 +138,17 @@ def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str,
 
 
 def _stage_curve(stages: StageSystem) -> StageCurve | None:
-    """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations."""
+    """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations.
+
+    Constraints give the velocity at the end by itself, as good as the step. What that of the curve is off it by is the
+    first coefficient that the curve does not have: it tells more than the last that it has, and of one velocity, too.
+    """
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
-    if isinstance(shape, Velocities) and 1 < len(shape.blocks) == len(set(shape.blocks)) and _moves(stages, shape):
-        degree = len(shape.blocks) - 1
-        highest = tuple((4 * degree - 2) * x for x in legendre_functional(shape.blocks, degree))
+    held = any(block.name == END_VELOCITY for block in stages.blocks)
+    if isinstance(shape, Velocities) and len({*shape.blocks}) + held > 1 and _moves(stages, shape):
+        degree = len(shape.blocks) - 1 + held
+        highest = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one) if held else ()
+        highest = tuple((4 * degree - 2) * x for x in highest or legendre_functional(shape.blocks, degree))
         highest += (mp.zero,) * (count - len(highest))
         bends = [(0, degree), (0, (degree + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
@@ -154,7 +166,9 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
 def _moves(stages: StageSystem, shape: Velocities) -> bool:
     """Whether the velocities, the first blocks, are all that moves positions, and momenta are no unknowns."""
     own = len(shape.blocks)
-    return all(block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks))
+    return own == len({*shape.blocks}) and all(
+        block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks)
+    )
 
 
 def _distinct(points: Vector) -> bool:
@@ -230,9 +244,15 @@ def notes_of(method: Method, system: MechanicalSystem) -> tuple[str, ...]:
     order = "no order claimed" if method.order is None else f"order {method.order}"
     return (
         order,
-        "symplectic" if is_symplectic(method, system) else "not symplectic",
+        _geometry(method, system),
         "symmetric" if method.symmetric else "not symmetric",
     )
+
+
+def _geometry(method: Method, system: MechanicalSystem) -> str:
+    if is_symplectic(method, system):
+        return "symplectic"
+    return f"{'conformally' if is_conformally_symplectic(method, system) else 'not'} symplectic"
 
 
 def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:

@@ -65,6 +65,7 @@ def change_coordinates(
         forces=_projected(system, positions, replaced, variables),
         constraints=tuple(g.xreplace(replaced) for g in system.constraints),
         inputs=system.inputs,
+        damping=system.damping,
     )
 
 

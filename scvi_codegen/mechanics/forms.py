@@ -66,6 +66,13 @@ class Forms:
         return tuple(map(sympy.Add, slopes, self.system.forces)) if self.system.forces else slopes
 
     @cached_property
+    def thrust(self) -> tuple[Expr, ...]:
+        """What momenta change by in a unit of time, m expressions: :attr:`force` less their damping."""
+        if self.system.damping == 0:
+            return self.force
+        return tuple(f - self.system.damping * p for f, p in zip(self.force, self.momentum, strict=True))
+
+    @cached_property
     def mass(self) -> Entries:
         """L_vv."""
         return jacobian(self.momentum, self.system.velocities)
@@ -107,20 +114,20 @@ class Forms:
 
     @cached_property
     def euler_lagrange(self) -> tuple[Expr, ...]:
-        """E = L_vv a + L_vq v + L_vt - L_q, m expressions in (q, v, a, t), zero on trajectories (paper (2)).
+        """E = L_vv a + L_vq v + L_vt - L_q + gamma L_v, m expressions in (q, v, a, t), 0 on trajectories (paper (2)).
 
         Of a Hamiltonian: d/dt (v - H_p) = a - H_pq v + H_pp H_q - H_pt, in (q, v, a, p, t) with v = H_p.
         """
         system = self.system
         variables = (*system.velocities, *system.coordinates, system.time, *system.auxiliaries)
-        rates = (*accelerations(system), *system.velocities, sympy.S.One, *self.force)
+        rates = (*accelerations(system), *system.velocities, sympy.S.One, *self.thrust)
         if system.auxiliaries:
             return _along(self.constitutive, variables, rates)
-        return tuple(rate - f for rate, f in zip(_along(self.momentum, variables, rates), self.force, strict=True))
+        return tuple(rate - f for rate, f in zip(_along(self.momentum, variables, rates), self.thrust, strict=True))
 
     @cached_property
     def applied_force(self) -> tuple[Expr, ...]:
-        """F = L_q - L_vq v - L_vt, m expressions in (q, v, t), equal to L_vv a on trajectories."""
+        """F = L_q - L_vq v - L_vt - gamma L_v, m expressions in (q, v, t), equal to L_vv a on trajectories."""
         at_rest = dict.fromkeys(accelerations(self.system), sympy.S.Zero)
         return tuple(-residual.xreplace(at_rest) for residual in self.euler_lagrange)
 
@@ -166,8 +173,11 @@ class Forms:
 
     @cached_property
     def separable(self) -> bool:
-        """Whether L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, as seen in the structure of its derivatives."""
-        if self.system.auxiliaries:
+        """Whether L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, as seen in the structure of its derivatives.
+
+        Not with damping: velocities at points are then other sums of forces than those in the tables of a method.
+        """
+        if self.system.auxiliaries or self.system.damping != 0:
             return False
         constant = set(self.system.parameters)
         if any(i != j or not entry.free_symbols <= constant for (i, j), entry in self.mass.items()):
@@ -180,7 +190,11 @@ class Forms:
     def split(self) -> bool:
         """Whether H = T(p) + V(q, t), as seen in the structure of its derivatives; forces may depend on q and t."""
         system = self.system
-        if not system.auxiliaries or system.time in set().union(*(v.free_symbols for v in self.legendre)):
+        if (
+            not system.auxiliaries
+            or system.damping != 0
+            or system.time in set().union(*(v.free_symbols for v in self.legendre))
+        ):
             return False
         return not jacobian(self.legendre, system.coordinates) and not jacobian(
             self.force, (*system.velocities, *system.auxiliaries)

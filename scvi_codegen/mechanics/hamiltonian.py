@@ -8,7 +8,7 @@ integrated as well, by methods that do not need one (:attr:`~scvi_codegen.method
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -16,25 +16,21 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
-from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, of, takes
+from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.mechanics.constraints import constraints_of
+from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points, singular_part
+from scvi_codegen.mechanics.legendre import legendre_dual
+from scvi_codegen.mechanics.regularity import singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
-from scvi_codegen.tables.precision import mp
 
-__all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_twin", "positive_parameters"]
-
-LARGEST_INVERSE = 3
-"""Coupled momenta (velocities) whose quadratic form is inverted symbolically."""
-NEGLIGIBLE = mp.mpf(10) ** -30
+__all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_twin"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +58,10 @@ class HamiltonianSystem(MechanicalSystem):
                 f"{len(self.coordinates)} coordinates, but {len(self.momenta)} momenta: list one each"
             )
         if self.constraints:
-            raise SystemDefinitionError(f"'{self.name}' has constraints, which are kept where a Lagrangian is given")
+            raise SystemDefinitionError(
+                f"'{self.name}' has constraints, which are kept where a Lagrangian is given: leave them out here, and "
+                "take lagrangian_of(system, constraints=[...]), whose momenta are the same"
+            )
         self._check("Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
@@ -73,6 +72,8 @@ class HamiltonianSystem(MechanicalSystem):
         hamiltonian=TEXT,
         momenta=NAMES,
         parameters=MAPPING,
+        damping=TEXT,
+        constraints=TEXTS,
         inputs=NAMES,
     )
     def from_text(
@@ -84,6 +85,8 @@ class HamiltonianSystem(MechanicalSystem):
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
+        damping: str | None = None,
+        constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
     ) -> HamiltonianSystem:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
@@ -95,8 +98,11 @@ class HamiltonianSystem(MechanicalSystem):
             momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
+            damping: the rate at which all momenta shrink, a formula of parameters
+                (:mod:`scvi_codegen.mechanics.damping`).
+            constraints: none; :func:`lagrangian_of` takes them.
             inputs: names of functions of time that are given as data with each run
-                (:mod:`scvi_codegen.mechanics.inputs`).
+                (:mod:`scvi_codegen.formulas.inputs`).
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
@@ -122,6 +128,8 @@ class HamiltonianSystem(MechanicalSystem):
             defaults=tuple(number(given, value) for given, value in values.items()),
             hamiltonian=read(hamiltonian),
             forces=forces_by_coordinate(variables, forces or {}, read),
+            damping=damping_rate(damping, read),
+            constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
 
@@ -145,6 +153,7 @@ class HamiltonianSystem(MechanicalSystem):
         time: Symbol | None = None,
         parameters: Mapping[Symbol | str, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
+        damping: Expr | float | None = None,
         inputs: Sequence[Any] = (),
     ) -> HamiltonianSystem:
         """Take H from a SymPy expression, in plain symbols or in functions of time.
@@ -159,16 +168,18 @@ class HamiltonianSystem(MechanicalSystem):
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
             forces: expression by coordinate, in coordinates, momenta and time.
+            damping: the rate at which all momenta shrink, an expression in parameters.
             inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
         hamiltonian = given_expression(hamiltonian, "Hamiltonian")
         acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        rate = damping_rate(damping, lambda given: given_expression(given, "damping"))
         own = tuple(given_name(each) for each in inputs)
         given = with_inputs(named_parameters(parameters), own)
         translation = Translation(
             hamiltonian,
             coordinates,
-            tuple(acting.values()),
+            (*acting.values(), rate),
             momenta=momenta,
             time=time,
             parameters=tuple(given),
@@ -188,6 +199,7 @@ class HamiltonianSystem(MechanicalSystem):
                 {translation.rules.get(q, q): f for q, f in acting.items()},
                 lambda given: translation.apply(given, "forces").xreplace(driven),
             ),
+            damping=translation.apply(rate, "damping").xreplace(driven),
             inputs=own,
         )
 
@@ -240,7 +252,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
             f"there are {system.dimension} coordinates, but {len(names)} momenta: list one each"
         )
     symbols = tuple(symbol(name) for name in names)
-    hamiltonian = _legendre_dual(system, system.velocities, symbols)
+    hamiltonian = legendre_dual(system, system.velocities, symbols)
     velocities = dict(zip(system.velocities, _slopes(hamiltonian, symbols), strict=True))
     return HamiltonianSystem(
         name=system.name,
@@ -252,25 +264,43 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         hamiltonian=hamiltonian,
         clock=system.clock,
         forces=tuple(f.xreplace(velocities) for f in system.forces),
+        damping=system.damping,
         inputs=system.inputs,
     )
 
 
-@takes(system=of("a HamiltonianSystem", HamiltonianSystem))
-@lru_cache(maxsize=64)
-def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
+@takes(system=of("a HamiltonianSystem", HamiltonianSystem), constraints=TEXTS)
+def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ()) -> LagrangianSystem:
     """The Lagrangian p . v - H of a Hamiltonian, p expressed by v = dH/dp (paper, section 1.1).
+
+    Args:
+        system: the Hamiltonian.
+        constraints: of the motion, as of :meth:`LagrangianSystem.from_text`: with them p' = -H_q + G^T lambda. Momenta
+            are those of the Hamiltonian.
 
     Raises:
         SystemDefinitionError: where d2H/dp2 is singular, or v = dH/dp has no closed solution that SymPy finds.
     """
+    found = _lagrangian_of(system)
+    if not constraints:
+        return found
+    known = {x.name: x for x in (*system.coordinates, *found.velocities, system.time, *system.parameters)}
+    known |= {name: symbol(name) for name in system.inputs}
+    driven = input_formulas(system.inputs, system.time)
+    return replace(
+        found, constraints=constraints_of(constraints, lambda g: parse_expression(g, known).xreplace(driven))
+    )
+
+
+@lru_cache(maxsize=64)
+def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
     if not system.is_regular:
         raise SystemDefinitionError(
             f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine momenta"
         )
     if system.clock and system.clock.rate.free_symbols & set(system.momenta):
         raise SystemDefinitionError(f"the clock of '{system.name}' contains momenta, that of a Lagrangian may not")
-    lagrangian = _legendre_dual(system, system.momenta, system.velocities)
+    lagrangian = legendre_dual(system, system.momenta, system.velocities)
     momenta = dict(zip(system.momenta, _slopes(lagrangian, system.velocities), strict=True))
     return LagrangianSystem(
         name=system.name,
@@ -281,6 +311,7 @@ def lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
         lagrangian=lagrangian,
         clock=system.clock,
         forces=tuple(f.xreplace(momenta) for f in system.forces),
+        damping=system.damping,
         inputs=system.inputs,
     )
 
@@ -295,7 +326,7 @@ def lagrangian_twin(system: MechanicalSystem) -> LagrangianSystem | None:
 @lru_cache(maxsize=64)
 def _twin(system: HamiltonianSystem) -> LagrangianSystem | None:
     try:
-        return lagrangian_of(system)
+        return _lagrangian_of(system)
     except SystemDefinitionError:
         return None
 
@@ -313,80 +344,3 @@ def _default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
 def _slopes(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
     slopes = gradient(f, variables)
     return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(variables)))
-
-
-def _legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: Sequence[Symbol]) -> Expr:
-    """The product x . y less f(x), with y = df/dx solved for x; f is the system's formula."""
-    f = system.formula
-    curvature = hessian(f, variables)
-    origin = dict.fromkeys(variables, sympy.S.Zero)
-    slopes = gradient(f, variables)
-    if all(not (entry.free_symbols & set(variables)) for entry in curvature.values()):
-        shifted = [y - slopes[i].xreplace(origin) for i, y in enumerate(duals)]
-        forms = [_inverse_form(curvature, block, shifted) for block in coupled_blocks(curvature, len(variables))]
-        return sympy.Add(*forms, -f.xreplace(origin))
-    solution = {x: _inverse_slope(system, slopes[i], x, duals[i], variables) for i, x in enumerate(variables)}
-    still, moving = f.as_independent(*variables, as_Add=True)
-    dual = sympy.Add(*(x * y for x, y in zip(solution.values(), duals, strict=True)), -moving.xreplace(solution))
-    positive = positive_parameters(system)
-    return sympy.simplify(dual.xreplace(positive)).xreplace({dummy: given for given, dummy in positive.items()}) - still
-
-
-def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
-    """Stand-ins for the parameters with positive default values, so that roots of their squares are taken."""
-    return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
-
-
-def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
-    """Half of y . C^-1 y over one block."""
-    if len(block) == 1:
-        (i,) = block
-        return y[i] ** 2 / (2 * curvature[i, i])
-    if len(block) > LARGEST_INVERSE:
-        raise SystemDefinitionError(
-            f"Legendre's transform couples {len(block)} variables: their quadratic form is not inverted symbolically. "
-            "Give both functions yourself, or use the system as it is"
-        )
-    size = len(block)
-    matrix = sympy.Matrix(size, size, lambda a, b: curvature.get((block[a], block[b]), 0))
-    adjugate, determinant = matrix.adjugate(), matrix.det(method="berkowitz")
-    terms = [adjugate[a, b] * y[i] * y[j] for a, i in enumerate(block) for b, j in enumerate(block)]
-    return sympy.Add(*terms) / (2 * determinant)
-
-
-def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]) -> Expr:
-    """The x with y = slope(x), the branch that holds at random points for parameters of the signs of their defaults."""
-    if slope.free_symbols & (set(variables) - {x}):
-        raise SystemDefinitionError(
-            f"Legendre's transform of '{system.name}' needs the solution of coupled equations that are not linear; "
-            "give the other function yourself, or use the system as it is"
-        )
-    positive = positive_parameters(system)
-    back = {dummy: symbol for symbol, dummy in positive.items()}
-    for root in _roots(slope.xreplace(positive) - y, x):
-        found = root.xreplace(back)
-        if unsupported_part(found) is None and _holds(system, found, slope, x, y):
-            return found
-    raise SystemDefinitionError(f"SymPy does not solve {y} = {slope} for {x}; give the other function yourself")
-
-
-def _roots(expression: Expr, x: Symbol) -> list[Expr]:
-    """What SymPy finds, without the formulas of Cardano and Ferrari, on which it would spend minutes; unchecked."""
-    try:
-        return list(sympy.solve(expression, x, check=False, simplify=False, cubics=False, quartics=False))
-    except (NotImplementedError, ArithmeticError, AttributeError, TypeError, ValueError, RecursionError):
-        return []
-
-
-def _holds(system: MechanicalSystem, root: Expr, slope: Expr, x: Symbol, y: Symbol) -> bool:
-    tried = 0
-    for point in sample_points([x], (*system.coordinates, system.time), system.constants):
-        try:
-            value = evaluate(slope, point)
-            again = evaluate(root, point | {y: value})
-        except ArithmeticError:
-            continue
-        tried += 1
-        if abs(again - point[x]) > NEGLIGIBLE * (1 + abs(point[x])):
-            return False
-    return tried > 0

@@ -11,12 +11,13 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation, given_expression
 from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, Kind, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
+from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -80,6 +81,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters=MAPPING,
         forces=MAPPING,
         dissipation=TEXT,
+        damping=TEXT,
         constraints=TEXTS,
         inputs=NAMES,
     )
@@ -92,6 +94,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
+        damping: str | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
     ) -> LagrangianSystem:
@@ -104,10 +107,12 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
+            damping: the rate at which all momenta shrink, a formula of parameters
+                (:mod:`scvi_codegen.mechanics.damping`).
             constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``;
                 linear in velocities those of wheels and skates (:mod:`scvi_codegen.mechanics.constraints`).
             inputs: names of functions of time that are given as data with each run
-                (:mod:`scvi_codegen.mechanics.inputs`).
+                (:mod:`scvi_codegen.formulas.inputs`).
 
         >>> oscillator = LagrangianSystem.from_text(
         ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",
@@ -134,6 +139,7 @@ class LagrangianSystem(MechanicalSystem):
             defaults=tuple(number(parameter, value) for parameter, value in values.items()),
             lagrangian=read(lagrangian),
             forces=_forces(variables, forces, dissipation, read),
+            damping=damping_rate(damping, read),
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
@@ -160,6 +166,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[Any, float] | None = None,
         forces: Mapping[Expr | str, Expr] | None = None,
         dissipation: Expr | None = None,
+        damping: Expr | float | None = None,
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
@@ -178,16 +185,18 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by symbol, by name, or by a function of time that stays constant.
             forces: expression by coordinate, as the coordinate is given or by its name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
+            damping: the rate at which all momenta shrink, an expression in parameters.
             constraints: expressions in coordinates, time and, linearly, velocities that stay 0, or equations ``Eq``.
             inputs: functions of time that are given as data with each run: as such, by symbol or by name.
         """
         lagrangian = given_expression(lagrangian, "Lagrangian")
         acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
         friction = None if dissipation is None else given_expression(dissipation, "dissipation")
+        rate = damping_rate(damping, lambda given: given_expression(given, "damping"))
         bound = constraints_of(constraints, lambda g: given_expression(g, "constraint"))
         own = tuple(given_name(each) for each in inputs)
         given = with_inputs(named_parameters(parameters), own)
-        beside = (*acting.values(), *(() if friction is None else (friction,)), *bound)
+        beside = (*acting.values(), *(() if friction is None else (friction,)), rate, *bound)
         translation = Translation(
             lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given), inputs=own
         )
@@ -209,6 +218,7 @@ class LagrangianSystem(MechanicalSystem):
                 friction,
                 lambda given: read(given, "forces"),
             ),
+            damping=read(rate, "damping"),
             constraints=constraints_of(bound, lambda given: read(given, "constraints")),
             inputs=own,
         )

@@ -24,8 +24,9 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.hamiltonian import positive_parameters
+from scvi_codegen.mechanics.legendre import positive_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["MONITORS", "monitor_function"]
@@ -40,14 +41,15 @@ def monitor_function(system: MechanicalSystem, monitor: str | Expr, *, in_time: 
     Args:
         system: what moves.
         monitor: a name among ``MONITORS``, or a formula.
-        in_time: whether it may depend on the time, too.
+        in_time: whether it may depend on the time and on inputs, too.
 
     Raises:
         SystemDefinitionError: for a formula in other symbols, and a name that the system is not fit for.
     """
     if isinstance(monitor, str) and monitor in MONITORS:
         return MONITORS[monitor](system)
-    time = (system.time,) if in_time else ()
+    driven = input_formulas(system.inputs, system.time) if in_time else {}
+    time = (system.time, *driven) if in_time else ()
     known = {given.name: given for given in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
     if isinstance(monitor, Expr):
         formula = monitor.xreplace({free: known[free.name] for free in monitor.free_symbols if free.name in known})
@@ -61,7 +63,7 @@ def monitor_function(system: MechanicalSystem, monitor: str | Expr, *, in_time: 
         raise SystemDefinitionError(f"'{unknown[0]}' in the monitor: it may depend on {kinds} of '{system.name}' alone")
     if not formula.free_symbols & {*system.coordinates, *system.auxiliaries}:
         raise SystemDefinitionError(f"the monitor {formula} is constant: steps would not adapt")
-    return formula
+    return formula.xreplace(driven)
 
 
 def _read(text: str, known: Mapping[str, Symbol]) -> Expr:

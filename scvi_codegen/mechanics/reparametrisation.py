@@ -27,6 +27,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import takes
+from scvi_codegen.mechanics.constraints import velocities_held
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.monitors import monitor_function
@@ -44,7 +45,7 @@ REVERSIBLE = 'the reversible controller: compile_stepper(..., monitor=...), cont
 
 @takes(system=SYSTEM)
 def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSystem:
-    """The same motion in a time tau with dt = g dtau.
+    """The same motion in a time tau with dt = g dtau; constraints of positions hold in it as they did.
 
     Args:
         system: an autonomous Lagrangian or Hamiltonian system.
@@ -55,7 +56,7 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
         A system of the same kind with one more parameter, the energy, and a ``clock`` that gives t.
 
     Raises:
-        SystemDefinitionError: for a system that depends on time, and a monitor that is none.
+        SystemDefinitionError: for a system that depends on time, constraints of velocities, and a monitor that is none.
 
     >>> kepler = LagrangianSystem.from_text(
     ...     name="Kepler", coordinates=["r", "phi"], lagrangian="(r_dot**2 + r**2*phi_dot**2)/2 + 1/r")
@@ -71,14 +72,16 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or "
             f"{REVERSIBLE}"
         )
-    if system.forces:
+    if system.forces or system.damping != 0:
+        acting = "forces act" if system.forces else "damping acts"
         raise SystemDefinitionError(
-            f"forces act on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
+            f"{acting} on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
             f"controlled steps (t_end=...), or {REVERSIBLE}"
         )
-    if system.constraints:
+    if any(velocities_held(system)):
         raise SystemDefinitionError(
-            f"'{system.name}' has constraints, which motions in transformed time do not keep: take controlled steps"
+            f"'{system.name}' has constraints of velocities, which transformed time would change: take controlled "
+            f"steps (t_end=...), or {REVERSIBLE}"
         )
     level = _free_symbol(system)
     rate = monitor_function(system, monitor)

@@ -30,11 +30,12 @@ from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.inputs import inputs_by_name
 from scvi_codegen.formulas.parts import identity
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.kinds import of
-from scvi_codegen.mechanics.inputs import inputs_by_name
+from scvi_codegen.mechanics.damping import check_damping
 
 __all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
 
@@ -73,7 +74,9 @@ class MechanicalSystem(ABC):
         clock: how time runs, if not evenly.
         forces: m forces beside those of the function (:mod:`scvi_codegen.mechanics.forces`), in (q, v, t) of a
             Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
-        inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.mechanics.inputs`).
+        damping: the rate gamma at which all momenta shrink beside what else they do, a formula of parameters, 0 if
+            they do not (:mod:`scvi_codegen.mechanics.damping`).
+        inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
         constraints: what a Lagrangian's motion keeps at 0, in (q, t), or linear in v
             (:mod:`scvi_codegen.mechanics.constraints`).
     """
@@ -87,6 +90,7 @@ class MechanicalSystem(ABC):
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
     inputs: tuple[str, ...] = ()
+    damping: Expr = sympy.S.Zero
 
     @property
     @abstractmethod
@@ -137,8 +141,8 @@ class MechanicalSystem(ABC):
     @property
     def changes_energy(self) -> str:
         """Why energy is not conserved; nothing where it is."""
-        if self.forces:
-            return "forces act"
+        if self.forces or self.damping != 0:
+            return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
             return "constraints move, and do work"
         return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.depends_on_time else ""
@@ -158,7 +162,7 @@ class MechanicalSystem(ABC):
             " ".join(symbol.name for symbol in symbols),
             repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
             identity(self.clock.rate) if self.clock else "",
-            *map(identity, (*self.forces, *self.constraints)),
+            *map(identity, (*self.forces, *self.constraints, self.damping)),
             repr((len(self.constraints), self.inputs)),
         )
 
@@ -203,6 +207,8 @@ class MechanicalSystem(ABC):
         for q, force in zip(self.coordinates, self.forces, strict=False):
             if force != 0:
                 yield f"force on {q.name}", plain(self.text_of(force))
+        if self.damping != 0:
+            yield "damping", plain(self.text_of(self.damping))
         for g in self.constraints:
             yield "constraint", plain(f"{self.text_of(g)} = 0")
 
@@ -234,9 +240,11 @@ class MechanicalSystem(ABC):
     def _check_symbols_of_formula(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         if self.forces and len(self.forces) != self.dimension:
             raise SystemDefinitionError(f"{self.dimension} coordinates, but {len(self.forces)} forces: give one each")
+        check_damping(self.name, self.damping, self.parameters)
         known = [*self.coordinates, *arguments, self.time, *self.parameters]
         named = zip(self.coordinates, self.forces, strict=False)
         formulas = {what: self.formula, **{f"force on {q.name}": force for q, force in named}}
+        formulas |= {"damping": self.damping}
         formulas |= {f"constraint {k}": g for k, g in enumerate(self.constraints, 1)}
         for where, formula in formulas.items():
             problem = unsupported_part(formula)

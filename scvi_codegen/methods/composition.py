@@ -180,7 +180,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     elif not forms_of(system).split:
         raise MethodError(
             f"{method.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, or "
-            f"H = T(p) + V(q, t); '{system.name}' is not: use an SVI"
+            f"H = T(p) + V(q, t), without damping; '{system.name}' is not: use an SVI"
         )
     kicks, drifts = kicks_and_drifts(method)
     moving = [k for k, x in enumerate(drifts) if x]

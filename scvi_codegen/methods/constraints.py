@@ -48,7 +48,10 @@ from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-__all__ = ["with_constraints"]
+__all__ = ["END_VELOCITY", "with_constraints"]
+
+END_VELOCITY = "v_1"
+"""The unknown velocity that belongs to the momentum at the end."""
 
 SAME = mp.mpf(10) ** -40
 """Beside 1: velocities of a polynomial, in 60 digits."""
@@ -68,7 +71,7 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
     multipliers = tuple(
         Block(name=f"lambda_{n}", power=1, straight=nothing, moves=False, size=count) for n in range(points)
     )
-    velocity = Block(name="v_1", power=1, straight=(mp.zero, mp.one), moves=False)
+    velocity = Block(name=END_VELOCITY, power=1, straight=(mp.zero, mp.one), moves=False)
     conditions = [("g", "stage")] * (points - 1) + [("hidden", "stage")]
     return replace(
         stages,

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 
 __all__ = ["discretise", "paper_equations"]
@@ -19,10 +23,25 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
     """
     stages = method.stage_system(system)
     check_regular(method, system)
-    return with_constraints(system, with_auxiliaries(system, stages), method.name)
+    _check_damping(system, method, stages)
+    return _completed(system, stages, method.name)
 
 
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
     """The same equations as the paper prints them. Raises as :func:`discretise`."""
     check_regular(method, system)
-    return with_constraints(system, with_auxiliaries(system, method.paper_form(system)), method.name)
+    return _completed(system, method.paper_form(system), method.name)
+
+
+def _completed(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
+    """The equations with what the system has beside L."""
+    return replace(with_constraints(system, with_auxiliaries(system, stages), name), damping=system.damping)
+
+
+def _check_damping(system: MechanicalSystem, method: Method, stages: StageSystem) -> None:
+    if system.damping != 0 and not isinstance(stages.shape, Velocities):
+        raise MethodError(
+            f"{method.name} does not take the damping of '{system.name}', which weighs L_q and L_v at the points of a "
+            'quadrature: take an SVI, or a Runge-Kutta method in phase space. As forces, "-gamma*p", every method '
+            "takes it, though area does not shrink by exactly exp(-gamma h)"
+        )

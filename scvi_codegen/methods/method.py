@@ -155,6 +155,11 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
 
 def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Whether the steps preserve dq ^ dp: of a symplectic method, where no forces act and nothing holds velocities."""
+    return system.damping == 0 and is_conformally_symplectic(method, system)
+
+
+def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
+    """Whether they multiply dq ^ dp by exp(-gamma h), gamma the damping, with nothing else that changes it."""
     return method.symplectic and not system.forces and not any(velocities_held(system))
 
 

@@ -10,7 +10,8 @@ the kernel phi (results in the arguments, time and parameters) is evaluated, its
 
     R_r = (momentum coefficient) p0 + sum_families sum_n scale w_n h^(power + power of r) S_nr phi(u_n) = 0,
 
-the last column of S belonging to p1, which is a row like the others; q1 is one more gather. The symbolic work is the
+the last column of S belonging to p1, which is a row like the others; q1 is one more gather. With damping gamma weights
+are w_n e^(gamma c_n h), and the row of p1 gives e^(gamma h) p1. The symbolic work is the
 kernel: it knows neither the degree nor the number of points. Everything else is a table, kept in 60 digits.
 
 Two parametrisations of the same method use this shape. The *paper's* has the positions Q^v at the nodes as unknowns;
@@ -208,6 +209,7 @@ class StageSystem:
         end_momentum: coefficient of p0 in p1.
         end_numbers: the paper's numbers of the equations for q1 and p1.
         extrapolation: (B, B) matrix from the unknowns of one step to a guess for the next, or ``None``.
+        damping: gamma, a formula of parameters.
         shape: what a solver without a matrix must know of the equations, or ``None``: only Newton's iteration is left.
     """
 
@@ -219,6 +221,7 @@ class StageSystem:
     end_numbers: tuple[str, str]
     extrapolation: Matrix | None = None
     shape: Shape | None = None
+    damping: sympy.Expr = sympy.S.Zero
 
     def block_sizes(self, dimension: int) -> tuple[int, ...]:
         """How many components each block has."""

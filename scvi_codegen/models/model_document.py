@@ -30,6 +30,8 @@ def document_of(model: Model) -> dict[str, Any]:
     forces = zip(names, system.forces, strict=False)
     if acting := {name: _wrapped(system.text_of(force)) for name, force in forces if force != 0}:
         document["forces"] = acting
+    if system.damping != 0:
+        document["system"]["damping"] = system.text_of(system.damping)
     if system.constraints:
         document["system"]["constraints"] = [system.text_of(g) for g in system.constraints]
     if monitor := clock.monitor if clock else model.monitor:

@@ -8,6 +8,7 @@
                                                         # time; without a step tolerance = 0
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
+    # damping = "gamma"                                 # the rate at which all momenta shrink; left out: 0
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
     # inputs = ["u"]                                    # functions of time that are data
 
@@ -44,7 +45,7 @@
     every = 1                                           # distance between kept states; left out: 1
 
 A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
-the names ``p_q``.
+the names ``p_q``; with constraints the model is that of its Lagrangian.
 
 ``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and what
 ``[initial]`` and ``[run]`` leave out is the catalogue's. Files are written complete in themselves.
@@ -69,7 +70,7 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.kinds import PATH, of, takes
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -108,7 +109,7 @@ __all__ = [
 
 Kind = TypeVar("Kind")
 
-FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "constraints")
+FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
 RUN_KEYS = ("step", "tolerance", "controller", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
@@ -296,15 +297,16 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     name, coordinates = text_of(section, "name", "[system]"), names_of(section, "coordinates")
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
     common["forces"] = {key: text_of(forces, key, "[forces]") for key in forces}
+    common["damping"] = text_of(section, "damping", "[system]") if "damping" in section else None
     common["inputs"] = names_of(section, "inputs") if "inputs" in section else ()
     if "hamiltonian" in section:
-        if "constraints" in section:
-            raise ModelFileError("[system] has constraints beside a hamiltonian: they are kept with a lagrangian")
+        bound = names_of(section, "constraints") if "constraints" in section else ()
         if "dissipation" in section:
             raise ModelFileError("[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]")
         common["hamiltonian"] = text_of(section, "hamiltonian", "[system]")
         common["momenta"] = names_of(section, "momenta") if "momenta" in section else None
-        return in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
+        given = in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
+        return in_section("[system]", lambda: lagrangian_of(given, constraints=bound)) if bound else given
     if "momenta" in section:
         raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
     common["lagrangian"] = text_of(section, "lagrangian", "[system]")

@@ -27,6 +27,7 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.errors import EventError, SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
@@ -60,7 +61,8 @@ def with_events(source: Source, interface: Interface, functions: tuple[str | Exp
 def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:
     """The functions at u = (q, p, v), and whether any velocity occurs in them."""
     names = _names(interface)
-    values = [_expression(function, names) for function in functions]
+    driven = input_formulas(interface.inputs, symbol(TIME))
+    values = [_expression(function, names).xreplace(driven) for function in functions]
     q = [symbol(name) for name in interface.coordinates]
     v = [symbol(name + DOT) for name in interface.coordinates]
     taken = {*q, *v, symbol(TIME), *(symbol(name) for name in interface.parameters)}
@@ -80,7 +82,14 @@ def _names(interface: Interface) -> dict[str, Symbol]:
     velocities = [name + DOT for name in interface.coordinates]
     return {
         name: symbol(name)
-        for name in (*interface.coordinates, *velocities, *interface.momenta, TIME, *interface.parameters)
+        for name in (
+            *interface.coordinates,
+            *velocities,
+            *interface.momenta,
+            TIME,
+            *interface.parameters,
+            *interface.inputs,
+        )
     }
 
 
@@ -98,8 +107,8 @@ def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
     unknown = sorted(free.name for free in found.free_symbols.difference(names.values()))
     if unknown:
         raise EventError(
-            f"'{unknown[0]}' in the event function '{function}' is neither a coordinate, a velocity, a momentum, time "
-            f"nor a parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
+            f"'{unknown[0]}' in the event function '{function}' is neither a coordinate, a velocity, a momentum, time, "
+            f"an input nor a parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
         )
     if not found.free_symbols:
         raise EventError(f"the event function '{function}' is constant: it never crosses zero")

@@ -70,6 +70,7 @@ class SweepText:
         tables: C text of each.
         kernels: with lanes.
         mass: the constant masses, if there are such.
+        damping: the rate of a damping that lanes have, each its own.
         support: headers from the tables on.
         error_defines, highest: macro and value, and the table, that the error of a curve is found with.
     """
@@ -82,6 +83,7 @@ class SweepText:
     tables: tuple[str, ...]
     kernels: tuple[Kernel, ...]
     mass: Kernel | None
+    damping: Kernel | None
     support: tuple[str, ...]
     error_defines: Mapping[str, str]
     highest: str
@@ -110,7 +112,8 @@ def sweep_text(
     """
     kernels = tuple(sweep.kernels if kernels is None else kernels)
     mass = sweep.constant_mass
-    applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()))
+    damping = None if meaning.are_points else sweep.damping
+    applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
     solver = _solver(sweep, fallback) if meaning.are_points else ()
     return SweepText(
@@ -125,6 +128,7 @@ def sweep_text(
         tables=tuple(_tables(sweep, meaning)),
         kernels=kernels,
         mass=mass,
+        damping=damping,
         support=(*meaning.before, "contraction", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),
         highest=_groups("HIGHEST", sweep.guess.highest),

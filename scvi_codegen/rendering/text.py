@@ -24,7 +24,7 @@ from scvi_codegen.rendering.fallback import Fallback
 from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, sweep_text
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
 from scvi_codegen.rendering.source import Interface, Source, included
-from scvi_codegen.rendering.stopping import MAX_ITERATIONS
+from scvi_codegen.rendering.stopping import MAX_ITERATIONS, NEAR, ROUNDED, TYPED
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
 from scvi_codegen.rendering.written_out import written_out
 
@@ -222,6 +222,7 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
         "interface": interface,
         "prefix": interface.prefix,
         "start": start,
+        "distances": (ROUNDED, TYPED, NEAR),
         "target": target,
         "real": target.scalar,
     }

@@ -54,7 +54,7 @@ class WrittenOut:
 
 def written_out(program: Program, target: Target) -> WrittenOut | None:
     """The equations written out, ``None`` where loops over tables are shorter."""
-    if not program.newton or program.unknowns > FEW_UNKNOWNS:
+    if not program.newton or program.unknowns > FEW_UNKNOWNS or program.damping:
         return None
     writer = _Statements(program, target)
     entries = writer.entries()

@@ -138,7 +138,7 @@ class CompiledMethod:
 
     def _why_not(self) -> str:
         if not self.interface.energy_parameter:
-            return ""
+            return ": of systems with damping there are first derivatives alone"
         return (
             ": in transformed time the energy of the start is a parameter of every step, and time an integral along "
             "them. Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import STATUS
+from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -25,8 +26,6 @@ from scvi_codegen.runtime.integrator import Integrator
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "projected"]
 
 MOST_SHOWN = 4
-TYPED, NEAR = 1e-6, 1e-2
-"""Relative distances: of numbers as people type them, moved without a word; beyond which a state is refused."""
 
 
 def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
@@ -38,10 +37,12 @@ def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayL
 
 
 def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
-    """(n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states."""
+    """(n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states; forces in t, also where time is transformed."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((len(times), len(stepper.constraints)))
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
+    if stepper.interface.energy_parameter:
+        values /= stepper.rates(positions, momenta, parameters)[:, np.newaxis]
     return values
 
 
@@ -79,7 +80,7 @@ def consistent(
             raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     q1, p1, moved = projected(stepper, q0, p0, t, parameters)
-    if moved <= 64 * np.finfo(float).eps:
+    if moved <= ROUNDED * np.finfo(float).eps:
         return q0, p0
     if moved <= TYPED:
         return q1, p1

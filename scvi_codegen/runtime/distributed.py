@@ -7,7 +7,7 @@ other, so a worker that dies costs no more than the blocks it had, which others 
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.driven_to_ends import driven_work
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
@@ -51,6 +53,7 @@ def integrate_ensemble(
     t_eval: ArrayLike | None = None,
     parameters: EnsembleParameters = None,
     options: SolverOptions | None = None,
+    inputs: Mapping[str, Any] | None = None,
     progress: Callable[[int], None] | None = None,
     address: str | None = None,
     blocks: int | None = None,
@@ -62,6 +65,7 @@ def integrate_ensemble(
         q, p: (k, m) initial positions and momenta.
         velocity: (k, m) initial velocities, in place of p.
         h, steps, t_end, tolerance, every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
+        inputs: then as ``stepper.drive_ensemble``; without ``t_eval``.
         progress: called now and then with the number of trajectories done.
         address: of a scheduler, as in ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
         blocks: number of parts that the trajectories are divided into, by default four for each thread of the cluster.
@@ -74,12 +78,18 @@ def integrate_ensemble(
         StateError: on wrong shapes, names or numbers, before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
-    p = momenta_of_each(stepper, q, p, velocity, t, parameters)
     common: dict[str, Any] = {"every": every, "t": t, "parameters": parameters, "options": options}
     work: Ensemble | EnsembleToEnds
-    if h is None and steps is None and t_end is not None:
+    if inputs is not None:
+        if t_eval is not None:
+            raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
+        way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
+        work = driven_work(stepper, q, p, velocity=velocity, inputs=inputs, **way, **common)
+    elif h is None and steps is None and t_end is not None:
+        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
         work = EnsembleToEnds(stepper, q, p, t_end=t_end, tolerance=tolerance, t_eval=t_eval, **common)
     else:
+        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
         h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
         work = Ensemble(stepper, q, p, h=h, steps=steps, **common)
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
@@ -124,7 +134,7 @@ def _gather(
     from distributed import as_completed
 
     pickled = pickle.dumps(work.stepper)
-    futures = {client.submit(_integrate, pickled, work.part(part), pure=False): part for part in parts}
+    futures = {client.submit(_integrate, pickled, work.call, work.part(part), pure=False): part for part in parts}
     done = 0
     try:
         for future, found in as_completed(futures, with_results=True):
@@ -140,9 +150,9 @@ def _gather(
         client.cancel(list(futures))
 
 
-def _integrate(pickled: bytes, arguments: dict[str, Any]) -> tuple[Any, ...]:
+def _integrate(pickled: bytes, call: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
     """The arrays of one part, by one thread of a worker."""
-    result = _stepper(pickled).integrate_ensemble(threads=1, **arguments)
+    result = getattr(_stepper(pickled), call)(threads=1, **arguments)
     return tuple(getattr(result, name) for name in ARRAYS)
 
 

@@ -1,6 +1,6 @@
 """Runs whose inputs are data: from breakpoint to breakpoint, the parameters of each input those of its piece.
 
-Steps end at breakpoints; the compensated sums go on across them. See :mod:`scvi_codegen.mechanics.inputs`.
+Steps end at breakpoints; the compensated sums go on across them. See :mod:`scvi_codegen.formulas.inputs`.
 """
 
 from __future__ import annotations
@@ -91,6 +91,8 @@ def checked_inputs(
 
 def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
     """One of them; raises as :func:`checked_inputs`."""
+    if isinstance(given, Input):
+        return given
     if callable(given) and not hasattr(given, "c"):
         raise StateError(
             f"the input {name} is a function of Python's, which C cannot call in the middle of a step: give values, "
@@ -165,6 +167,14 @@ def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: 
     return Input(breakpoints, pieces)
 
 
+def part_of_inputs(inputs: Mapping[str, Input], part: slice) -> dict[str, Input]:
+    """Those of a part of the trajectories of an ensemble."""
+    return {
+        name: replace(data, pieces=data.pieces[:, part]) if data.pieces.ndim == 3 else data
+        for name, data in inputs.items()
+    }
+
+
 def drive(
     run: Run,
     inputs: Mapping[str, Input],
@@ -207,7 +217,7 @@ def stretches(
             run.change(parameters=values(stretch.middle), h=stretch.h)
             yield stretch.steps
         return
-    for end in _ends(run.t, t_end, inputs):
+    for end in ends_on_the_way(run.t, t_end, inputs):
         run.change(parameters=values(run.t + 0.5 * (end - run.t)), goal=replace(run.goal, t_end=end))
         yield None
 
@@ -243,7 +253,7 @@ def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> li
     """By steps of h, and one that is shorter where a breakpoint or the end comes before theirs."""
     forward, now, found = np.sign(t_end - t), (t, 0.0), []
     negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
-    for end in _ends(t, t_end, inputs):
+    for end in ends_on_the_way(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])
         if whole := int(np.floor((end - now[0]) / h + NEGLIGIBLE_STEP)):
             found.append(Stretch(whole, h, now, middle))
@@ -276,7 +286,7 @@ def with_end(piece: Trajectory, run: Run) -> Trajectory:
     )
 
 
-def _ends(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
+def ends_on_the_way(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
     """Breakpoints on the way, and its end."""
     low, high = min(t, t_end), max(t, t_end)
     inner: set[float] = set()

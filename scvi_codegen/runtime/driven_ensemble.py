@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,16 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.driven import Input, Stretch, checked_inputs, entered, later, parameters_at, planned
+from scvi_codegen.runtime.driven import (
+    Input,
+    Stretch,
+    checked_inputs,
+    entered,
+    later,
+    parameters_at,
+    part_of_inputs,
+    planned,
+)
 from scvi_codegen.runtime.ensemble import Change, Ensemble, Portion
 from scvi_codegen.runtime.ensemble_states import (
     EnsembleParameters,
@@ -31,7 +40,31 @@ from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.inputs import Array, check_left_to_inputs, columns_of_inputs
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["DrivenEnsemble"]
+__all__ = ["DrivenEnsemble", "driven_start"]
+
+
+def driven_start(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    velocity: ArrayLike | None,
+    inputs: Mapping[str, Any],
+    way: tuple[float, float],
+    parameters: EnsembleParameters,
+) -> tuple[dict[str, Input], ArrayLike, Array]:
+    """Inputs, momenta, and (k, number of parameters) at the start of a ``way`` from a time to one.
+
+    Raises:
+        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and where a monitor chooses steps.
+    """
+    if stepper.interface.monitor:
+        raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
+    count = len(checked_ensemble(stepper, q, q)[0])
+    data = checked_inputs(stepper.interface, inputs, count)
+    check_left_to_inputs(stepper.interface, parameters)
+    own = parameters_of_each(stepper, parameters, count)
+    start = parameters_at(stepper.parameters, own, data, entered(*way))
+    return data, momenta_of_each(stepper, q, p, velocity, way[0], start), start
 
 
 class DrivenEnsemble(Ensemble):
@@ -42,6 +75,8 @@ class DrivenEnsemble(Ensemble):
         ends: of each, the number of steps up to there.
         numbers: of the steps after which states are kept.
     """
+
+    call: ClassVar[str] = "drive_ensemble"
 
     def __init__(
         self,
@@ -57,7 +92,7 @@ class DrivenEnsemble(Ensemble):
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
     ) -> None:
-        self.data = data
+        self.data, self.t_end = data, checked_number(t_end, "t_end")
         self.stretches = planned(checked_number(t, "the time t"), checked_number(t_end, "t_end"), checked_step(h), data)
         self.ends = list(accumulate(stretch.steps for stretch in self.stretches))
         steps, every = sum(stretch.steps for stretch in self.stretches), checked_count(every, "every", least=1)
@@ -80,15 +115,14 @@ class DrivenEnsemble(Ensemble):
         **others: Any,
     ) -> DrivenEnsemble:
         """From inputs and initial states as users give them."""
-        if stepper.interface.monitor:
-            raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
-        count = len(checked_ensemble(stepper, q, q)[0])
-        data = checked_inputs(stepper.interface, inputs, count)
-        check_left_to_inputs(stepper.interface, parameters)
-        own, first = parameters_of_each(stepper, parameters, count), entered(t, t_end)
-        start = parameters_at(stepper.parameters, own, data, first)
-        p = momenta_of_each(stepper, q, p, velocity, t, start)
+        data, p, start = driven_start(stepper, q, p, velocity, inputs, (t, t_end), parameters)
         return cls(stepper, q, p, data, t=t, t_end=t_end, parameters=start, **others)
+
+    def part(self, part: slice) -> dict[str, object]:
+        """Arguments by name that make the ensemble of a part of the trajectories."""
+        found = super().part(part) | {"inputs": part_of_inputs(self.data, part), "t_end": self.t_end}
+        del found["steps"]
+        return found
 
     def row(self, step: int) -> int:
         """Of the first state kept that comes after ``step``."""
@@ -137,7 +171,7 @@ class DrivenEnsemble(Ensemble):
         """With the parameters of each piece for the states in it; one at a breakpoint belongs to the piece before."""
         last = [bisect_right(self.numbers, end) for end in self.ends]
         spans = [
-            (slice(first, end), self._change(stretch).parameters)
+            (slice(first, end), slice(None), self._change(stretch).parameters)
             for first, end, stretch in zip([0, *last], last, self.stretches, strict=False)
         ]
         return replace(super().result(), spans=tuple(spans))

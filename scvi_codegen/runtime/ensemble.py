@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -151,6 +151,9 @@ class Ensemble:
         """(n,) of the states, by steps of h."""
         number = self.every * np.arange(len(self.q), dtype=np.float64)
         return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
+
+    call: ClassVar[str] = "integrate_ensemble"
+    """Of a stepper, that takes the arguments of a part."""
 
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""

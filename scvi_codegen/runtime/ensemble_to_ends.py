@@ -7,7 +7,7 @@ Trajectories are the single integrator's, which has a table for each change of l
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,6 +39,22 @@ def steps_of_ensemble(h: float | None, steps: int | None, **others: object) -> t
     if given:
         raise StateError(f"{given[0]} is for steps that choose their length: give t_end, and neither h nor steps")
     return h, steps
+
+
+class LaneStates(Protocol):
+    """Of a trajectory, as far as they are kept."""
+
+    @property
+    def t(self) -> Array:
+        """(n,)."""
+
+    @property
+    def q(self) -> Array:
+        """(n, m)."""
+
+    @property
+    def p(self) -> Array:
+        """(n, m)."""
 
 
 class KeptLane(NamedTuple):
@@ -101,6 +117,9 @@ class EnsembleToEnds:
         """What ``progress`` counts up to: trajectories."""
         return len(self)
 
+    call: ClassVar[str] = "integrate_ensemble"
+    """Of a stepper, that takes these."""
+
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""
         return {
@@ -131,29 +150,35 @@ class EnsembleToEnds:
         run_each(len(self), drive, progress=progress, threads=threads)
 
     def _trajectory(self, j: int, heed: Heed) -> KeptLane:
-        goal, status = self.goals[j], OK
         try:
             run = Memory.started(
                 self.stepper,
                 self.q[j],
                 self.p[j],
-                h=goal,
+                h=self.goals[j],
                 t=self.t0,
-                parameters=self.parameters[j],
+                parameters=self._first_parameters(j),
                 options=self.options,
             )
-            found = self._states(run, goal, heed)
+            found, status = self._states(j, run, heed)
         except StateError:  # a sum of finite terms that overflowed
             return KeptLane(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
-        except StepFailedError as failure:
-            status, found = failure.status, Trajectory.before(failure)
         return KeptLane(found.t, found.q, found.p, status, run.steps)
 
-    def _states(self, run: Memory, goal: Goal, heed: Heed) -> Trajectory:
-        if self.t_eval is None:
-            return record(run, None, every=self.every, progress=heed)
-        reached = np.abs(self.t_eval - self.t0) <= abs(goal.t_end - self.t0)
-        return Observation(run, times=self.t_eval[reached]).advance(None, heed)
+    def _first_parameters(self, j: int) -> Array:
+        """Of trajectory j."""
+        found: Array = self.parameters[j]
+        return found
+
+    def _states(self, j: int, run: Memory, heed: Heed) -> tuple[LaneStates, str]:
+        """What is kept of trajectory j, and why it ended."""
+        try:
+            if self.t_eval is None:
+                return record(run, None, every=self.every, progress=heed), OK
+            reached = np.abs(self.t_eval - self.t0) <= abs(self.goals[j].t_end - self.t0)
+            return Observation(run, times=self.t_eval[reached]).advance(None, heed), OK
+        except StepFailedError as failure:
+            return Trajectory.before(failure), failure.status
 
     def result(self) -> EnsembleTrajectory:
         """The arrays; trajectories that were not done are ``"interrupted"`` after their initial state."""

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,12 @@ from scvi_codegen.runtime.trajectory import relative_changes
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory"]
+__all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory", "Span"]
 
 OK, INTERRUPTED = "ok", "interrupted"
+
+Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
+"""Rows of states, the trajectories that they are of, and the parameters in them of a part of all trajectories."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,8 +45,8 @@ class EnsembleTrajectory:
             ``"vanished"``, ``"interrupted"``).
         steps: (k,) steps completed.
         h: step size, 0 where steps choose their length.
-        spans: with inputs, rows of states and the parameters in them of a part of the trajectories; ``parameters`` has
-            zeros in place of inputs.
+        spans: with inputs, rows of states of some of the trajectories, and the parameters in them of a part of all;
+            ``parameters`` has zeros in place of inputs.
         goals: of each trajectory whose steps choose their length, else none.
         parameters: (k, number of parameters).
         stepper: the compiled integrator.
@@ -60,7 +63,7 @@ class EnsembleTrajectory:
     stepper: Integrator = field(repr=False)
     times: Array | None = None
     goals: tuple[Goal, ...] = ()
-    spans: tuple[tuple[slice, Callable[[slice], Array]], ...] = field(default=(), repr=False)
+    spans: tuple[Span, ...] = field(default=(), repr=False)
 
     def __len__(self) -> int:
         return len(self.status)
@@ -122,12 +125,11 @@ class EnsembleTrajectory:
 
     def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
         """Trajectories, rows of states that there are, and the parameters in them."""
-        for rows, parameters in self.spans or ((slice(None), self.parameters.__getitem__),):
-            own = parameters(slice(None))
-            for j in range(len(self)):
+        for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
+            for j, own in zip(range(*some.indices(len(self))), parameters(some), strict=True):
                 good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
                 if good.size:
-                    yield j, good, own[j]
+                    yield j, good, own
 
     @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:

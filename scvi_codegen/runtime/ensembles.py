@@ -13,8 +13,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
-from scvi_codegen.runtime.driven import end_of
-from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
+from scvi_codegen.runtime.driven_to_ends import driven_work
 from scvi_codegen.runtime.ensemble import integrate_ensemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
@@ -105,10 +104,11 @@ class Ensembles(ConstrainedStates):
         p: ArrayLike | None = None,
         *,
         inputs: Mapping[str, Any],
-        h: float,
+        h: float | None = None,
         velocity: ArrayLike | None = None,
         steps: int | None = None,
-        t_end: float | None = None,
+        t_end: ArrayLike | None = None,
+        tolerance: float | None = None,
         every: int = 1,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
@@ -116,28 +116,31 @@ class Ensembles(ConstrainedStates):
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
     ) -> EnsembleTrajectory:
-        """Run k trajectories with inputs, by common steps that end at all breakpoints.
+        """Run k trajectories with inputs: by common steps that end at all breakpoints, or each by steps of its own.
 
         Args:
             inputs: as of :meth:`drive`, the same for all trajectories; with values of shape (k, n) each has its own.
-            h: of steps; one that ends at a breakpoint is shorter.
-            steps, t_end: one of both.
-            q, p, velocity, every, t, parameters, options, progress, threads: as of :meth:`integrate_ensemble`.
+            h: of common steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
+            steps, t_end: with h one of both; without it ``t_end``, one time or (k,).
+            q, p, velocity, tolerance, every, t, parameters, options, progress, threads: as of
+                :meth:`integrate_ensemble`.
 
         Returns:
-            An :class:`EnsembleTrajectory` with the states of :meth:`drive`, equal to round-off.
+            An :class:`EnsembleTrajectory` with the states of :meth:`drive`, equal to round-off, to the bit without h.
 
         Raises:
             StateError: as :meth:`drive`.
         """
-        work = DrivenEnsemble.of(
+        work = driven_work(
             self,
             q,
             p,
             velocity=velocity,
             inputs=inputs,
             h=h,
-            t_end=end_of(t, h, steps, t_end),
+            steps=steps,
+            t_end=t_end,
+            tolerance=tolerance,
             every=every,
             t=t,
             parameters=parameters,

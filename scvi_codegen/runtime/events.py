@@ -23,11 +23,11 @@ DIRECTIONS = (-1, 0, 1)
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Zero crossings of a function g(q, v, p, t; parameters).
+    """Zero crossings of a function g(q, v, p, t; inputs, parameters).
 
     Attributes:
         function: g, as text of the grammar or as a SymPy expression. It may use the coordinates, their velocities
-            (``q_dot``), their momenta (``p_q``, or as the Hamiltonian calls them), time ``t`` and the parameters.
+            (``q_dot``), their momenta (``p_q``, or as the Hamiltonian calls them), time ``t``, inputs and parameters.
         direction: 1 for crossings from negative to positive as the run goes, -1 for the opposite, 0 for both.
         terminal: whether the first crossing ends the run; or the number of the crossing that does.
 

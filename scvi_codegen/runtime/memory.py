@@ -208,6 +208,11 @@ class Memory:
         """All of it, for :meth:`Stepper.restore` on the same kind of machine."""
         return bytes(self.stepper.binding.buffer(self._memory))
 
+    def check_inputs(self) -> None:
+        """Raise :class:`StateError` for an input that the next step waits for."""
+        if self._awaited:
+            raise missing_input(self._awaited[0])
+
     def rewind(self, saved: bytes) -> None:
         """Back to when :meth:`save` gave these bytes."""
         self.stepper.binding.buffer(self._memory)[:] = saved
@@ -240,8 +245,8 @@ class Memory:
         Returns:
             The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
         """
-        if self._awaited and steps:
-            raise missing_input(self._awaited[0])
+        if steps:
+            self.check_inputs()
         binding, goal = self.stepper.binding, self.goal
         report = binding.new("report *")
         status = binding.function("advance_to" if goal else "advance")(

@@ -175,7 +175,7 @@ def _run_of(subject: Subject, stepper: Stepper) -> float:
 
 def _action(subject: Subject) -> Finding | None:
     """The action S by evaluation of L alone, its slopes by differences: dS = p1 dq1 - p0 dq0 at the solution."""
-    if subject.system.forces:
+    if subject.system.forces or subject.system.damping != 0:
         return None
     state, equations, solved = subject.states[0], subject.derived(), subject.solved(0)
     slopes = equations.action_slopes(solved, state.q, state.p, state.h, state.t)

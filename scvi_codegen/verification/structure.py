@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import partial
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.exact.motion import numbers
-from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.methods.method import is_conformally_symplectic, is_symplectic
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
@@ -36,6 +37,9 @@ def structure_checks(subject: Subject) -> Iterator[Check]:
     if is_symplectic(subject.method, subject.system):
         promise = "J^T Omega J = Omega, J by finite differences of the compiled step"
         yield from checked("symplecticity", promise, partial(_symplecticity, subject))
+    elif is_conformally_symplectic(subject.method, subject.system):
+        promise = "J^T Omega J = exp(-gamma h) Omega, gamma the damping, J by finite differences of the compiled step"
+        yield from checked("conformal symplecticity", promise, partial(_symplecticity, subject))
     if subject.system.constraints:
         promise = f"they and their rates are 0 but for rounding at {LOOKED_AT} states of {STEPS} steps"
         yield from checked("constraints", promise, partial(_constraints, subject))
@@ -57,9 +61,10 @@ def _symplecticity(subject: Subject) -> Finding:
         around = subject.linearised(state)
         if around is None:
             raise StateError("steps from nearby states fail")
-        defect, noise = _defect(around)
+        shrunk = math.exp(-subject.damping * state.h)
+        defect, noise = _defect(around, shrunk)
         if subject.system.constraints:
-            defect, noise = _along(subject.tangents(state), around)
+            defect, noise = _along(subject.tangents(state), around, shrunk)
         if noise.max() > TOO_ROUGH:
             raise StateError(f"differences are good to {noise.max():.1g} only: try a smaller step")
         place = np.unravel_index(np.argmax(defect / noise), defect.shape)
@@ -68,18 +73,21 @@ def _symplecticity(subject: Subject) -> Finding:
     return worst
 
 
-def _defect(around: Linearised) -> tuple[Array, Array]:
-    """(2m, 2m) sizes of J^T Omega J - Omega, and of their noise, each in units of the areas of its two coordinates."""
+def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
+    """(2m, 2m) sizes of J^T Omega J - Omega, and of their noise, each in units of the areas of its two coordinates.
+
+    Omega is shrunk by the damping of a step.
+    """
     m, J = len(around.scales) // 2, around.matrix
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(around.scales, around.scales)
     areas = np.tile(around.scales[:m] * around.scales[m:], 2)
     units = np.sqrt(np.outer(areas, areas))
     error = np.full_like(J, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
     half = error.T @ np.abs(omega) @ np.abs(J)
-    return np.abs(J.T @ omega @ J - omega) / units, (half + half.T) / units
+    return np.abs(J.T @ omega @ J - shrunk * omega) / units, (half + half.T) / units
 
 
-def _along(tangents: Array, around: Linearised) -> tuple[Array, Array]:
+def _along(tangents: Array, around: Linearised, shrunk: float) -> tuple[Array, Array]:
     """The same of areas along the constrained phase space, in units of those of its directions."""
     m, scale = len(around.scales) // 2, around.scales
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scale, scale)
@@ -87,7 +95,7 @@ def _along(tangents: Array, around: Linearised) -> tuple[Array, Array]:
     error = np.full_like(around.matrix, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
     ends = around.matrix @ tangents
     half = np.abs(tangents.T) @ error.T @ np.abs(omega) @ np.abs(ends)
-    return np.abs(ends.T @ omega @ ends - tangents.T @ omega @ tangents) / unit, (half + half.T) / unit
+    return np.abs(ends.T @ omega @ ends - shrunk * tangents.T @ omega @ tangents) / unit, (half + half.T) / unit
 
 
 def _constraints(subject: Subject) -> Finding:

@@ -86,6 +86,12 @@ class Subject:
         return dict(self._defaults)
 
     @property
+    def damping(self) -> float:
+        """The rate at :attr:`parameters`, 0 without one."""
+        values = {parameter: self.parameters[parameter.name] for parameter in self.system.parameters}
+        return float(self.system.damping.xreplace(values))
+
+    @property
     def _defaults(self) -> dict[str, float]:
         return {name.name: value for name, value in self.system.constants.items()}
 

@@ -39,6 +39,10 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     for (int n = 0; n < GROUPS; n++) {
       place(step, n, scaled, z, u);
       point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
+#ifdef DAMPED
+      grow(&data->damping, n, 2 * M, value[n]);
+      grow(&data->damping, n, MASS, mass[n]);
+#endif
       for (int i = 0; i < M; i++)
         impulse[n][i] = data->momentum_weight[n] * value[n][i];
     }
@@ -94,11 +98,17 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   for (int n = 0; n < GROUPS; n++) {
     place(step, n, scaled, z, u);
     force_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, r[n]);
+#ifdef DAMPED
+    grow(&data->damping, n, M, r[n]);
+#endif
   }
   scale(data->momentum_weight, r, impulse);
   for (int i = 0; i < M; i++) {
     dq[i] = weigh(POINT_END_POSITION, scaled, i);
     dp[i] = weigh(POINT_END_MOMENTUM, impulse, i);
+#ifdef DAMPED
+    dp[i] = data->damping.shrunk * dp[i] + data->damping.loss * (step->p0[i] + step->carry_p[i]);
+#endif
   }
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;

@@ -1,5 +1,11 @@
 /* Changes of what a step starts from, of its unknowns, of what stands at points, of rows; the linear maps between
- * them, and their transposes. Before it: real, M, B, GIVEN, WIDTH, band.h, stages.h. */
+ * them, and their transposes. Before it: real, M, B, GIVEN, WIDTH, band.h, stages.h; where DAMPED, damping.h. */
+
+#ifdef DAMPED
+#define GROWN(weight, growth, abscissa) ((weight) * MATH(exp)((growth) * (abscissa)))
+#else
+#define GROWN(weight, growth, abscissa) ((void)(growth), (weight))
+#endif
 
 /* WIDTH changes at a time. */
 typedef struct {
@@ -70,8 +76,19 @@ static real time_of(const point_family *f, const step_data *step, int n)
   return step->t + (f->abscissa ? f->abscissa[n] * step->h : 0);
 }
 
+/* Where the slopes of a family end: behind those by what is given there are, where DAMPED, those by gamma h. */
+static inline long long end_of_slopes(const point_family *f)
+{
+  const long long each = f->arguments + f->results + f->slopes + f->given;
+#ifdef DAMPED
+  return f->points * (each + f->results);
+#else
+  return f->points * each;
+#endif
+}
+
 /* At each point: by h, unknowns held, the slopes of arguments and of what results are multiplied by; those of results
- * by arguments; those by parameters and time. Returns where they end. */
+ * by arguments; those by parameters and time; by gamma h. Returns where they end. */
 static real *slopes_of(const point_family *f, const step_data *step, const real *z, real *by_h)
 {
   const real h = step->h;
@@ -84,6 +101,11 @@ static real *slopes_of(const point_family *f, const step_data *step, const real 
     if (f->given)
       f->by_given(u, t, step->parameters, given + n * f->given);
   }
+#ifdef DAMPED
+  for (int n = 0; n < f->points; n++)
+    for (int i = 0; i < f->results; i++)
+      given[f->points * f->given + n * f->results + i] = f->abscissa[n] * value[n * f->results + i];
+#endif
   for (int g = 0; g < f->gathers; g++) {
     const linear_loop *loop = f->gather + g;
     const real scale = (real)loop->power * power_of(h, loop->power - 1);
@@ -93,7 +115,7 @@ static real *slopes_of(const point_family *f, const step_data *step, const real 
     for (int n = 0; n < f->points; n++)
       for (int i = 0; i < f->scatter[s].sites; i++)
         value[n * f->results + f->scatter[s].offset + i] *= (real)f->scatter[s].power / h;
-  return given + f->points * f->given;
+  return by_h + end_of_slopes(f);
 }
 
 /* From unknowns to arguments. */
@@ -147,7 +169,7 @@ static void multiply_wide(const point_family *f, int back, const real *slope, wi
 }
 
 /* From results to rows, those before the first left out. */
-static void scatter_wide(const point_family *f, real h, int back, int first, wide *value, wide *rows)
+static void scatter_wide(const point_family *f, real h, real growth, int back, int first, wide *value, wide *rows)
 {
   for (int s = 0; s < f->scatters; s++) {
     const linear_loop *loop = f->scatter + s;
@@ -156,7 +178,8 @@ static void scatter_wide(const point_family *f, real h, int back, int first, wid
       for (int n = 0; n < f->points; n++)
         for (int r = first; r <= B; r++)
           flow(back, rows + (loop->first + i) * (B + 1) + r,
-              f->weight[n] * scale * loop->table[n * (B + 1) + r], value + n * f->results + loop->offset + i);
+              GROWN(f->weight[n], growth, f->abscissa[n]) * scale * loop->table[n * (B + 1) + r],
+              value + n * f->results + loop->offset + i);
   }
 }
 
@@ -169,27 +192,36 @@ static void arguments_wide(const point_family *f, real h, int back, const real *
     gather_wide(f, h, back, dz, u);
 }
 
+/* What a step is made with beside its slopes: h; where DAMPED, gamma h and its changes. */
+typedef struct {
+  real h, growth;
+  wide *grown;
+} step_change;
+
 /* From v to all rows, or from dz to the last ones, by way of the points of a family; back: from these to those. Returns
  * where its slopes end. */
-static const real *through_family(const point_family *f, real h, int back, const real *slopes, wide *points, wide *v,
-    wide *dz, wide *rows)
+static const real *through_family(const point_family *f, const step_change *by, int back, const real *slopes,
+    wide *points, wide *v, wide *dz, wide *rows)
 {
+  const real h = by->h;
   const real *by_h = slopes + f->points * f->arguments, *slope = by_h + f->points * f->results;
   const real *given = slope + f->points * f->slopes;
   wide *value = points + f->points * f->arguments;
   memset(points, 0, sizeof(wide) * (size_t)(f->points * (f->arguments + f->results)));
   if (back)
-    scatter_wide(f, h, back, v ? 0 : B, value, rows);
+    scatter_wide(f, h, by->growth, back, v ? 0 : B, value, rows);
   else
     arguments_wide(f, h, back, slopes, v, dz, points);
   multiply_wide(f, back, slope, points, value);
   if (v)
     given_wide(f, back, by_h, given, v, value);
+  for (int i = 0; v && by->grown && i < f->points * f->results; i++)
+    flow(back, value + i, given[f->points * f->given + i], by->grown);
   if (back)
     arguments_wide(f, h, back, slopes, v, dz, points);
   else
-    scatter_wide(f, h, back, v ? 0 : B, value, rows);
-  return given + f->points * f->given;
+    scatter_wide(f, h, by->growth, back, v ? 0 : B, value, rows);
+  return slopes + end_of_slopes(f);
 }
 
 static void exchange_wide(wide *a, wide *b)

@@ -1,5 +1,5 @@
 /* Newton's iteration on the stage equations. Before it: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT,
- * MOMENTA and MOVES, and evaluate, which gives the equations and their Jacobian. */
+ * MOMENTA and MOVES, and evaluate, which gives the equations and their Jacobian; where DAMPED, damping.h. */
 
 #define STOPPED_SHRINKING REAL(0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
 #define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* what is left of positions that a force has stiffly settled */
@@ -166,8 +166,12 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
       measure(&moved, change, size_p);
       report->change = options->absolute ? moved.absolute : moved.relative;
       stalls += has_stalled(&moved, last);
-      if (has_converged(options, &moved, stalls, trials))
+      if (has_converged(options, &moved, stalls, trials)) {
+#ifdef DAMPED
+        shrink(step, increment);
+#endif
         return OK;
+      }
       last = moved.relative;
     }
     if (k >= least(options->max_iterations, MOST_ITERATIONS))

@@ -1,6 +1,10 @@
-/* What the steps of a run share where velocities and forces at points are summed. Before it: the tables. */
+/* What the steps of a run share where velocities and forces at points are summed. Before it: the tables; where momenta
+ * shrink, damped_points.h. */
 typedef struct {
   weight position_weight[GROUPS], momentum_weight[GROUPS]; /* h beta, h w: the same rounded numbers everywhere */
+#ifdef DAMPED
+  damping_data damping;
+#endif
 } sweep_data;
 
 static void prepare_sweep(const step_data *step, sweep_data *data)
@@ -9,6 +13,9 @@ static void prepare_sweep(const step_data *step, sweep_data *data)
     data->position_weight[n] = step->h * POSITION_WEIGHT[n];
     data->momentum_weight[n] = step->h * MOMENTUM_WEIGHT[n];
   }
+#ifdef DAMPED
+  prepare_damping(step, &data->damping);
+#endif
 }
 
 /* h times the weights, times what is at the points. */

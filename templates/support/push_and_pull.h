@@ -1,5 +1,6 @@
 /* The derivative of steps, and its transpose, exact: those of the map which the solved equations define. Before it:
- * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated. */
+ * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated; where DAMPED,
+ * growth_wide, from what is given to gamma h. */
 
 enum {
   COUNT_OF_FAMILIES = sizeof FAMILIES / sizeof *FAMILIES
@@ -12,6 +13,9 @@ typedef struct {
   band shape;
   real *slopes;
   wide *v, *dz, *rows, *x, *points;
+  wide *grown; /* changes of gamma h; NULL without damping */
+  real growth; /* gamma h */
+  real p1[M];
 } linearised_step;
 
 static linearised_step linearised_in(const step_data *step, real *workspace)
@@ -26,11 +30,18 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   at.rows = at.dz + N;
   at.x = at.rows + SITES * (B + 1);
   at.points = at.x + N;
+#ifdef DAMPED
+  at.growth = growth_of(step);
+  at.grown = at.points + MOST_AT_POINTS;
+#else
+  at.growth = 0;
+  at.grown = NULL;
+#endif
   return at;
 }
 
 /* The step solved, as where sweeps fail, its equations factorised, its slopes evaluated. */
-static int linearise_step(const linearised_step *at, const solver_options *options, real *q1, real *p1,
+static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1,
     solver_report *report)
 {
   const step_data *step = at->step;
@@ -47,9 +58,11 @@ static int linearise_step(const linearised_step *at, const solver_options *optio
     return SINGULAR;
   for (int f = 0; f < COUNT_OF_FAMILIES; f++)
     slopes = slopes_of(FAMILIES + f, step, at->data.z, slopes);
+  for (int i = 0; i < M; i++)
+    at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
   for (int i = 0; q1 && i < M; i++) {
     q1[i] = step->q0[i] + dq[i];
-    p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
+    p1[i] = at->p1[i];
   }
   return OK;
 }
@@ -57,9 +70,10 @@ static int linearise_step(const linearised_step *at, const solver_options *optio
 /* From v (or where back: to it) to all rows, or from dz to the last one, that of p1, by way of all points. */
 static void through_points(const linearised_step *at, int back, wide *v, wide *dz)
 {
+  const step_change by = {at->step->h, at->growth, at->grown};
   const real *slopes = at->slopes;
   for (int f = 0; f < COUNT_OF_FAMILIES; f++)
-    slopes = through_family(FAMILIES + f, at->step->h, back, slopes, at->points, v, dz, at->rows);
+    slopes = through_family(FAMILIES + f, &by, back, slopes, at->points, v, dz, at->rows);
 }
 
 /* dz = -(matrix)^-1 rows, the last row of each site left out. */
@@ -103,17 +117,43 @@ static void momentum_rows(const linearised_step *at, int back)
       flow(back, at->rows + i * (B + 1) + r, MOMENTUM_ROW[r], at->v + M + i);
 }
 
+/* How p1 depends on p0, on the rows that say by what it grows, and on damping, which shrinks it. */
+static void end_momentum(const linearised_step *at, int back)
+{
+#ifdef DAMPED
+  const real factor = MATH(exp)(-at->growth);
+#endif
+  for (int i = 0; i < M; i++) {
+    wide *p = at->v + M + i;
+    if (!back)
+      flow(0, p, 1, at->rows + i * (B + 1) + B);
+#ifdef DAMPED
+    if (back)
+      flow(1, p, -at->p1[i], at->grown);
+    for (int j = 0; j < WIDTH; j++)
+      p->lane[j] *= factor;
+    if (!back)
+      flow(0, p, -at->p1[i], at->grown);
+#endif
+    if (back)
+      flow(1, p, 1, at->rows + i * (B + 1) + B);
+  }
+}
+
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
 static void push_step(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
+#ifdef DAMPED
+  memset(at->grown, 0, sizeof(wide));
+  growth_wide(at->step, 0, at->v, at->grown);
+#endif
   momentum_rows(at, 0);
   through_points(at, 0, at->v, NULL);
   solve_forward(at);
   through_points(at, 0, NULL, at->dz);
   end_position(at, 0);
-  for (int i = 0; i < M; i++)
-    flow(0, at->v + M + i, 1, at->rows + i * (B + 1) + B);
+  end_momentum(at, 0);
   flow(0, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
 }
 
@@ -122,14 +162,19 @@ static void push_step(const linearised_step *at)
 static void pull_on(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
+#ifdef DAMPED
+  memset(at->grown, 0, sizeof(wide));
+#endif
   flow(1, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
-  for (int i = 0; i < M; i++)
-    flow(1, at->v + M + i, 1, at->rows + i * (B + 1) + B);
+  end_momentum(at, 1);
   end_position(at, 1);
   through_points(at, 1, NULL, at->dz);
   solve_back(at);
   through_points(at, 1, at->v, NULL);
   momentum_rows(at, 1);
+#ifdef DAMPED
+  growth_wide(at->step, 1, at->v, at->grown);
+#endif
 }
 
 static void pull_step(const linearised_step *at)
@@ -166,7 +211,7 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
   for (long long done = 0; done < steps; done++) {
     const long long k = back ? steps - 1 - done : done;
     const step_data step = {t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace, 1, NULL};
-    const linearised_step at = linearised_in(&step, workspace);
+    linearised_step at = linearised_in(&step, workspace);
     int status;
     report->t = t[k];
     status = linearise_step(&at, options ? options : &standard, q1 ? q1 + k * M : NULL, p1 ? p1 + k * M : NULL, report);

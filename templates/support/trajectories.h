@@ -25,6 +25,22 @@ static inline number magnitude(number x)
   return view.all;
 }
 
+static inline number exponential(number x)
+{
+  lane_view view = {x};
+  for (int j = 0; j < LANES; j++)
+    view.lane[j] = exp(view.lane[j]);
+  return view.all;
+}
+
+static inline number exponential_less_1(number x)
+{
+  lane_view view = {x};
+  for (int j = 0; j < LANES; j++)
+    view.lane[j] = expm1(view.lane[j]);
+  return view.all;
+}
+
 /* The largest of M numbers. */
 static inline number largest_number(const number *x)
 {

@@ -1,5 +1,6 @@
 """The benchmark's own arithmetic: references against closed forms, equal error, ratios. No peer is needed."""
 
+import importlib.util
 import json
 import math
 import os
@@ -19,6 +20,7 @@ from scvi_codegen.benchmark import (
     compile_times,
     compositions,
     hand_written,
+    held,
     measuring,
     mechanisms,
     paper_tables,
@@ -26,7 +28,7 @@ from scvi_codegen.benchmark import (
     start_up,
     sums,
 )
-from scvi_codegen.benchmark.contenders import ours, peers
+from scvi_codegen.benchmark.contenders import held_bodies, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
@@ -458,6 +460,29 @@ class TestTables:
         assert max(ours["least_error"], other["least_error"]) < 1e-12
         assert min(ours["second_ms"], other["second_ms"], ours["first_step_s"], other["first_step_s"]) > 0.0
         assert "KeyError" in missing["why_not"]
+
+    def test_held_bodies_are_the_same_in_angles_on_rods_and_in_mujoco(self):
+        """The chain twice by this project, and both by MuJoCo where it is installed: small steps, one motion."""
+        chain, linkage = (held_bodies.HELD[name]() for name in ("chain", "four-bar"))
+        on_rods, in_angles = held_bodies.our_motion(chain, "svi:4"), held_bodies.motion_in_angles(chain, "svi:4")
+        assert max(move(0.01, 100).energy for move in (on_rods, in_angles)) < 1e-6
+        assert on_rods(0.01, 100).stretch < 1e-14
+        assert held_bodies.our_motion(linkage, "svi:3")(0.02, 50).energy < 1e-8
+        if importlib.util.find_spec("mujoco") is None:
+            pytest.skip("mujoco is not installed (extra bench)")
+        assert held_bodies.mujoco_motion(chain, "RK4")(0.001, 1000).energy < 1e-6
+        soft, stiff = (held_bodies.mujoco_motion(linkage, "RK4", stiff=stiff)(0.001, 1000) for stiff in (False, True))
+        assert stiff.stretch < 1e-5 < soft.stretch < 1e-2
+        assert stiff.energy < 1e-4
+
+    def test_rows_of_held_bodies_are_told_at_equal_time(self, monkeypatch):
+        monkeypatch.setattr(held, "OUR_STEPS", (1000, 500))
+        monkeypatch.setattr(held, "_others", lambda bodies: [("other", held.our_motion(bodies, "svi:1"))])
+        rows = held.run_held(bench.Plan(quick=True), lambda text: None).rows
+        others = [row for row in rows if row["by"] == "other"]
+        assert {row["bodies"] for row in rows} == {"chain", "four-bar"}
+        assert all(row["ratio"] > 0.0 for row in others if row["ours_then"] is not None)
+        assert any(row["ours_then"] is not None for row in others)
 
     @pytest.mark.parametrize("lattice", [sums.ring(8, 1.0), sums.field(6, 0.2)], ids=lambda lattice: lattice.name)
     def test_lattices_by_hand_move_as_generated_ones(self, lattice):

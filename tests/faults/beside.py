@@ -50,6 +50,30 @@ FORCES_AND_INPUTS = (
     ),
 )
 
+DAMPING = (
+    text("weights that do not grow", case("damped/svi"), r"lanes_of_number\(growth\) \* ABSCISSA", "0.0 * ABSCISSA"),
+    text("weights of the middle", case("damped/svi"), r"\)\(growth \* abscissa\[n\]\)", ")(growth / 2)"),
+    text("a momentum that is not damped", case("damped/svi"), r"data->damping\.shrunk \* dp\[i\] \+ .*;", "dp[i];"),
+    text("damping by 1 - gamma h", case("damped/svi"), r"exponential_less_1\(-growth\)", "-growth"),
+    text(
+        "slopes by the rate lost",
+        case("damped/svi"),
+        r"flow\(back, growth, step->h \* slope\[e\].*;",
+        ";",
+    ),
+    text("slopes of what grows by h alone", case("damped/svi"), r"flow\(0, p, -at->p1\[i\], at->grown\);", ";"),
+)
+
+RATTLES = tuple(
+    text(f"{what}, rods/rattle", case("rods/rattle"), *edit)
+    for what, *edit in (
+        ("a hidden constraint without g_t", r"value \+ M, lambda\)", "value + M + CONSTRAINTS, lambda)"),
+        ("half of the force at the end", r"now\.force\[i\] \+ force\[i\]", "now.force[i] + force[i] / 2"),
+        ("constraints of the start of a step", r"constraints\(u, step->t \+ step->h", "constraints(u, step->t"),
+        ("masses that are not inverted", r"now\.inverse_mass\[i\] = 1 / now", "now.inverse_mass[i] = now"),
+    )
+)
+
 HAMILTONIANS = (
     function("H_pt lost", case("swing/sc"), mechanics, "_along", without_rates_of("t")),
     function(
@@ -172,9 +196,9 @@ C_TEXT = (
     (
         "half of the last row",
         "double/svi",
-        "push_step",
-        r"at->v \+ M \+ i, 1, at->rows",
-        "at->v + M + i, 0.5, at->rows",
+        "end_momentum",
+        r"flow\(0, p, 1, at->rows",
+        "flow(0, p, 0.5, at->rows",
     ),
     (
         "positions that unknowns move by 1, not by h",
@@ -207,6 +231,8 @@ C_TEXT = (
 )
 BESIDE = (
     *FORCES_AND_INPUTS,
+    *DAMPING,
+    *RATTLES,
     *HAMILTONIANS,
     *CONSTRAINTS,
     here(

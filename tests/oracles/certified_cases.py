@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from sabotage import Case
 from samples import (
+    damped_pendulum,
     driven_duffing,
     linkage,
     oscillator,
@@ -18,6 +19,7 @@ from samples import (
     sleigh,
     tangle,
     turning_wire,
+    two_rods,
 )
 
 from scvi_codegen.mechanics.reparametrisation import reparametrise
@@ -61,12 +63,15 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "sleigh": (sleigh(), (0.3, -0.4, 0.5), (1.155222551473559, 0.8681156930772079, 0.56), 0.1),
     "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
     "pushed": (pushed_pendulum(), (0.6,), (-0.3,), 0.1),
+    "damped": (damped_pendulum(), (0.6, 0.2), (-0.3, 0.5), 0.1),
+    "rods": (two_rods(), (0.6, -0.8, 1.4, -1.4), (0.8, 0.6, 0.7, 0.0), 0.05),
     "swing": (pumped_swing(), (0.6,), (-0.3,), 0.1),
     "field": (problem("charged-particle").system, (0.6, 0.3, -0.2), (-0.3, 0.4, 0.5), 0.1),
     "vortices": (point_vortices(2), (0.5, -0.4), (0.1, 0.3), 0.1),
 }
 METHODS: dict[str, Callable[[], Method]] = {
     "svi": lambda: SVI(2),
+    "rattle": lambda: SVI(1, "gauss-lobatto:2"),
     "svi-3": lambda: SVI(3),
     "svi-4": lambda: SVI(4),
     "svi-8": lambda: SVI(8),
@@ -106,7 +111,7 @@ WHOLE = """
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
     tangle/svi tangle/scvi tangle/sc chain/svi-4 field/gauss
-    slowed/svi-3 pushed/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
+    slowed/svi-3 pushed/svi damped/svi rods/rattle pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)
 REVERSIBLE = replace(case("kepler/svi-3"), monitor="frequency")

@@ -1,48 +1,223 @@
-"""Uniform damping by L exp(c t) (Caldirola, Kanai): phase area shrinks by exp(-c h) in every step, to rounding."""
+"""Uniform damping: phase area shrinks by exp(-gamma h) in every step to rounding, and the order stays.
+
+The references are L exp(gamma t) with momenta scaled by hand, where time occurs in a Lagrangian without damping, and
+SciPy's DOP853 on the equations of motion.
+"""
 
 import numpy as np
 import pytest
+from samples import QUICK_FLAGS
+from scipy.integrate import solve_ivp
 
-from scvi_codegen import SVI, Gauss, LagrangianSystem, compile_stepper
+from scvi_codegen import (
+    SCVI,
+    SVI,
+    Composition,
+    Gauss,
+    HamiltonianSystem,
+    LagrangianSystem,
+    LobattoIIIA,
+    MethodError,
+    RadauIIA,
+    SpectralCollocation,
+    StoermerVerlet,
+    SystemDefinitionError,
+    compile_stepper,
+    lagrangian_of,
+    reparametrise,
+    verify,
+)
 
-METHODS = [SVI(1), SVI(3), Gauss(2)]
+L = "(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5"
+GAMMA = 0.4 * 0.9
 
 
-def stepped(stepper, q, v, h, t):
-    """(q, v) after a step: momenta are those of L exp(c t)."""
-    q1, p1 = stepper.step(q, stepper.momentum(q, v, t), h, t)
-    return np.concatenate([q1, stepper.velocity(q1, p1, t + h)])
+def damped(lagrangian=L, **beside):
+    return LagrangianSystem.from_text(
+        name="damped",
+        coordinates=["x", "y"],
+        lagrangian=lagrangian,
+        parameters={"c": 0.4, "m": 0.9},
+        damping="c*m",
+        **beside,
+    )
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+@pytest.mark.covering
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+@pytest.mark.parametrize(
+    "method",
+    [SVI(1), SVI(3), SVI(2, "gauss-lobatto:3"), SVI(2, "gauss-legendre:4"), Gauss(2), RadauIIA(2), StoermerVerlet()],
+    ids=lambda method: method.name,
+)
+def test_a_step_is_that_of_the_scaled_lagrangian(method, solver):
+    """At any time: exp(gamma t) of the start is a unit of action."""
+    scaled = LagrangianSystem.from_text(
+        name="scaled", coordinates=["x", "y"], lagrangian=f"exp(c*m*t)*({L})", parameters={"c": 0.4, "m": 0.9}
+    )
+    own = compile_stepper(damped(), method, solver=solver, flags=QUICK_FLAGS)
+    other = compile_stepper(scaled, method, solver=solver, flags=QUICK_FLAGS)
+    for t, h in ((0.0, 0.1), (7.0, -0.07)):
+        grown = np.exp(GAMMA * t)
+        q, p = own.step([0.3, -0.4], [0.5, 0.7], h, t)
+        same_q, grown_p = other.step([0.3, -0.4], np.multiply([0.5, 0.7], grown), h, t)
+        assert np.abs(q - same_q).max() < 1e-15
+        assert np.abs(p - grown_p / np.exp(GAMMA * (t + h))).max() < 4e-15
+
+
+@pytest.mark.parametrize("method", [SVI(1), SVI(3), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
 def test_linear_steps_contract_area_exactly(method):
     system = LagrangianSystem.from_text(
         name="damped oscillator",
         coordinates=["q"],
-        lagrangian="exp(c*t)*(q_dot**2 - k*q**2)/2",
+        lagrangian="q_dot**2/2 - k*q**2/2",
         parameters={"c": 0.3, "k": 2.0},
+        damping="c",
     )
     stepper = compile_stepper(system, method)
-    for t in (0.0, 40.0):
-        columns = [stepped(stepper, [q], [v], 0.2, t) for q, v in ((1.0, 0.0), (0.0, 1.0))]
-        assert np.linalg.det(columns) == pytest.approx(np.exp(-0.3 * 0.2), rel=4e-14)
+    for t in (0.0, 1e6):
+        columns = [np.concatenate(stepper.step([q], [p], 0.2, t)) for q, p in ((1.0, 0.0), (0.0, 1.0))]
+        assert np.linalg.det(columns) == pytest.approx(np.exp(-0.3 * 0.2), rel=5e-16)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-def test_it_is_the_motion_with_that_friction(method):
-    """Two discretisations of one motion: by L exp(c t), and by the force -c v beside L."""
-    free = "q_dot**2/2 + cos(q)"
-    scaled = LagrangianSystem.from_text(
-        name="scaled", coordinates=["q"], lagrangian=f"exp(c*t)*({free})", parameters={"c": 0.3}
+@pytest.mark.parametrize("h", [0.1, 0.8])
+def test_curved_steps_contract_area_exactly(h):
+    """By the compiled derivative, whatever the step; and two steps back lead to the start."""
+    stepper = compile_stepper(damped(), SVI(2))
+    J = stepper.integrate([0.3, -0.4], [0.5, 0.7], h=h, steps=1).sensitivity().state[-1]
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
+    assert np.abs(J.T @ omega @ J - np.exp(-GAMMA * h) * omega).max() < 4e-15
+    q, p = stepper.step([0.3, -0.4], [0.5, 0.7], h)
+    q, p = stepper.step(q, p, -h, h)
+    assert np.abs(q - [0.3, -0.4]).max() < 2e-15
+    assert np.abs(p - [0.5, 0.7]).max() < 2e-15
+
+
+def rates(t, z):
+    x, y, v, w = z
+    mass = np.array([[1 + x**2, 1 / 3], [1 / 3, 1.0]])
+    p = mass @ [v, w]
+    right = [x * v**2 - np.sin(x) - y**2 / 4, -x * y / 2 + np.cos(2 * t) / 5] - GAMMA * p - [2 * x * v * v, 0]
+    return [v, w, *np.linalg.solve(mass, right)]
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "counts"),
+    [
+        (SVI(1), 2, (80, 160)),
+        (SVI(2), 4, (40, 80)),
+        (SVI(3), 6, (20, 40)),
+        (SVI(4), 8, (6, 12)),
+        (SVI(2, "gauss-lobatto:3"), 4, (40, 80)),
+        (LobattoIIIA(3), 4, (40, 80)),
+        (RadauIIA(3), 5, (20, 40)),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_order_is_that_without_damping(method, order, counts):
+    exact = solve_ivp(rates, (0.0, 2.0), [0.3, -0.4, 0.5, 0.7], method="DOP853", rtol=1e-13, atol=1e-14).y[:2, -1]
+    stepper, errors = compile_stepper(damped(), method, flags=QUICK_FLAGS), []
+    for count in counts:
+        run = stepper.integrate([0.3, -0.4], velocity=[0.5, 0.7], h=2.0 / count, steps=count)
+        errors.append(np.abs(run.q[-1] - exact).max())
+    assert np.log2(errors[0] / errors[1]) > order - 0.3
+    assert errors[1] < 1e-4
+
+
+def test_momentum_maps_shrink_exactly_and_work_is_told():
+    """The angular momentum of a body about a centre; damping takes energy to the order of the method."""
+    system = LagrangianSystem.from_text(
+        name="slowed body",
+        coordinates=["x", "y"],
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)",
+        parameters={"m": 2.0, "c": 0.2},
+        damping="c",
     )
-    forced = LagrangianSystem.from_text(
-        name="forced", coordinates=["q"], lagrangian=free, parameters={"c": 0.3}, forces={"q": "-c*q_dot"}
-    )
+    assert system.changes_energy
+    stepper = compile_stepper(system, SVI(3))
+    assert not stepper.interface.map_names
+    assert stepper.impulse_names == ("angular momentum",)
     apart = []
     for h in (0.1, 0.05):
-        ends = []
-        for system in (scaled, forced):
-            run = compile_stepper(system, method).integrate([2.0], velocity=[0.5], h=h, steps=round(3 / h))
-            ends.append(np.concatenate([run.q[-1], run.velocity[-1]]))
-        apart.append(np.abs(ends[0] - ends[1]).max())
-    assert apart[1] < 1e-12 or np.log2(apart[0] / apart[1]) > method.order - 0.4
+        run = stepper.integrate([1.0, 0.0], velocity=[0.1, 0.9], h=h, steps=round(3 / h))
+        angular = run.q[:, 0] * run.p[:, 1] - run.q[:, 1] * run.p[:, 0]
+        assert np.abs(angular / angular[0] - np.exp(-0.2 * run.t)).max() < 4e-15
+        apart.append(np.abs(run.energy() - run.energy()[0] - run.work()).max())
+        taken = np.abs(angular - angular[0] - run.impulses()[:, 0]).max()
+    assert np.log2(apart[0] / apart[1]) > 5.6
+    assert taken < 1e-9
+
+
+def test_steps_that_choose_their_length_ensembles_and_hamiltonians():
+    """Lanes with rates of their own; H, its Lagrangian, forces beside; what is held by constraints."""
+    hamiltonian = HamiltonianSystem.from_text(
+        name="damped from H",
+        coordinates=["x"],
+        momenta=["p"],
+        hamiltonian="p**2/(2*m) - cos(x)",
+        parameters={"m": 1.5, "c": 0.3},
+        forces={"x": "cos(t)/2"},
+        damping="c",
+    )
+
+    def pendulum(t, z, rate):
+        return [z[1] / 1.5, -np.sin(z[0]) + np.cos(t) / 2 - rate * z[1]]
+
+    for system in (hamiltonian, lagrangian_of(hamiltonian)):
+        stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
+        values = np.array([[1.5, 0.3], [1.5, 1.2], [1.5, -0.1]])
+        ends = [
+            solve_ivp(pendulum, (0, 3), [1.0, 0.2], args=(c,), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+            for c in values[:, 1]
+        ]
+        run = stepper.integrate([1.0], [0.2], t_end=3.0)
+        assert np.abs([run.q[-1, 0], run.p[-1, 0]] - ends[0]).max() < 1e-10
+        q, p = np.full((3, 1), 1.0), np.full((3, 1), 0.2)
+        many = stepper.integrate_ensemble(q, p, h=0.05, steps=60, parameters={"c": values[:, 1]})
+        assert np.abs(np.concatenate([many.q[-1], many.p[-1]], axis=1) - ends).max() < 1e-8
+
+
+def test_constrained_motion_is_that_of_the_angle():
+    rod = LagrangianSystem.from_text(
+        name="damped rod",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        parameters={"c": 0.5},
+        damping="c",
+        constraints=["x**2 + y**2 = 1"],
+    )
+    angle = LagrangianSystem.from_text(
+        name="damped angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)", parameters={"c": 0.5}, damping="c"
+    )
+    exact = compile_stepper(angle, "svi:8").integrate([1.0], [0.0], h=0.1, steps=20).q[-1, 0]
+    stepper, errors = compile_stepper(rod, SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS), []
+    for steps in (20, 40):
+        run = stepper.integrate([np.sin(1), -np.cos(1)], velocity=[0, 0], h=2 / steps, steps=steps)
+        errors.append(np.abs(run.q[-1] - [np.sin(exact), -np.cos(exact)]).max())
+        assert np.abs(run.constraint_values()).max() < 4e-15
+    assert np.log2(errors[0] / errors[1]) > 3.7
+
+
+def test_the_certificate_says_so():
+    certificate = verify(damped(), SVI(2), [0.3, -0.4], [0.5, 0.7], h=0.1, flags=QUICK_FLAGS)
+    assert certificate.passed, certificate.to_text()
+    assert not certificate.not_measured
+    names = {check.name for check in certificate.checks}
+    assert "conformal symplecticity" in names
+    assert "symplecticity" not in names
+
+
+def test_who_does_not_take_it():
+    for method in (SCVI(2), SpectralCollocation(3), SVI(2, "hermite:2"), Gauss(2, form="position")):
+        with pytest.raises(MethodError, match=r"does not take the damping of 'damped'.*take an SVI"):
+            compile_stepper(damped(), method)
+    plain = damped("x_dot**2/2 + y_dot**2/2 + cos(x)")
+    with pytest.raises(MethodError, match="without damping"):
+        compile_stepper(plain, Composition(8))
+    with pytest.raises(SystemDefinitionError, match="damping acts on 'damped'"):
+        reparametrise(plain, "1 + x**2")
+    for rate, symbol in (("c*x", "x"), ("c*t", "t"), ("c + y_dot", "y_dot")):
+        with pytest.raises(SystemDefinitionError, match=rf"depends on '{symbol}'.*as forces"):
+            LagrangianSystem.from_text(
+                name="varied", coordinates=["x", "y"], lagrangian=L, parameters={"c": 1.0}, damping=rate
+            )

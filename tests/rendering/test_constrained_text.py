@@ -10,6 +10,8 @@ from style import check_style
 
 from scvi_codegen import (
     SVI,
+    AccuracyWarning,
+    LagrangianSystem,
     Model,
     compile_stepper,
     derive,
@@ -22,6 +24,13 @@ from scvi_codegen.models.model_file import dump_model, parse_model
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 LINKAGE = linkage()
+PENDULUM = LagrangianSystem.from_text(
+    name="double pendulum",
+    coordinates=["x1", "y1", "x2", "y2"],
+    lagrangian="(x1_dot**2 + y1_dot**2 + x2_dot**2 + y2_dot**2)/2 - 9.81*(y1 + y2)",
+    constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+)
+"""By RATTLE, for multipliers alone."""
 NEAR = [0.0, 1.0, 1.94, 1.5]
 
 
@@ -31,8 +40,8 @@ def lobatto(s):
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_compiles_without_a_warning(compiler, tmp_path):
-    for controlled in (False, True):
-        source = generate_source(LINKAGE, lobatto(3), controlled=controlled, amalgamate=True)[0]
+    for system, s, controlled in ((LINKAGE, 3, False), (LINKAGE, 3, True), (PENDULUM, 1, True)):
+        source = generate_source(system, lobatto(s), controlled=controlled, amalgamate=True)[0]
         (tmp_path / f"{source.prefix}.h").write_text(source.header)
         (tmp_path / "all.c").write_text(source.code)
         check_style(source.code)
@@ -80,3 +89,43 @@ def test_packages_run_alone(tmp_path):
     one, other = (each.integrate(q, np.zeros(4), h=0.01, steps=20) for each in (stepper, loaded))
     assert np.abs(one.q - other.q).max() < 1e-14
     assert np.abs(other.multipliers() - one.multipliers()).max() < 1e-10
+
+
+def made_and_run(folder, q, *, precision=None, system=LINKAGE, said=0):
+    """A folder is generated, ``make`` builds what is in it and runs it: the example's states, and all that it said."""
+    model = Model(system=system, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.05, steps=40)
+    generate_package(model, folder, embedded=precision)
+    found = subprocess.run(["make", "-s", "-C", str(folder)], capture_output=True, text=True)
+    assert (found.returncode != 0) == said
+    return np.array([line.split() for line in found.stdout.splitlines() if line[0] != "#"], dtype=float), found
+
+
+@pytest.mark.parametrize("precision", [None, "double", "single"])
+def test_generated_folders_meet_constraints_and_compute_what_python_does(precision, tmp_path):
+    """A state a little off is moved, which is said, and integrated; also by steps that choose their length."""
+    near = [0.001, 1.0, 1.94, 1.5]
+    states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
+    stepper = compile_stepper(LINKAGE, "svi:3", solver="newton")
+    with pytest.warns(AccuracyWarning, match="moved to the nearest"):
+        run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, every=2)
+    assert "(relative) off the constraints" in found.stderr
+    assert len(states) == len(run)
+    bound = 2e-4 if precision == "single" else 2e-13
+    assert np.abs(states[:, 1:5] - run.q).max() < bound
+    assert np.abs(states[:, 5:9] - run.p).max() < 10 * bound
+    values = stepper.constraint_values(states[:, 1:5], states[:, 5:9], states[:, 0])
+    assert np.abs(values).max() < 0.1 * bound
+    if precision is None:
+        (away,) = [line for line in found.stdout.splitlines() if "of their own lengths" in line]
+        assert np.abs(np.array(away.rpartition(" by ")[2].split(), dtype=float)).max() < 1e-5
+
+
+def test_what_cannot_be_put_on_the_constraints_is_refused_in_c(tmp_path):
+    """A state that is far off; and one stretched out, whose rods are one line: what they say depends on each other."""
+    states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], said=1)
+    assert "(relative) off the constraints" in found.stderr
+    stretched = LINKAGE.with_parameters(d=4.5)
+    other, also = made_and_run(tmp_path / "stretched", [1.0, 0.0, 3.0, 0.0], system=stretched, said=1)
+    assert "no state that meets the constraints was found near the initial one (status 2)" in also.stderr
+    assert not len(states)
+    assert not len(other)

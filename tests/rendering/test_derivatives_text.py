@@ -3,7 +3,7 @@
 import subprocess
 
 import pytest
-from samples import linkage, pumped_cart_pole
+from samples import damped_pendulum, linkage, pumped_cart_pole, two_rods
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, problem
@@ -17,6 +17,8 @@ CASES = {
     "linkage": (linkage(), SVI(2, "gauss-lobatto:3")),
     "cart": (pumped_cart_pole(), SVI(1)),
     "pendulum": (problem("planar-pendulum").system, SVI(1)),
+    "damped": (damped_pendulum(), SVI(2)),
+    "rods": (two_rods(), SVI(1, "gauss-lobatto:2")),
     "double": (problem("double-pendulum").system, SCVI(2)),
 }
 

@@ -15,7 +15,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from recorded_runs import COLUMNS, STATE, H, StopsAfter, assert_same, digests, recorded, start
+from samples import pushed_pendulum
 
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MissingLibraryError, RecordingError, RecordingWarning, StateError
 from scvi_codegen.files import export
 from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
@@ -420,3 +422,13 @@ class TestFiles:
             run.save("a.npz")
         assert [path.name for path in Path().iterdir()] == ["a.npz"]
         assert Path("a.npz").read_bytes() == before
+
+
+def test_inputs_that_nobody_gave_leave_no_folder_behind():
+    stepper = compile_stepper(pushed_pendulum(), SVI(2))
+    run = stepper.start([0.3], [0.0], h=0.1)
+    with pytest.raises(StateError, match="the input u is not given"):
+        record_run(run, "pushed.run", steps=4)
+    assert not Path("pushed.run").exists()
+    run.hold(u=0.5, w=0.0)
+    assert len(record_run(run, "pushed.run", steps=4)) == 5

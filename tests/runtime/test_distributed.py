@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from samples import QUICK_FLAGS
+from samples import QUICK_FLAGS, pushed_pendulum
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
@@ -74,6 +74,19 @@ class TestCluster:
             assert np.array_equal(getattr(result, name), getattr(here, name))
         assert done[-1] == COUNT
         assert done == sorted(done)
+
+    @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 2.0}, {"t_end": np.linspace(1.0, 2.0, COUNT)}])
+    def test_inputs_go_along(self, distributed: Any, way: dict[str, Any]):
+        stepper = compile_stepper(pushed_pendulum(), SVI(3))
+        knots, values = np.array([0.0, 0.7, 2.0]), np.linspace(-1.0, 1.0, 3 * COUNT).reshape(COUNT, 3)
+        given = {"inputs": {"u": (knots, values), "w": (knots, [0.0, 0.1, 0.0])}, **way}
+        q = np.linspace(0.1, 1.0, COUNT)[:, np.newaxis]
+        here = stepper.drive_ensemble(q, 0.0 * q, **given)
+        result = integrate_ensemble(stepper, q, 0.0 * q, **given, blocks=3)
+        assert here.ok.all()
+        for found, expected in ((result.t, here.t), (result.q, here.q), (result.p, here.p), (result.steps, here.steps)):
+            assert np.array_equal(found, expected, equal_nan=True)
+        assert np.array_equal(result.energy(), here.energy(), equal_nan=True)
 
     def test_faults_are_found_before_anything_is_sent(self, kepler: Stepper):
         q, p = states()

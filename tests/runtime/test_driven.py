@@ -13,6 +13,7 @@ from scipy.interpolate import Akima1DInterpolator, BPoly, CubicSpline, PPoly, ma
 
 from scvi_codegen import (
     SVI,
+    ExpressionError,
     Gauss,
     HamiltonianSystem,
     LagrangianSystem,
@@ -325,6 +326,27 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
     assert np.array_equal(run.record(2).q, given.q)
     lanes = stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2, parameters=given.parameters)
     assert_allclose(lanes.q[:, 0], given.q, rtol=1e-15)
+
+
+def test_events_and_monitors_know_inputs_by_name(pendulum):
+    """A crossing of the torque with a number, and of the angle with a line that is data."""
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
+    stepper = compile_stepper(pendulum, SVI(4))
+    run = stepper.drive([0.3], [0.1], inputs=inputs, t_end=2.3, events=["u - 1/2", "q - w - 1/3"])
+    torque, line = run.events
+    assert torque.t[0] == pytest.approx(0.5 / 1.2 * 0.37, rel=1e-14)
+    assert_allclose(np.interp(torque.t, KNOTS, VALUES), 0.5, rtol=1e-13)
+    assert_allclose(line.q[:, 0], 0.1 * line.t + 1 / 3, rtol=1e-12)
+    assert len(line.t)
+    slowed = compile_stepper(pendulum, SVI(4), monitor="1/(2 + q**2 + w)")
+    same = slowed.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3)
+    assert_allclose(same.q[-1], run.q[-1], atol=1e-8)
+    by_hand = 1 / (2 + same.q[:, 0] ** 2 + 0.1 * same.t)
+    lengths = np.concatenate([piece.lengths[:-1] for piece in same.pieces])
+    ratio = lengths / (0.1 * by_hand[:-1])
+    assert np.median(np.abs(ratio - 1)) < 0.05
+    with pytest.raises(ExpressionError, match=r"Known here: .* u, w"):
+        stepper.with_events("v - 1")
 
 
 def test_inputs_stay_in_other_coordinates_and_other_forms(pendulum):

@@ -93,6 +93,41 @@ def test_methods_without_lanes_are_equal_to_the_bit(pendulum):
     check_against_drive(stepper, starts(1), inputs, 0.0, h=0.02, t_end=2.3, every=4)
 
 
+@pytest.mark.parametrize("tolerance", [None, 1e-6])
+def test_by_steps_of_their_own_each_is_that_of_drive_to_the_bit(pendulum, tolerance):
+    """Times, ends, energies; two inputs of their own and a common one; also back."""
+    stepper, (values, c) = compile_stepper(pendulum, SVI(4)), own_values()
+    inputs = {"u": (KNOTS, values), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0], "cubic")}
+    ends, (q, p) = np.linspace(0.2, 2.5, COUNT), starts(1)
+    there = stepper.drive_ensemble(q, p, inputs=inputs, t_end=ends, tolerance=tolerance, parameters={"c": c})
+    assert there.ok.all()
+    for j, (t, q_j, p_j, _, steps) in enumerate(there.each()):
+        given = {"inputs": of_one(inputs, j), "tolerance": tolerance, "parameters": {"c": c[j]}}
+        run = stepper.drive(q[j], p[j], t_end=ends[j], **given)
+        assert steps == run.steps
+        for found, expected in ((t, run.t), (q_j, run.q), (p_j, run.p)):
+            assert np.array_equal(found, expected)
+        assert np.array_equal(there.energy()[: len(t), j], run.energy())
+    back = stepper.drive_ensemble(
+        there.ends[1], there.ends[2], inputs=inputs, t=2.5, t_end=0.0, parameters={"c": c}, every=5
+    )
+    assert_allclose(back.ends[1][-1], q[-1], atol=1e-4 if tolerance else 1e-11)
+    assert len(pickle.loads(pickle.dumps(back))) == COUNT
+
+
+def test_a_trajectory_that_vanishes_keeps_what_came_before():
+    singular = LagrangianSystem.from_text(
+        name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
+    )
+    inputs = {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}
+    runs = compile_stepper(singular, SVI(4)).drive_ensemble([[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5)
+    assert runs.status.tolist() == ["vanished", "ok"]
+    t = next(runs.each())[0]
+    assert (t[0], 0.5 in t) == (0.0, True)
+    assert 0.9 < t[-1] < 1.3
+    assert (np.diff(t) >= 0).all()
+
+
 def test_velocities_are_taken_with_the_inputs_of_the_start(coupled):
     stepper = compile_stepper(coupled, SVI(3))
     q, v = starts(2)

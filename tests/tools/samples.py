@@ -70,6 +70,17 @@ def linkage() -> LagrangianSystem:
     )
 
 
+def two_rods() -> LagrangianSystem:
+    """One mass below the other, the upper rod of changing length: constant masses, a step is one of RATTLE."""
+    return LagrangianSystem.from_text(
+        name="two rods",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="m*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - g*(m*y1 + y2)",
+        parameters={"m": 2.0, "g": 3.0},
+        constraints=["x1**2 + y1**2 = (1 + sin(t)/9)**2", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+    )
+
+
 def sleigh() -> LagrangianSystem:
     """Chaplygin's, between springs: its blade at (x, y) goes where it points, its mass is d ahead of it."""
     return LagrangianSystem.from_text(
@@ -91,6 +102,17 @@ def pushed_pendulum() -> LagrangianSystem:
         parameters={"c": 0.2},
         forces={"q": "u - c*q_dot"},
         inputs=["u", "w"],
+    )
+
+
+def damped_pendulum() -> LagrangianSystem:
+    """On a cart that a spring holds; all momenta damped at a rate of two parameters, and L with time."""
+    return LagrangianSystem.from_text(
+        name="damped pendulum",
+        coordinates=["x", "a"],
+        lagrangian="m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)",
+        parameters={"m": 2.0, "c": 0.4, "r": 0.7},
+        damping="c*r",
     )
 
 

@@ -30,9 +30,9 @@ def bench(
     (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), adaptive (steps that choose their
     length, beside fixed steps, transformed time, heyoka and IAS15: adaptive:kepler:0.9, ..), drift (the energy over ten
     million steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up, compile
-    (larger systems, from text to first step), mechanisms (of SymPy, beside lambdify and PyDy), sums (over indices:
-    lattices, fields, many bodies), growth (with their number of coordinates) or builds (other compilers and
-    processors); by default all; kepler is both of its kind.
+    (larger systems, from text to first step), mechanisms (of SymPy, beside lambdify and PyDy), held (bodies held by
+    rods, beside MuJoCo), sums (over indices: lattices, fields, many bodies), growth (with their number of coordinates)
+    or builds (other compilers and processors); by default all; kepler is both of its kind.
     Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
 
     \b

@@ -33,6 +33,14 @@ def system_section(system: MechanicalSystem) -> Section:
             Paragraph("Forces act beside it; where L_q stands below, L_q + f is meant:"),
             *formulas(acting, "force"),
         ]
+    if system.damping != 0:
+        contents += [
+            Paragraph(
+                "Momenta are damped at one rate, gamma; the points of a quadrature weigh exp(gamma c h) times as much, "
+                "and the momentum at the end is divided by exp(gamma h):"
+            ),
+            *formulas([Formula(system.damping, Symbol("gamma"))], "damping"),
+        ]
     if system.constraints:
         contents += [
             Paragraph(
@@ -74,7 +82,7 @@ def _hamilton(system: MechanicalSystem) -> Iterator[Content]:
     rates = [Formula(by_momenta.get(i, sympy.S.Zero), velocity, "19a") for i, velocity in enumerate(system.velocities)]
     kicks = [
         Formula(force, Symbol(f"{p.name}_dot"), "19b")
-        for p, force in zip(system.auxiliaries, forms_of(system).force, strict=True)
+        for p, force in zip(system.auxiliaries, forms_of(system).thrust, strict=True)
     ]
     yield Paragraph("Hamilton's equations (19), dq/dt = dH/dp and dp/dt = -dH/dq:")
     yield from formulas(rates, "equation")

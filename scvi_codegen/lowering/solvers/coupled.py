@@ -12,7 +12,7 @@ the rounded map still has a generating function: its energy error does not drift
 from __future__ import annotations
 
 from scvi_codegen.ir.sweeps import CoupledSweep
-from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
+from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, velocity_tables
@@ -65,6 +65,7 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),
         mass_entries=tuple(forms.lower_mass),
         integrands=integrand_kernel(system, "integrand_lanes", of),
+        damping=damping_kernel(system),
     )
 
 

@@ -23,7 +23,7 @@ def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
     """The fixed-point iteration of a Hamiltonian; ``None`` with too many points, or other points than velocities."""
     system = problem.system
     tables = velocity_tables(problem.shape) if system.auxiliaries else None
-    if tables is None or tables.velocity:
+    if tables is None or tables.velocity or system.damping != 0:
         return None
     lanes = lane_count(len(tables.abscissae))
     if lanes > MOST_LANES:

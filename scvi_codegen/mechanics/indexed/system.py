@@ -24,10 +24,10 @@ from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexe
 from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
 from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
+from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
-from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 
 __all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
 
@@ -135,7 +135,7 @@ class IndexedSystem:
             forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` at every place, ``{"q[0]": "cos(t)"}`` at one.
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
             inputs: names of functions of time that are given as data with each run
-                (:mod:`scvi_codegen.mechanics.inputs`).
+                (:mod:`scvi_codegen.formulas.inputs`).
 
         Raises:
             SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.

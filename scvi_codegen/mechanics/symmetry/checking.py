@@ -173,7 +173,8 @@ def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
     terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
-    forces = with_reactions(system, system.forces or (sympy.S.Zero,) * system.dimension)
+    acting = system.forces or (sympy.S.Zero,) * system.dimension
+    forces = with_reactions(system, [f - system.damping * x for f, x in zip(acting, p, strict=True)])
     terms += [force * component for force, component in zip(forces, xi, strict=True)]
     return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
 

@@ -150,7 +150,7 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
 def rates_of(system: MechanicalSystem) -> Rates:
     """The motion of a system, long numbers replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
-    forces = with_reactions(system, forms_of(system).force)
+    forces = with_reactions(system, forms_of(system).thrust)
     numbers = _long_numbers((*transformed, *forces))
     if numbers:
         replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}

@@ -190,7 +190,9 @@ def _energy(system: MechanicalSystem) -> list[Terms]:
     """H, if it is a conserved polynomial: no symmetry but time's."""
     places = {x: i for i, x in enumerate((*system.coordinates, *system.momentum_symbols))}
     found = (
-        None if system.forces or system.formula.has(system.time) else _monomials(sympy.expand(system.formula), places)
+        None
+        if system.changes_energy or system.formula.has(system.time)
+        else _monomials(sympy.expand(system.formula), places)
     )
     if found is None:
         return []

@@ -79,13 +79,14 @@ def record_run(
         The run as it lies in the folder; ``finished`` unless ``stop`` ended it.
 
     Raises:
-        StateError: on wrong numbers, or a run under way.
+        StateError: on wrong numbers, a run under way, or an input that was not given.
         RecordingError: if the folder holds a run, or cannot be written; it then says how far the run in it goes.
         StepFailedError: if a step fails; the states before are in the folder.
     """
     target = Path(folder)
     if run.steps:
         raise StateError(f"a run is recorded from its start, but this one has {run.steps} steps: start another")
+    run.check_inputs()
     manifest = Manifest(
         source=run.stepper.source,
         fallback=run.stepper.fallback,

@@ -1,0 +1,228 @@
+"""Bodies held by rods, with constraints by this project and by MuJoCo: the same masses, lengths and initial states.
+
+    chain      5 masses of 1/5 on rods of 1/5, let go from 0.6 (the first) to 0.3 from the vertical; MuJoCo has it in
+               the angles of its joints, in which there is no constraint to break, and so has this project once more
+    four-bar   masses at the two joints of rods of 1, 2 and 1.5 between points that are 2 apart; MuJoCo closes the loop
+               by its equality ``connect``
+
+A contender gives a function of (step, number of steps): how energies at the end of ten equal parts differ, how far rods
+are off their lengths there, and the processor time that the steps took.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import Array
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.runtime.stepper import Stepper
+
+__all__ = ["HELD", "Held", "HeldRun", "motion_in_angles", "mujoco_motion", "our_motion"]
+
+GRAVITY = 9.81
+PARTS = 10
+"""Of a run, after which energies are looked at."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Held:
+    """Masses in the plane at (x, y), and rods between two of them, or one and a fixed point.
+
+    Attributes:
+        rods: (i, j, length); i < 0 is the fixed point ``anchors[-1 - i]``.
+        closed: whether the last rod ends at a fixed point: a loop.
+    """
+
+    name: str
+    masses: tuple[float, ...]
+    start: tuple[tuple[float, float], ...]
+    rods: tuple[tuple[int, int], ...]
+    anchors: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    closed: bool = False
+
+    def point(self, i: int) -> Array:
+        """Where a mass, or a fixed point, is at the start."""
+        return np.array(self.anchors[-1 - i] if i < 0 else self.start[i])
+
+    def length(self, i: int, j: int) -> float:
+        """Of a rod."""
+        return float(np.linalg.norm(self.point(j) - self.point(i)))
+
+    @property
+    def weight(self) -> float:
+        """The energy that errors are told in: of all masses through a length of 1."""
+        return GRAVITY * sum(self.masses)
+
+
+def hanging_chain(n: int) -> Held:
+    """Of n rods."""
+    angles = np.linspace(0.6, 0.3, n)
+    places = np.cumsum(np.column_stack([np.sin(angles), -np.cos(angles)]) / n, axis=0)
+    return Held(
+        name="chain",
+        masses=(1.0 / n,) * n,
+        start=tuple(map(tuple, places.tolist())),
+        rods=tuple((i - 1, i) for i in range(n)),
+    )
+
+
+def four_bar() -> Held:
+    """From a state at rest: the second joint follows from the first."""
+    first, end, b, c = np.array([0.0, 1.0]), np.array([2.0, 0.0]), 2.0, 1.5
+    apart = float(np.linalg.norm(end - first))
+    along = (apart**2 + b**2 - c**2) / (2 * apart)
+    towards = (end - first) / apart
+    second = first + along * towards + np.sqrt(b**2 - along**2) * np.array([-towards[1], towards[0]])
+    return Held(
+        name="four-bar",
+        masses=(1.0, 1.0),
+        start=(tuple(first.tolist()), tuple(second.tolist())),
+        rods=((-1, 0), (0, 1), (1, -2)),
+        anchors=((0.0, 0.0), (2.0, 0.0)),
+        closed=True,
+    )
+
+
+LINKS = 5
+HELD: Mapping[str, Callable[[], Held]] = {"chain": lambda: hanging_chain(LINKS), "four-bar": four_bar}
+"""By name."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldRun:
+    """Of a run: processor seconds of its steps, largest change of energy, and of a rod's length as a part of it."""
+
+    seconds: float
+    energy: float
+    stretch: float
+
+
+def our_motion(held: Held, method: str) -> Callable[[float, int], HeldRun]:
+    """By constraints in Cartesian coordinates."""
+    n = len(held.masses)
+    kinetic = " + ".join(f"{held.masses[i]!r}*(x{i}_dot**2 + y{i}_dot**2)/2" for i in range(n))
+    weights = " ".join(f"- {held.masses[i] * GRAVITY!r}*y{i}" for i in range(n))
+    constraints = []
+    for i, j in held.rods:
+        (a, b), (c, d) = (map(repr, map(float, held.anchors[-1 - k])) if k < 0 else (f"x{k}", f"y{k}") for k in (i, j))
+        constraints.append(f"({c} - {a})**2 + ({d} - {b})**2 - {held.length(i, j) ** 2!r}")
+    system = LagrangianSystem.from_text(
+        name=f"{held.name} on rods",
+        coordinates=[f"{axis}{i}" for i in range(n) for axis in "xy"],
+        lagrangian=f"{kinetic} {weights}",
+        constraints=constraints,
+    )
+    stepper = compile_stepper(system, method)
+    q, p = stepper.project(np.ravel(held.start))
+    return _by(stepper, q, p, lambda x: _stretch(held, x.reshape(n, 2)))
+
+
+def motion_in_angles(held: Held, method: str) -> Callable[[float, int], HeldRun]:
+    """The same for an open chain in the angles of its rods, which leave nothing to hold."""
+    n = len(held.masses)
+    lengths, angles = [held.length(i, j) for i, j in held.rods], [f"a{k}" for k in range(n)]
+    kinetic, height = [], []
+    for mass, last in zip(held.masses, range(1, n + 1), strict=True):
+        own = list(zip(lengths[:last], angles[:last], strict=True))
+        speeds = [" + ".join(f"{length!r}*{turn}({a})*{a}_dot" for length, a in own) for turn in ("cos", "sin")]
+        kinetic.append(f"{mass!r}/2*(({speeds[0]})**2 + ({speeds[1]})**2)")
+        height += [f"{mass * GRAVITY * length!r}*cos({a})" for length, a in own]
+    system = LagrangianSystem.from_text(
+        name=f"{held.name} in angles", coordinates=angles, lagrangian=" + ".join([*kinetic, *height])
+    )
+    stepper = compile_stepper(system, method)
+    along = [held.point(j) - held.point(i) for i, j in held.rods]
+    q = np.array([np.arctan2(x, -y) for x, y in along])
+    return _by(stepper, q, np.zeros(n), lambda x: 0.0)
+
+
+def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float]) -> Callable[[float, int], HeldRun]:
+    """Runs of a stepper, so many steps of h."""
+
+    def move(h: float, steps: int) -> HeldRun:
+        run, seconds, energies, worst = stepper.start(q, p, h=h), 0.0, [float(stepper.energy(q, p))], 0.0
+        for _ in range(PARTS):
+            began = time.process_time()
+            run.skip(steps // PARTS)
+            seconds += time.process_time() - began
+            energies.append(float(stepper.energy(run.q, run.p)))
+            worst = max(worst, stretch(run.q))
+        return HeldRun(seconds, float(np.ptp(energies)), worst)
+
+    return move
+
+
+def _stretch(held: Held, places: Array) -> float:
+    """How much longer or shorter a rod is, as a part of its length."""
+    found = 0.0
+    for i, j in held.rods:
+        ends = [np.array(held.anchors[-1 - k]) if k < 0 else places[k] for k in (i, j)]
+        length = held.length(i, j)
+        found = max(found, abs(float(np.linalg.norm(ends[1] - ends[0])) - length) / length)
+    return found
+
+
+def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callable[[float, int], HeldRun]:
+    """By MuJoCo: hinges, and where a loop is closed its equality, as soft as it is or as stiff as a step allows.
+
+    Raises:
+        ImportError: without ``mujoco``.
+    """
+    import mujoco
+
+    def move(h: float, steps: int) -> HeldRun:
+        model = mujoco.MjModel.from_xml_string(_document(held, integrator, h, stiff=stiff))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        seconds, energies, stretch = 0.0, [float(data.energy.sum())], 0.0
+        for _ in range(PARTS):
+            began = time.process_time()
+            mujoco.mj_step(model, data, nstep=steps // PARTS)
+            seconds += time.process_time() - began
+            mujoco.mj_forward(model, data)
+            energies.append(float(data.energy.sum()))
+            places = data.site_xpos[:, [0, 2]]
+            stretch = max(stretch, _stretch(held, places[: len(held.masses)]))
+        return HeldRun(seconds, float(np.ptp(energies)), stretch)
+
+    return move
+
+
+def _document(held: Held, integrator: str, h: float, *, stiff: bool) -> str:
+    """MJCF: bodies one inside the other along the rods; y is MuJoCo's z, the axis of hinges its y."""
+    open_rods = held.rods[:-1] if held.closed else held.rods
+    bodies, tail = "", ""
+    for i, j in open_rods:
+        last = held.closed and (i, j) == open_rods[-1]
+        at, to = held.point(i), held.point(j)
+        before = np.zeros(2) if i < 0 else at - held.point(open_rods[open_rods.index((i, j)) - 1][0])
+        mass = held.masses[j] / (2.0 if last else 1.0)
+        bodies += _body(f"b{j}", before, to - at, mass, f"s{j}")
+        tail = "</body>" + tail
+    loop, equality = "", ""
+    if held.closed:
+        i, j = held.rods[-1]
+        end, other = held.point(j), held.point(i)
+        loop = _body("closing", end, other - end, held.masses[i] / 2.0, "closing") + "</body>"
+        soft = f'solref="{2 * h!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"' if stiff else ""
+        equality = f'<equality><connect site1="s{i}" site2="closing" {soft}/></equality>'
+    return f"""<mujoco>
+      <option timestep="{h!r}" integrator="{integrator}" gravity="0 0 {-GRAVITY}" tolerance="1e-15" iterations="200">
+        <flag contact="disable" energy="enable"/>
+      </option>
+      <worldbody>{bodies}{tail}{loop}</worldbody>{equality}
+    </mujoco>"""
+
+
+def _body(name: str, before: Array, rod: Array, mass: float, site: str) -> str:
+    """A hinge at a place of the body around it, with a mass at the end of a rod; left open."""
+    place, end = (" ".join(map(repr, (float(x), 0.0, float(y)))) for x, y in (before, rod))
+    return (
+        f'<body name="{name}" pos="{place}"><joint type="hinge" axis="0 1 0"/>'
+        f'<inertial pos="{end}" mass="{mass!r}" diaginertia="1e-12 1e-12 1e-12"/><site name="{site}" pos="{end}"/>'
+    )

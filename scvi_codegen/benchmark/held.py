@@ -1,0 +1,114 @@
+"""Bodies held by rods: energies and lengths kept by this project and by MuJoCo, at equal time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.contenders.contenders import OURS
+from scvi_codegen.benchmark.contenders.held_bodies import (
+    HELD,
+    Held,
+    HeldRun,
+    motion_in_angles,
+    mujoco_motion,
+    our_motion,
+)
+from scvi_codegen.benchmark.curves import FLOOR, Point, error_at
+from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.errors import StepFailedError
+
+__all__ = ["run_held"]
+
+SPAN = 10.0
+METHODS = ("svi:1", "svi:2", "svi:4")
+OUR_STEPS = (2000, 1000, 500, 250, 100)
+"""In the span."""
+STEPS = (10000, 5000, 2000, 1000)
+"""Of MuJoCo, whose own default is 5000."""
+INTEGRATORS = ("Euler", "implicitfast", "RK4")
+
+Move = Callable[[float, int], HeldRun]
+
+
+def run_held(plan: Plan, say: Say) -> ResultTable:
+    """All rows; those of MuJoCo say why not where it is not installed."""
+    rows: list[dict[str, Any]] = []
+    for name, make in HELD.items():
+        held, own = make(), []
+        for method in METHODS[: 1 if plan.quick else None]:
+            say(f"held: {name} by {method}")
+            own += list(_rows(held, f"{OURS} {method}", our_motion(held, method), OUR_STEPS, plan))
+        angles = [] if held.closed else list(_angles(held, plan))
+        theirs = [row for label, move in _others(held) for row in _rows(held, label, move, STEPS, plan)]
+        curves = {"energy": _points(own), "angles": _points(angles)}
+        found = [row | _beside(row, curves) for row in theirs] or [{"by": "MuJoCo", "why_not": "pip install mujoco"}]
+        rows += [{"bodies": name} | row for row in (*own, *angles, *found)]
+    return ResultTable(
+        name="held",
+        title="bodies held by rods: energy and lengths over ten seconds",
+        columns={
+            "bodies": "",
+            "by": "",
+            "h": "g",
+            "second_us": ".0f",
+            "energy": ".1e",
+            "stretch": ".0e",
+            "ours_then": ".1e",
+            "ratio": ".2g",
+            "in_angles_then": ".1e",
+            "why_not": "",
+        },
+        rows=tuple(rows),
+        remarks=(
+            "second: microseconds of the processor for a second of motion; energy: its largest change, in units of",
+            "all weights times 1; stretch: of a rod, as a part of its length; ours then: that energy by constraints of",
+            "this project at equal time, between its settings; ratio: theirs over ours; in angles: ours in those.",
+        ),
+    )
+
+
+def _angles(held: Held, plan: Plan) -> Iterator[dict[str, Any]]:
+    for method in METHODS[-1:]:
+        yield from _rows(held, f"{OURS} {method}, angles", motion_in_angles(held, method), OUR_STEPS, plan)
+
+
+def _others(held: Held) -> Iterator[tuple[str, Move]]:
+    """MuJoCo's integrators; loops also as stiff as a step allows."""
+    try:
+        import mujoco  # noqa: F401  (whether it is there)
+    except ImportError:
+        return
+    for integrator in INTEGRATORS:
+        for stiff in (False, True)[: 2 if held.closed else 1]:
+            label = f"MuJoCo {integrator}{', stiff' * stiff}"
+            yield label, mujoco_motion(held, integrator, stiff=stiff)
+
+
+def _rows(held: Held, by: str, move: Move, counts: Sequence[int], plan: Plan) -> Iterator[dict[str, Any]]:
+    """One for each step, the median of the times."""
+    span = SPAN * plan.share
+    for count in counts:
+        h = SPAN / count
+        try:
+            runs = [move(h, round(span / h)) for _ in range(plan.rounds)]
+        except StepFailedError:  # too long a step
+            continue
+        energy = runs[0].energy / held.weight
+        if np.isfinite(energy) and energy < 1.0:
+            seconds = float(np.median([run.seconds for run in runs]))
+            yield {"by": by, "h": h, "second_us": 1e6 * seconds / span, "energy": energy, "stretch": runs[0].stretch}
+
+
+def _points(rows: Sequence[dict[str, Any]]) -> list[Point]:
+    return [Point(seconds=row["second_us"], error=row["energy"]) for row in rows]
+
+
+def _beside(row: dict[str, Any], curves: dict[str, list[Point]]) -> dict[str, Any]:
+    """What this project's errors are in the time of a row."""
+    ours, angles = (error_at(curves[name], row["second_us"]) for name in ("energy", "angles"))
+    ratio = None if ours is None else row["energy"] / max(ours, FLOOR)
+    return {"ours_then": ours, "ratio": ratio, "in_angles_then": angles}

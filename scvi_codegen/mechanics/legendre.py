@@ -1,0 +1,99 @@
+"""Legendre's transform of a function, solved symbolically: of quadratic forms by inverses, else by roots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import sympy
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.canonical import unsupported_part
+from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["legendre_dual", "positive_parameters"]
+
+LARGEST_INVERSE = 3
+"""Coupled momenta (velocities) whose quadratic form is inverted symbolically."""
+NEGLIGIBLE = mp.mpf(10) ** -30
+
+
+def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: Sequence[Symbol]) -> Expr:
+    """The product x . y less f(x), with y = df/dx solved for x; f is the system's formula."""
+    f = system.formula
+    curvature = hessian(f, variables)
+    origin = dict.fromkeys(variables, sympy.S.Zero)
+    slopes = gradient(f, variables)
+    if all(not (entry.free_symbols & set(variables)) for entry in curvature.values()):
+        shifted = [y - slopes[i].xreplace(origin) for i, y in enumerate(duals)]
+        forms = [_inverse_form(curvature, block, shifted) for block in coupled_blocks(curvature, len(variables))]
+        return sympy.Add(*forms, -f.xreplace(origin))
+    solution = {x: _inverse_slope(system, slopes[i], x, duals[i], variables) for i, x in enumerate(variables)}
+    still, moving = f.as_independent(*variables, as_Add=True)
+    dual = sympy.Add(*(x * y for x, y in zip(solution.values(), duals, strict=True)), -moving.xreplace(solution))
+    positive = positive_parameters(system)
+    return sympy.simplify(dual.xreplace(positive)).xreplace({dummy: given for given, dummy in positive.items()}) - still
+
+
+def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
+    """Stand-ins for the parameters with positive default values, so that roots of their squares are taken."""
+    return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
+
+
+def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
+    """Half of y . C^-1 y over one block."""
+    if len(block) == 1:
+        (i,) = block
+        return y[i] ** 2 / (2 * curvature[i, i])
+    if len(block) > LARGEST_INVERSE:
+        raise SystemDefinitionError(
+            f"Legendre's transform couples {len(block)} variables: their quadratic form is not inverted symbolically. "
+            "Give both functions yourself, or use the system as it is"
+        )
+    size = len(block)
+    matrix = sympy.Matrix(size, size, lambda a, b: curvature.get((block[a], block[b]), 0))
+    adjugate, determinant = matrix.adjugate(), matrix.det(method="berkowitz")
+    terms = [adjugate[a, b] * y[i] * y[j] for a, i in enumerate(block) for b, j in enumerate(block)]
+    return sympy.Add(*terms) / (2 * determinant)
+
+
+def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]) -> Expr:
+    """The x with y = slope(x), the branch that holds at random points for parameters of the signs of their defaults."""
+    if slope.free_symbols & (set(variables) - {x}):
+        raise SystemDefinitionError(
+            f"Legendre's transform of '{system.name}' needs the solution of coupled equations that are not linear; "
+            "give the other function yourself, or use the system as it is"
+        )
+    positive = positive_parameters(system)
+    back = {dummy: symbol for symbol, dummy in positive.items()}
+    for root in _roots(slope.xreplace(positive) - y, x):
+        found = root.xreplace(back)
+        if unsupported_part(found) is None and _holds(system, found, slope, x, y):
+            return found
+    raise SystemDefinitionError(f"SymPy does not solve {y} = {slope} for {x}; give the other function yourself")
+
+
+def _roots(expression: Expr, x: Symbol) -> list[Expr]:
+    """What SymPy finds, without the formulas of Cardano and Ferrari, on which it would spend minutes; unchecked."""
+    try:
+        return list(sympy.solve(expression, x, check=False, simplify=False, cubics=False, quartics=False))
+    except (NotImplementedError, ArithmeticError, AttributeError, TypeError, ValueError, RecursionError):
+        return []
+
+
+def _holds(system: MechanicalSystem, root: Expr, slope: Expr, x: Symbol, y: Symbol) -> bool:
+    tried = 0
+    for point in sample_points([x], (*system.coordinates, system.time), system.constants):
+        try:
+            value = evaluate(slope, point)
+            again = evaluate(root, point | {y: value})
+        except ArithmeticError:
+            continue
+        tried += 1
+        if abs(again - point[x]) > NEGLIGIBLE * (1 + abs(point[x])):
+            return False
+    return tried > 0

@@ -1,0 +1,162 @@
+"""Ensembles whose inputs are data and whose steps choose their length: each trajectory its own steps, ends and inputs.
+
+Trajectories are those of :meth:`Stepper.drive`, bit for bit: steps of each end at all breakpoints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.driven import (
+    Input,
+    end_of,
+    ends_on_the_way,
+    entered,
+    parameters_at,
+    part_of_inputs,
+    stretches,
+)
+from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble, driven_start
+from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, LaneStates
+from scvi_codegen.runtime.ensemble_trajectory import OK, EnsembleTrajectory, Span
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs
+from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.portions import record
+from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.workers import Heed
+
+__all__ = ["DrivenToEnds", "driven_work"]
+
+
+def driven_work(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    *,
+    h: float | None,
+    steps: int | None,
+    t_end: ArrayLike | None,
+    tolerance: float | None,
+    t: float,
+    **others: Any,
+) -> DrivenEnsemble | DrivenToEnds:
+    """An ensemble with inputs as users ask for it: by steps of h, or to t_end by steps that choose their length."""
+    if h is not None:
+        if tolerance is not None:
+            raise StateError("a tolerance is for steps that choose their length: give t_end, and neither h nor steps")
+        if t_end is not None and np.ndim(t_end):
+            raise StateError("steps of h lead all trajectories to one t_end; leave out h for an end of each")
+        end = end_of(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))
+        return DrivenEnsemble.of(stepper, q, p, h=h, t_end=end, t=t, **others)
+    if t_end is None or steps is not None:
+        raise StateError(
+            "give h and steps or t_end, for steps of h, or t_end alone, for steps that choose their length"
+        )
+    return DrivenToEnds.of(stepper, q, p, t_end=t_end, tolerance=tolerance, t=t, **others)
+
+
+class DrivenToEnds(EnsembleToEnds):
+    """An ensemble with inputs, each trajectory by steps of its own; arguments as of :class:`EnsembleToEnds`."""
+
+    call: ClassVar[str] = "drive_ensemble"
+
+    def __init__(
+        self,
+        stepper: Integrator,
+        q: ArrayLike,
+        p: ArrayLike,
+        data: Mapping[str, Input],
+        *,
+        t_end: ArrayLike,
+        tolerance: float | None = None,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+    ) -> None:
+        self.data = data
+        super().__init__(
+            stepper,
+            q,
+            p,
+            t_end=t_end,
+            tolerance=tolerance,
+            every=every,
+            t=t,
+            parameters=parameters,
+            options=options,
+        )
+        for goal in self.goals:
+            ends_on_the_way(self.t0, goal.t_end, data)
+        self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        stepper: Integrator,
+        q: ArrayLike,
+        p: ArrayLike | None,
+        *,
+        inputs: Mapping[str, Any],
+        t_end: ArrayLike,
+        velocity: ArrayLike | None = None,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        **others: Any,
+    ) -> DrivenToEnds:
+        """From inputs and initial states as users give them."""
+        towards = float(real_array(t_end, "t_end").flat[0])
+        data, p, start = driven_start(stepper, q, p, velocity, inputs, (t, towards), parameters)
+        return cls(stepper, q, p, data, t=t, t_end=t_end, parameters=start, **others)
+
+    def part(self, part: slice) -> dict[str, object]:
+        """Arguments by name that make the ensemble of a part of the trajectories."""
+        found = super().part(part) | {"inputs": part_of_inputs(self.data, part)}
+        del found["t_eval"]
+        return found
+
+    def _values(self, j: int, t: float) -> Array:
+        """Parameters of trajectory j in the pieces in which a time lies."""
+        found: Array = parameters_at(self.stepper.parameters, self.parameters, self.data, t, slice(j, j + 1))[0]
+        return found
+
+    def _first_parameters(self, j: int) -> Array:
+        return self._values(j, entered(self.t0, self.goals[j].t_end))
+
+    def _states(self, j: int, run: Memory, heed: Heed) -> tuple[LaneStates, str]:
+        pieces: list[Trajectory] = []
+        try:
+            way = stretches(run, self.data, self.goals[j].t_end, partial(self._values, j))
+            pieces.extend(record(run, steps, every=self.every, progress=heed) for steps in way)
+        except StepFailedError as failure:
+            return DrivenTrajectory((*pieces, Trajectory.before(failure))), failure.status
+        return DrivenTrajectory(tuple(pieces or [record(run, 0)])), OK
+
+    def result(self) -> EnsembleTrajectory:
+        """With the parameters of each piece for the states in it; one at a breakpoint belongs to the piece before."""
+        found = super().result()
+        return replace(found, spans=tuple(span for j in range(len(self)) for span in self._spans(j, found)))
+
+    def _spans(self, j: int, found: EnsembleTrajectory) -> Iterator[Span]:
+        """Of the states of one trajectory."""
+        assert found.times is not None
+        t, goal = found.times[:, j], self.goals[j].t_end
+        forward = -1.0 if goal < self.t0 else 1.0
+        ends = ends_on_the_way(self.t0, goal, self.data) or [goal]
+        last = np.searchsorted(forward * t[np.isfinite(t)], forward * np.array(ends), side="right").tolist()
+        for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
+            values = partial(parameters_at, self.stepper.parameters, self.parameters, self.data, (start + end) / 2)
+            yield slice(first, until), slice(j, j + 1), values
