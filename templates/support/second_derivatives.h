@@ -107,7 +107,7 @@ static const real *bend_family(const point_family *f, const linearised_step *at,
   arguments_wide(f, h, 0, slopes, to->change, to->dz, to->moved);
   multiply_wide(f, 0, slope, to->moved, to->moved + first);
   given_wide(f, 0, by_h, given, to->change, to->moved + first);
-  scatter_wide(f, h, 1, 0, to->pulled + first, at->rows);
+  scatter_wide(f, h, at->growth, 1, 0, to->pulled + first, at->rows);
   multiply_wide(f, 1, slope, to->pulled, to->pulled + first);
   if (f->curvature)
     arguments_of(f, at->step, at->data.z, to->u);
@@ -197,7 +197,7 @@ int NAME(bend)(long long steps, const real *t, const real *h, const real *q, con
   memset(report, 0, sizeof *report);
   for (long long k = steps - 1; k >= 0; k--) {
     const step_data step = {t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace, 1, NULL};
-    const linearised_step at = linearised_in(&step, workspace);
+    linearised_step at = linearised_in(&step, workspace);
     int status;
     report->t = t[k];
     status = linearise_step(&at, options ? options : &standard, NULL, NULL, report);

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from samples import QUICK_FLAGS
+from samples import QUICK_FLAGS, damped_pendulum
 
 from scvi_codegen import SVI, LagrangianSystem, MethodError, StateError, compile_stepper, problem, reparametrise
 
@@ -143,3 +143,10 @@ def test_what_has_no_hessian(stepper):
     clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4), flags=QUICK_FLAGS)
     with pytest.raises(MethodError, match="no derivatives"):
         clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).hessian_product(np.ones((4, 4)), np.ones(4))
+
+
+def test_of_damped_systems_there_are_first_derivatives_alone():
+    run = compile_stepper(damped_pendulum(), "svi:2").integrate([1.0], [0.0], h=0.1, steps=3)
+    assert run.tangent([1.0, 0.0]).shape == (4, 2)
+    with pytest.raises(MethodError, match="of systems with damping there are first derivatives alone"):
+        run.hessian_product(np.ones((4, 2)), np.ones((2, 1)))
