@@ -136,19 +136,21 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
     if isinstance(shape, Velocities) and 1 < len(shape.blocks) == len(set(shape.blocks)) and _moves(stages, shape):
         degree = len(shape.blocks) - 1
-        highest = tuple((4 * degree - 2) * x for x in legendre_functional(shape.blocks, degree))
-        highest += (mp.zero,) * (count - len(highest))
+        coefficients = {k: legendre_functional(shape.blocks, k) for k in (degree, degree - 1)}
+        first, tops = 0, [tuple(max(4 * k - 2, 0) * x for x in line) for k, line in coefficients.items()]
         bends = [(0, degree), (0, (degree + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
         power = 2 * degree
     elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):
         c, size = shape.tableau.c, len(shape.tableau.c)
-        highest = (mp.zero, *legendre_functional(c, size - 1), *(mp.zero,) * (count - 1 - size))
+        first, tops = 1, [legendre_functional(c, k) for k in (size - 1, size - 2)]
         rows = [tuple(mp.mpf(b == only) for b in range(count)) for only in (1, size)]
         power = 2 * size
     else:
         return None
-    return StageCurve(highest=lower_vector(highest), bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
+    before, behind = (mp.zero,) * first, (mp.zero,) * (count - first - len(tops[0]))
+    highest, below = (lower_vector((*before, *top, *behind)) for top in tops)
+    return StageCurve(highest=highest, next=below, bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
 
 
 def _moves(stages: StageSystem, shape: Velocities) -> bool:

@@ -11,7 +11,7 @@ enum {
 #define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
 #define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
-#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
+#define ROUNDOFF_ERROR (REAL(0.0625) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
 #define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: less is rounding */
 #define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
 
@@ -19,12 +19,14 @@ enum {
  * `few`, two below `fewer`. */
 typedef struct {
   real most, few, fewer;
+  real decay; /* from a coefficient of a curve to the next, where its error is just allowed */
 } error_limits;
 
 static error_limits limits_of(real tolerance)
 {
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
-  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH)};
+  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
+      MATH(exp2)(MATH(log2)(most) / (OCTAVE * MATH(log2)(GROWTH) - 2))};
   return limits;
 }
 
@@ -78,7 +80,8 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->step.h = now->last ? rest : MATH(copysign)(length, rest);
     prepare(&now->step, &now->data);
   }
-  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, least, options, report);
+  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, now->limits.decay, least,
+      options, report);
 }
 
 /* By how many rungs the first step may be longer at once. */
