@@ -2,7 +2,8 @@
  * stage_error.h; their powers make the errors of one those of the other. */
 static SELDOM double fallback_error(const run_memory *run, const step_data *step, const double *dq, double *workspace)
 {
-  return larger(run->error, pow(stage_error(step, newton_in(workspace).z, dq, ALL, DECAY, 0.0), STAGE_POWER / ERROR_POWER));
+  const double error = stage_error(step, newton_in(workspace).z, dq, ALL, DECAY, 0.0);
+  return larger(run->error, pow(error, STAGE_POWER / ERROR_POWER));
 }
 
 static double largest_error(const run_memory *run, const step_data *step, const solver_data *data, const double *dq,
