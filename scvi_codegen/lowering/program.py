@@ -154,9 +154,9 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
 
 
 def _moves(stages: StageSystem, shape: Velocities) -> bool:
-    """Whether the velocities, the first blocks, are all that moves positions, and momenta are no unknowns."""
+    """Whether the velocities, the first blocks, are all that moves positions."""
     own = len(shape.blocks)
-    return all(block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks))
+    return all(block.moves == (b < own) for b, block in enumerate(stages.blocks))
 
 
 def _distinct(points: Vector) -> bool:

@@ -51,6 +51,15 @@ def test_no_phase_of_a_motion_hides_its_error(name, method):
     check_all_phases(SYSTEMS[name], method)
 
 
+def test_where_momenta_are_unknowns_newtons_iteration_estimates_as_sweeps_do():
+    vortices = sc.problem("point-vortices")
+    steppers = [sc.compile_stepper(vortices.system, sc.SVI(4), solver=each) for each in ("auto", "newton")]
+    errors = [each.integrate(vortices.q, vortices.p, h=0.1, steps=1).step_error for each in steppers]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+    with pytest.warns(sc.AccuracyWarning, match="too long"):
+        assert steppers[0].integrate(vortices.q, vortices.p, h=0.5, steps=50).step_error > 1e-3  # sweeps fail there
+
+
 @pytest.mark.parametrize("method", [sc.SVI(4), sc.SCVI(3), sc.Gauss(4)])
 def test_nor_of_a_step_by_newtons_iteration(method):
     check_all_phases(SYSTEMS["quartic"], method, "newton")
