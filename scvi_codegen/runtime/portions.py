@@ -16,7 +16,7 @@ from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.stalling import Pace, lost_level
+from scvi_codegen.runtime.stalling import Watch, lost_level
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -95,7 +95,7 @@ def record_until(
     every = checked_count(every, "every", least=1)
     pieces = [_Piece.of(memory)]
     done, portion = 0, 256 * every
-    pace = Pace(memory.stepper, memory.goal.t_end if memory.goal and memory.goal.tau else None)
+    watch = Watch(memory.stepper, memory.goal.t_end if memory.goal and memory.goal.tau else None)
     while not memory.arrived and (steps is None or done < steps):
         size, began, before = portion if steps is None else min(portion, steps - done), time.perf_counter(), memory.t
         piece = _Piece.empty(memory, size // every + 2)
@@ -104,7 +104,7 @@ def record_until(
         done += report.steps
         if status:
             raise step_failure(status, report, step=memory.steps, h=memory.h, kept=_joined(memory, pieces, every))
-        if failure := pace.halt(before, memory.t, report.steps, memory.steps):
+        if failure := watch.halt(before, memory.t, report.steps, memory.steps):
             failure.trajectory = _joined(memory, pieces, every)
             raise failure
         if progress is not None:

@@ -14,7 +14,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Pace", "lost_level"]
+__all__ = ["Watch", "lost_level"]
 
 MOST_STEPS: Final = 1e9
 """That a run may still take, at its present pace, if that has become a millionth of what it was."""
@@ -27,8 +27,8 @@ LOST: Final = 1e-3
 """Of the energy: nothing conserves it where rounding is all that is left of g (H - E)."""
 
 
-class Pace:
-    """How much time the steps of a run take on; ``end``: where a monitor leads it, or ``None`` for other runs."""
+class Watch:
+    """Over how much time the steps of a run take on; ``end``: where a monitor leads it, or ``None`` for other runs."""
 
     def __init__(self, stepper: Integrator, end: float | None) -> None:
         self.stepper, self.end, self.best, self.slow = stepper, end, 0.0, 0
