@@ -11,7 +11,7 @@ enum {
 #define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
 #define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
-#define ROUNDOFF_ERROR (REAL(0.0625) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
+#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
 #define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: less is rounding */
 #define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
 
