@@ -44,12 +44,16 @@ from scvi_codegen.frameworks.optimal_control import optimal_control as optimal_c
 from scvi_codegen.frameworks.rebound import GravitatingBodies as GravitatingBodies
 from scvi_codegen.frameworks.rebound import from_rebound as from_rebound
 from scvi_codegen.frameworks.rebound import to_rebound as to_rebound
+from scvi_codegen.frameworks.torch import TorchFlow as TorchFlow
+from scvi_codegen.frameworks.torch import torch_flow as torch_flow
 from scvi_codegen.indexed_compiler import compile_indexed as compile_indexed
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
 from scvi_codegen.mechanics.indexed.expansion import expand_sums as expand_sums
+from scvi_codegen.mechanics.indexed.gathering import GatheredSums as GatheredSums
+from scvi_codegen.mechanics.indexed.gathering import gather_sums as gather_sums
 from scvi_codegen.mechanics.indexed.system import IndexedSystem as IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise
@@ -71,6 +75,7 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
+from scvi_codegen.models.fmu import generate_fmu as generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel as IndexedModel
 from scvi_codegen.models.model import Model as Model
 from scvi_codegen.models.model_file import load_indexed_model as load_indexed_model

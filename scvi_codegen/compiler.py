@@ -16,7 +16,8 @@
 Beside the way: :func:`scvi_codegen.derivation.equations.derive` writes the equations out as the paper prints them, and
 :func:`scvi_codegen.exact.step.derived_step` solves them in 60 digits; both read a ``StageSystem`` of their own.
 :mod:`scvi_codegen.frameworks` puts many steps and their derivatives behind the C text that has those of one step, for
-JAX and CasADi, and :func:`scvi_codegen.frameworks.casadi_step.casadi_step` a ``StageSystem`` as equations into CasADi.
+JAX, PyTorch and CasADi, and :func:`scvi_codegen.frameworks.casadi_step.casadi_step` a ``StageSystem`` as equations into
+CasADi.
 
 Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
 kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so the second time is quick.
@@ -122,6 +123,7 @@ def compile_stepper(
         controlled=texts.remembered("controlled", texts.controlled),
         fallback=texts.remembered("fallback", texts.fallback),
         tangent=texts.remembered("tangent", texts.tangent),
+        curvature=texts.remembered("curvature", partial(texts.tangent, second=True)),
         changes=lambda count: texts.remembered(f"changes {count}", partial(texts.changes, count))(),
         flags=flags,
         events=as_events(events),
@@ -171,15 +173,15 @@ class _Texts:
         """With Newton's iteration, where the text itself borrows it."""
         return render(self.program(fallback=True), fallback="lent") if self.borrows else None
 
-    def tangent(self) -> Source | None:
-        """With derivatives of steps by all they start from; none in transformed time."""
+    def tangent(self, *, second: bool = False) -> Source | None:
+        """With derivatives of steps by all they start from, the second ones, too; none in transformed time."""
         if self.system.integrands:
             return None
         found = self.program(fallback=True)
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
-        return render_derivatives(derivatives_of(self.system, stages, found))
+        return render_derivatives(derivatives_of(self.system, stages, found, second=second))
 
     def changes(self, count: int) -> Source | None:
         """With small changes beside each of many trajectories, where their equations are sums of forces, too."""

@@ -10,9 +10,15 @@ Neither the length of the text nor the time to compile it depends on the number 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+
 from scvi_codegen.compiler import c_identifier
+from scvi_codegen.errors import MethodError
+from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.kinds import TEXT, TEXTS, takes
-from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate, with_control
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods import as_method
@@ -28,11 +34,15 @@ from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 __all__ = ["compile_indexed", "generate_indexed"]
 
 
-@takes(system=INDEXED, flags=TEXTS, prefix=TEXT)
+SOLVERS = ("fixed-point", "newton")
+
+
+@takes(system=INDEXED, flags=TEXTS, prefix=TEXT, solver=TEXT)
 def compile_indexed(
     system: IndexedSystem,
     method: Method | str,
     *,
+    solver: str = "fixed-point",
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
 ) -> IndexedStepper:
@@ -42,35 +52,70 @@ def compile_indexed(
         system: what moves.
         method: how its motion is discretised, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods, and
             those whose equations sweeps over positions solve: SVI, SC, Runge-Kutta.
+        solver: of the equations of a step: ``"fixed-point"``, sweeps, or ``"newton"`` for stiff systems: Newton's
+            iteration, its linear systems by GMRES from products with the derivatives of the forces alone.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 
     Raises:
         BuildError: if there is no C compiler.
-        MethodError: for a method without such sweeps.
+        MethodError: for a method without such sweeps, and a solver that it does not have.
     """
-    return IndexedStepper(*generate_indexed(system, method, prefix=prefix), flags=flags)
+    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
+    return IndexedStepper(texts.plain, texts.interface, controlled=lambda: texts.controlled, flags=flags)
 
 
 def generate_indexed(
-    system: IndexedSystem, method: Method | str, *, prefix: str | None = None
+    system: IndexedSystem, method: Method | str, *, solver: str = "fixed-point", prefix: str | None = None
 ) -> tuple[Source, IndexedInterface]:
     """The C text, and what a caller must know of it; arguments and errors as of :func:`compile_indexed`."""
-    one = one_coordinate(system)
-    chosen = as_method(method, one)
-    name = c_identifier(prefix or f"{system.name}_{chosen.name}")
-
-    def text() -> str:
-        with waiting_for(f"deriving the equations of {system.name} by {chosen.name}"):
-            return render_indexed(lower_indexed(system, chosen, name)).to_json()
-
-    source = Source.from_json(remembered_text((*system.key(), *chosen.key(), name, "indexed"), text))
-    return source, _interface(system, chosen, source)
+    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
+    return texts.plain, texts.interface
 
 
-def _interface(system: IndexedSystem, method: Method, source: Source) -> IndexedInterface:
+class _IndexedTexts:
+    """The texts of one integrator; equations are derived when one of them is first made."""
+
+    def __init__(self, system: IndexedSystem, method: Method, prefix: str | None, solver: str) -> None:
+        if solver not in SOLVERS:
+            raise MethodError(f"the solver of sums over indices is {' or '.join(SOLVERS)}, not {solver!r}")
+        self.system, self.method, self.solver = system, method, solver
+        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
+
+    @property
+    def interface(self) -> IndexedInterface:
+        """What a caller must know."""
+        return replace(_interface(self.system, self.method, self.prefix), solver=self.solver)
+
+    @cached_property
+    def program(self) -> IndexedProgram:
+        """Without steps that choose their length."""
+        with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
+            return lower_indexed(self.system, self.method, self.prefix, newton=self.solver == "newton")
+
+    @cached_property
+    def plain(self) -> Source:
+        """The text by steps of one length."""
+        return Source.from_json(self._remembered("indexed", lambda: render_indexed(self.program).to_json()))
+
+    @cached_property
+    def controlled(self) -> Source | None:
+        """The text with steps that choose their length, if a curve tells their error."""
+
+        def text() -> str:
+            program = with_control(self.program)
+            return render_indexed(program).to_json() if program else ""
+
+        found = self._remembered("indexed controlled", text)
+        return Source.from_json(found) if found else None
+
+    def _remembered(self, what: str, make: Callable[[], str]) -> str:
+        return remembered_text((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
+
+
+def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInterface:
     return IndexedInterface(
-        prefix=source.prefix,
+        prefix=prefix,
         title=f"{system.name}: {method.title}",
         system=system.name,
         method=method.name,
@@ -85,4 +130,5 @@ def _interface(system: IndexedSystem, method: Method, source: Source) -> Indexed
         maps=momentum_maps(system),
         accesses=system.accesses,
         depends_on_time=system.depends_on_time,
+        inputs=system.inputs,
     )

@@ -112,7 +112,7 @@ def ladder(counts: Sequence[int] = (3,)) -> Iterator[Model]:
     zonal = {n: constant(f"J{n}E") for n in (2, 3, 4)}
     earth = figures.zonal("earth", ("moon", "sun"), figures.of_the_earth(century), ephemeris.EARTH_RADIUS, zonal)
     yield (model := model.with_term("+ the Earth's J2, J3, J4", earth))
-    axes = figures.of_the_moon(century, turn=TURN)
+    axes = figures.of_the_moon(century, turn=f"({TURN} - {libration.DRIFT!r}*t)")
     moon = figures.moon(*axes, ephemeris.MOON_RADIUS, constant("J2M"), constant("C22M"))
     turning = figures.turning_moon(ephemeris.MOON_RADIUS, 4.0 * constant("C22M") / constant("LGAM"))
     yield (model := model.with_term("+ the Moon's J2, C22, libration", f"{moon} + {turning}"))

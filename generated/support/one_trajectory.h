@@ -26,11 +26,6 @@ static inline coordinates *kept(history past, coordinates *own)
   return own;
 }
 
-/* Tables that continue what is kept at the points: from the last step, or from the last and the one before. */
-struct guess_tables {
-  const lanes *alone, *last, *before;
-};
-
 /* What is kept at the points, continued into this step from the last one or from the last two. */
 static inline void continue_curve(const step_data *step, const double *past, long long steps, lanes (*x)[M])
 {

@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.curves import Point, time_at
+from scvi_codegen.benchmark.machine_limits import machine_limits
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.indexed_compiler import compile_indexed
@@ -27,7 +28,7 @@ from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import unwarned
 
-__all__ = ["Lattice", "ring", "run_growth", "run_sums"]
+__all__ = ["Lattice", "field", "ring", "run_growth", "run_sums"]
 
 ERRORS = (1e-4, 1e-7, 1e-10)
 OWN = "composition"
@@ -38,6 +39,8 @@ DECLARATIONS = (
     "const double *kicks, const double *drifts, int leaps);"
 )
 GROWTH = (10**3, 10**4, 10**5, 10**6)
+SIDE = 512
+"""Of the field."""
 SEED = 20261121
 PATIENCE = 0.3
 """Seconds beyond which a setting is timed twice only."""
@@ -314,35 +317,44 @@ def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], 
 @unwarned()
 def run_growth(plan: Plan, say: Say) -> ResultTable:
     """Time to the first step, and time and memory a step, by the number of coordinates."""
-    rows = list(_growth(plan, say))
+    rows, (memory, arithmetic) = list(_growth(plan, say)), machine_limits()
     return ResultTable(
         name="growth",
-        title="one library for any number of coordinates: a ring, h = 0.1, a process each with an empty cache",
+        title="one library for any number of coordinates: h = 0.1 (field: 0.03), a process each with an empty cache",
         columns={
+            "problem": "",
             "by": "",
             "coordinates": "d",
             "first_step_s": ".2f",
             "ns_a_coordinate_and_step": ".1f",
             "sweeps": ".2f",
             "gflops": ".2f",
+            "gigabytes_s": ".1f",
             "memory_mb": ".0f",
         },
         rows=tuple(rows),
-        remarks=("first step: from text; gflops: of the kernel and of the tables, in sweeps; memory: of the process.",),
+        remarks=(
+            "first step: from text; gflops: of the kernel and of the tables, in sweeps; gigabytes: what these read and",
+            "write of arrays; memory: of the process. One core of this machine, at most: multiply-adds in registers",
+            f"{arithmetic:.0f} GFLOP/s, STREAM's triad {memory:.1f} GB/s.",
+        ),
     )
 
 
 def _growth(plan: Plan, say: Say) -> Iterator[dict[str, Any]]:
+    sizes = [("ring", count) for count in GROWTH[: 2 if plan.quick else None]]
+    sizes.append(("field", 16 if plan.quick else SIDE))
     for method in ("svi:4", "svi:8", "stoermer-verlet"):
-        for count in GROWTH[: 2 if plan.quick else None]:
-            say(f"growth: {count} coordinates by {method}")
+        for name, size in sizes:
+            count = size * size if name == "field" else size
+            say(f"growth: {name} of {count} coordinates by {method}")
             with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
                 environment = os.environ | {building.CACHE_VARIABLE: folder}
-                command = [sys.executable, "-m", "scvi_codegen.benchmark.contenders.one_size", method, str(count)]
+                command = [sys.executable, "-m", "scvi_codegen.benchmark.contenders.one_size", method, name, str(size)]
                 run = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
-            yield {"by": f"{OURS} {method}", "coordinates": count} | _numbers(run.stdout.split())
+            yield {"problem": name, "by": f"{OURS} {method}", "coordinates": count} | _numbers(run.stdout.split())
 
 
 def _numbers(found: Sequence[str]) -> dict[str, float]:
-    names = ("first_step_s", "ns_a_coordinate_and_step", "sweeps", "gflops", "memory_mb")
+    names = ("first_step_s", "ns_a_coordinate_and_step", "sweeps", "gflops", "gigabytes_s", "memory_mb")
     return dict(zip(names, map(float, found), strict=True))

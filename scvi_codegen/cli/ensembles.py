@@ -63,14 +63,12 @@ def integrate_states(
     check_memory(model, len(states))
     stepper = model.stepper(solver=solver)
     work = _work(model, stepper, states, options)
-    started, shown, interrupted = time.perf_counter(), 0, False
+    started, interrupted = time.perf_counter(), False
     length = work.length
-    with interruptions() as caught, progress_bar(length) as advance:
+    with interruptions() as caught, progress_bar(length) as reach:
 
         def look(done: int) -> None:
-            nonlocal shown
-            advance(done - shown)
-            shown = done
+            reach(done)
             if caught and done < length:
                 raise _Stop
 

@@ -42,9 +42,9 @@ def interruptions() -> Iterator[list[int]]:
 
 @contextlib.contextmanager
 def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr if that is a terminal; the function given adds steps done."""
+    """A bar on stderr if that is a terminal; the function given is told how many steps are done in all."""
     if not sys.stderr.isatty() or steps == 0:
-        yield lambda count: None
+        yield lambda done: None
         return
     with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:
-        yield bar.update
+        yield lambda done: bar.update(done - bar.pos)

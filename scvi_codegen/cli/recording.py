@@ -168,16 +168,16 @@ class Recording:
         """With a progress bar, ended by Ctrl-C or SIGTERM at a state that is written."""
         pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
         settings |= {name: value for name, value in pace.items() if value is not None}
-        folder, failure, began, shown = arguments[-1], None, time.perf_counter(), first
-        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as advance:
-
-            def look(done: int) -> None:
-                nonlocal shown
-                advance(done - shown)
-                shown = done
-
+        folder, failure, began = arguments[-1], None, time.perf_counter()
+        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as reach:
             try:
-                act(*arguments, steps=steps, progress=look, stop=lambda: bool(caught), **settings)
+                act(
+                    *arguments,
+                    steps=steps,
+                    progress=lambda done: reach(done - first),
+                    stop=lambda: bool(caught),
+                    **settings,
+                )
             except StepFailedError as error:
                 failure = error
         recorded = load_run(folder)

@@ -90,8 +90,8 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     if model.system.clock is not None and model.ends_at_time:
         return _by_clock(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
-    with interruptions() as caught, progress_bar(_length(model)) as advance:
-        work, pieces = _Portions(model, run, caught, advance), []
+    with interruptions() as caught, progress_bar(_length(model)) as reach:
+        work, pieces = _Portions(model, run, caught, reach), []
         for steps in model.stretches(run):
             pieces.append(work.stretch(steps))
             if work.failure is not None or work.stopped:
@@ -118,8 +118,8 @@ class _Portions:
         stopped: whether a signal came first.
     """
 
-    def __init__(self, model: Model, run: Run, caught: Sequence[int], advance: Callable[[int], None]) -> None:
-        self.model, self.run, self.caught, self.advance = model, run, caught, advance
+    def __init__(self, model: Model, run: Run, caught: Sequence[int], reach: Callable[[int], None]) -> None:
+        self.model, self.run, self.caught, self.reach = model, run, caught, reach
         self.size, self.seconds, self.stopped = 1, 0.0, False
         self.failure: StepFailedError | None = None
 
@@ -137,14 +137,14 @@ class _Portions:
 
     def _portion(self, steps: int) -> Trajectory:
         model, run = self.model, self.run
-        before, began = _reached(model, run), time.perf_counter()
+        began = time.perf_counter()
         try:
             piece = run.record(steps, every=model.every)
         except StepFailedError as error:
             self.failure, piece = error, Trajectory.before(error)
         elapsed = time.perf_counter() - began
         self.seconds += elapsed
-        self.advance(_reached(model, run) - before)
+        self.reach(_reached(model, run))
         check_room(model, run.steps)
         self.size = max(1, int(self.size * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
         return piece
@@ -152,16 +152,13 @@ class _Portions:
 
 def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
     """A run of steps of tau to the end of the model's span of time."""
-    end, began, failure, shown = model.t + model.covered, time.perf_counter(), None, 0
+    end, began, failure = model.t + model.covered, time.perf_counter(), None
     observed = Observation(run, every=model.every, end=end)
-    with interruptions() as caught, progress_bar(PARTS) as advance:
+    with interruptions() as caught, progress_bar(PARTS) as reach:
 
         def look(_: int) -> None:
-            nonlocal shown
             check_room(model, run.steps)
-            done = min(PARTS, int(PARTS * (run.t - model.t) / model.covered))
-            advance(done - shown)
-            shown = done
+            reach(min(PARTS, int(PARTS * (run.t - model.t) / model.covered)))
 
         try:
             trajectory = observed.advance(None, look, lambda: bool(caught))

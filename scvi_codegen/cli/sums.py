@@ -78,18 +78,12 @@ def _integrate(model: IndexedModel, options: SolverOptions | None) -> SumsOutcom
     steps, began = model.step_count, time.perf_counter()
     check_states(sum(np.size(values) for values in model.q.values()), steps, model.every)
     stepper = model.stepper()
-    run, failure, done = model.start(stepper, options=options), None, 0
+    run, failure = model.start(stepper, options=options), None
     preparation, began = time.perf_counter() - began, time.perf_counter()
     record = IndexedRecord(run)
-    with interruptions() as caught, progress_bar(steps) as advance:
-
-        def look(count: int) -> None:
-            nonlocal done
-            advance(count - done)
-            done = count
-
+    with interruptions() as caught, progress_bar(steps) as reach:
         try:
-            record.follow(steps, model.every, progress=look, stop=lambda: bool(caught))
+            record.follow(steps, model.every, progress=reach, stop=lambda: bool(caught))
         except StepFailedError as error:
             failure = error
     return SumsOutcome(

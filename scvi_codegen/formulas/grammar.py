@@ -35,7 +35,7 @@ from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 
 __all__ = ["Parser", "Token", "parse_expression", "parsed"]
 
-MAX_CHARACTERS = 400_000
+MAX_CHARACTERS = 1_000_000
 """Reading takes time in proportion to the length times the depth of brackets: fifty atoms in a gas are 212 000 long."""
 MAX_DEPTH = 100
 

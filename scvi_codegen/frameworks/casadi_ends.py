@@ -13,6 +13,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
+from scvi_codegen.mechanics.constraints import constraint_rates, positions_held
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.inputs import input_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -49,6 +50,18 @@ class Ends:
         if any(each.free_symbols - {*self.symbols} for each in bound):
             raise MethodError("momenta depend on an input, and would jump where it does: let inputs be forces")
         return self._function(bound)
+
+    @cached_property
+    def held(self) -> Any:
+        """What vanishes at a state on the constraints: their g of positions, and what they say of velocities.
+
+        Raises:
+            MethodError: where they have an input in them.
+        """
+        found = [each for each in (*positions_held(self.system), *constraint_rates(self.system)) if each != 0]
+        if any(each.free_symbols - {*self.symbols} for each in found):
+            raise MethodError("a constraint has an input in it, and would jump where it does: let inputs be forces")
+        return self._function(found)
 
     def momentum(self, q: Any, v: Any, t: Any, parameters: Any) -> Any:
         """P of a velocity: exact unless H is not quadratic in p, when it is a first guess."""

@@ -26,6 +26,9 @@ from scvi_codegen.runtime.inputs import Array
 
 __all__ = ["Conditions", "Task", "check_known", "interval"]
 
+ZERO = 1e-16
+"""Beside the largest of a coordinate or momentum along the motion: rounding, of which constraints would be asked."""
+
 Conditions = Mapping[str, Any]
 """Formulas, and the number that each is, or the least and the largest, ``None`` where there is none."""
 
@@ -75,6 +78,7 @@ class Task:
             constraints=[
                 (states[:, 1:] - ca.vertcat(q1, p1), 0.0, 0.0),
                 (residual, 0.0, 0.0),
+                *([(self.ends.held(*first), 0.0, 0.0)] if self.system.constraints else []),
                 *self._at_end(first, self.start),
                 *self._at_end(last, self.end),
                 *((along[row, :], *self.between[text]) for row, text in enumerate(self.between, 1)),
@@ -138,12 +142,14 @@ class Task:
         """What was found, with the multipliers of the steps' equations as slopes of the cost."""
         m, n = self.system.dimension, self.steps
         values = program.split(found["x"])
+        states = values["states"]
+        states[np.abs(states) < ZERO * np.abs(states).max(axis=1, keepdims=True)] = 0.0
         slopes = -np.asarray(found["lam_g"]).ravel()[: 2 * m * n].reshape(n, 2 * m)
         inputs = values["inputs"].reshape(len(self.system.inputs), n, self.degree + 1)
         return ControlledMotion(
             t=self.t + np.linspace(0.0, values["duration"].item(), n + 1),
-            q=values["states"][:m].T,
-            p=values["states"][m:].T,
+            q=states[:m].T,
+            p=states[m:].T,
             coefficients=dict(zip(self.system.inputs, inputs, strict=True)),
             coordinates=tuple(each.name for each in self.system.coordinates),
             cost=float(found["f"]),

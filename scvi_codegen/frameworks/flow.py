@@ -69,6 +69,14 @@ class Flow:
         assert source is not None
         return source
 
+    @property
+    def second_derivatives(self) -> Source:
+        """The same with second derivatives; MethodError where there are none."""
+        self.stepper.curvature  # noqa: B018
+        source = self.stepper.second_derivatives
+        assert source is not None
+        return source
+
     def parameter_values(self, parameters: Any) -> Any:
         """All in order: a list of numbers and whatever stood in a mapping, or, not given by name, as they are.
 

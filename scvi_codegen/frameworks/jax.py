@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -9,7 +10,8 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import Flow, imported
 from scvi_codegen.kinds import of, takes
 from scvi_codegen.native import building
-from scvi_codegen.rendering.flow import XLA_PARTS, with_xla_flow
+from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND, with_xla_flow
+from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["JaxFlow", "jax_flow"]
@@ -24,7 +26,8 @@ def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFl
     It is compiled C that XLA calls itself, without Python: ``jit``, ``vmap``, ``grad``, ``jvp``, ``vjp``, ``jacfwd``
     and ``jacrev`` apply, in any order, on processors (not on GPUs) and in binary64 (``jax_enable_x64``). Derivatives
     are exact, those of the computed map: forward by the linearised steps, back by their transpose; both take memory
-    for all states of one trajectory. There are no second ones.
+    for all states of one trajectory. Second ones are those of ``jax.hessian``, ``jacfwd`` or ``jacrev`` of a gradient
+    or of ``jacrev``; there are none forward of forward.
 
     Args:
         stepper: system and method.
@@ -79,15 +82,29 @@ class JaxFlow(Flow):
     @cached_property
     def _target(self) -> str:
         """The name under which XLA knows the C functions, compiled and registered when first asked for."""
-        import jax
         import jaxlib
 
-        source = with_xla_flow(self.derivatives, jaxlib.__version__)
+        from scvi_codegen.frameworks.jax_primitives import SECOND
+
+        name = self._registered(with_xla_flow(self.derivatives, jaxlib.__version__), XLA_PARTS)
+        SECOND[name] = lambda: self._second_target
+        return name
+
+    @cached_property
+    def _second_target(self) -> str:
+        """The same of second derivatives, which are derived when JAX first asks for them."""
+        import jaxlib
+
+        return self._registered(with_xla_flow(self.second_derivatives, jaxlib.__version__, second=True), [XLA_SECOND])
+
+    def _registered(self, source: Source, parts: Sequence[str]) -> str:
+        import jax
+
         flags = (*self.stepper.flags, f"-I{jax.ffi.include_dir()}")
         name = f"scvi_{building.fingerprint(source, flags=flags)}"
         if name not in _registered:
             library = building.load(source, flags=flags)
-            for part in XLA_PARTS:
+            for part in parts:
                 function = getattr(library.lib, f"{source.prefix}_xla_{part}")
                 address = int(library.ffi.cast("uintptr_t", function))
                 jax.ffi.register_ffi_target(f"{name}_{part}", jax.ffi.pycapsule(address), platform="cpu")

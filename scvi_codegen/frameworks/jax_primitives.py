@@ -1,8 +1,9 @@
-"""The flow of JAX: three primitives that XLA calls in C, and the rules by which JAX transforms them.
+"""The flow of JAX: four primitives that XLA calls in C, and the rules by which JAX transforms them.
 
 ``states`` has the values; ``push``, linear in its second argument, is the derivative applied to changes, and ``pull``
-its transpose applied to slopes. Changes and slopes have an axis of their own, of those that share a trajectory: the
-steps are then linearised once for all of them, so that a Jacobian costs far less than its columns one by one.
+its transpose applied to slopes; ``bend``, linear in slopes and in changes, is how ``pull`` changes with the start.
+Changes and slopes have an axis of their own, of those that share a trajectory: the steps are then linearised once for
+all of them, so that a Jacobian costs far less than its columns one by one.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from scvi_codegen.errors import MethodError
 __all__ = ["states_along"]
 
 STATIC = ("target", "steps", "every", "size")
+SECOND: dict[str, Callable[[], str]] = {}
+"""By the name of a target, what gives that of the one with second derivatives."""
 
 
 def states_along(x: Any, *, target: str, steps: int, every: int, size: int) -> Any:
@@ -61,24 +64,31 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
     """Each with a trajectory of its own, or all that share one beside each other."""
 
     def batched(arguments: Sequence[Any], axes: Sequence[Any], **static: Any) -> tuple[Any, int]:
-        (x, given), (of_x, of_given) = arguments, axes
-        if of_x is not None:
-            x = jnp.moveaxis(x, of_x, 0)
-            shape = (len(x), *given.shape)
-            own = jnp.broadcast_to(given, shape) if of_given is None else jnp.moveaxis(given, of_given, 0)
-            return primitive().bind(x, own, **static), 0
-        at = x.ndim - 1
-        given = jnp.moveaxis(given, of_given, at)
-        beside = given.reshape(*given.shape[:at], -1, *given.shape[at + 2 :])
-        found = primitive().bind(x, beside, **static)
-        return found.reshape(*given.shape[: at + 2], *found.shape[at + 1 :]), at
+        count = next(each.shape[axis] for each, axis in zip(arguments, axes, strict=True) if axis is not None)
+        place = arguments[0].ndim - 1 if axes[0] is None else 0
+        x = arguments[0] if axes[0] is None else jnp.moveaxis(arguments[0], axes[0], 0)
+        given = [
+            _repeated(each, count, place) if axis is None else jnp.moveaxis(each, axis, place)
+            for each, axis in zip(arguments[1:], axes[1:], strict=True)
+        ]
+        if axes[0] is not None:
+            return primitive().bind(x, *given, **static), 0
+        beside = [each.reshape(*each.shape[:place], -1, *each.shape[place + 2 :]) for each in given]
+        found = primitive().bind(x, *beside, **static)
+        return found.reshape(*given[0].shape[: place + 2], *found.shape[place + 1 :]), place
 
     return batched
+
+
+def _repeated(given: Any, count: int, place: int) -> Any:
+    """With an axis of so many that are all the same."""
+    return jnp.broadcast_to(jnp.expand_dims(given, place), (*given.shape[:place], count, *given.shape[place:]))
 
 
 STATES: Primitive = _primitive("states", lambda x, n, size: (*x[:-1], n, size), _states_batched)
 PUSH: Primitive = _primitive("push", lambda _, v, n, size: (*v[:-1], n, size), _linear_batched(lambda: PUSH))
 PULL: Primitive = _primitive("pull", lambda x, w, *_: (*w[:-2], x[-1]), _linear_batched(lambda: PULL))
+BEND: Primitive = _primitive("bend", lambda x, w, v, *_: v, _linear_batched(lambda: BEND))
 
 
 def _states_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
@@ -89,16 +99,34 @@ def _states_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) 
     return found, jnp.squeeze(pushed, -3)
 
 
-def _linear_pushed(primitive: Primitive) -> Callable[..., tuple[Any, Any]]:
-    def pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-        if type(changes[0]) is not ad.Zero:
-            raise MethodError(
-                "a flow has no second derivatives, as jax.hessian asks for: take methods that need first ones alone, "
-                "such as BFGS, or Gauss-Newton with jax.jacfwd"
-            )
-        return primitive.bind(*given, **static), primitive.bind(given[0], changes[1], **static)
+def _push_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    if type(changes[0]) is not ad.Zero:
+        raise MethodError(
+            "a flow has no second derivatives forward of forward, as jacfwd of jacfwd and jacrev of jacfwd ask for, "
+            "and no third derivatives: take jax.hessian, or jacfwd or jacrev of jacrev"
+        )
+    return PUSH.bind(*given, **static), PUSH.bind(given[0], changes[1], **static)
 
-    return pushed
+
+def _pull_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    (x, slopes), (of_x, of_slopes), parts = given, changes, []
+    if type(of_slopes) is not ad.Zero:
+        parts.append(PULL.bind(x, of_slopes, **static))
+    if type(of_x) is not ad.Zero:
+        second = static | {"target": SECOND[static["target"]]()}
+        parts.append(BEND.bind(x, slopes, _repeated(of_x, slopes.shape[x.ndim - 1], x.ndim - 1), **second))
+    return PULL.bind(x, slopes, **static), sum(parts[1:], parts[0])
+
+
+def _bend_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    if type(changes[0]) is not ad.Zero:
+        raise MethodError("a flow has no third derivatives")
+    (x, slopes, moved), (_, of_slopes, of_moved), found = given, changes, []
+    if type(of_slopes) is not ad.Zero:
+        found.append(BEND.bind(x, of_slopes, moved, **static))
+    if type(of_moved) is not ad.Zero:
+        found.append(BEND.bind(x, slopes, of_moved, **static))
+    return BEND.bind(*given, **static), sum(found[1:], found[0])
 
 
 def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
@@ -110,6 +138,16 @@ def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
     return transpose
 
 
+def _bend_transposed(slopes: Any, x: Any, own: Any, moved: Any, **static: Any) -> tuple[Any, ...]:
+    """By changes it is its own transpose: second derivatives are symmetric."""
+    if ad.is_undefined_primal(own):
+        raise MethodError("a flow has no second derivatives forward of forward: take jacfwd or jacrev of jacrev")
+    if type(slopes) is ad.Zero:
+        return None, None, ad.Zero(moved.aval)
+    return None, None, BEND.bind(x, own, slopes, **static)
+
+
 ad.primitive_jvps[STATES] = _states_pushed
-ad.primitive_jvps[PUSH], ad.primitive_jvps[PULL] = _linear_pushed(PUSH), _linear_pushed(PULL)
+ad.primitive_jvps[PUSH], ad.primitive_jvps[PULL], ad.primitive_jvps[BEND] = _push_pushed, _pull_pushed, _bend_pushed
+ad.primitive_transposes[BEND] = _bend_transposed
 ad.primitive_transposes[PUSH], ad.primitive_transposes[PULL] = _transposed(PULL), _transposed(PUSH)

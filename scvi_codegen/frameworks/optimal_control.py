@@ -66,7 +66,8 @@ def optimal_control(
         method: whose steps are taken, an SVI, SCVI or Gauss method, or its name.
         steps: how many, equally long.
         duration: of the motion; two numbers if it is to be found between them.
-        start, end: conditions in coordinates, velocities, momenta (``p_`` and the coordinate), t and parameters.
+        start, end: conditions in coordinates, velocities, momenta (``p_`` and the coordinate), t and parameters. Those
+            of a system with constraints hold beside: give what these leave open.
         cost: formula in coordinates, velocities, inputs, parameters and t, integrated by the method's quadrature.
         end_cost: the same without inputs, with momenta, of the end, added to the integral.
         bounds: by name of an input, everywhere; of formulas as for the cost, at the points of the quadrature.
@@ -81,7 +82,7 @@ def optimal_control(
     Raises:
         ControlError: if IPOPT finds none; its ``motion`` is the last that was tried.
         ExpressionError: for a formula outside the grammar.
-        MethodError: for systems with constraints or without inputs, methods without a quadrature along a curve.
+        MethodError: for systems without inputs, methods without a quadrature along a curve.
         MissingLibraryError: without CasADi.
         StateError: for names that there are not, or bounds that are none.
 
@@ -117,9 +118,8 @@ def optimal_control(
 
 
 def _check_controllable(system: MechanicalSystem) -> None:
-    if system.constraints or not system.inputs:
-        lacks = "has constraints" if system.constraints else "has no inputs"
-        raise MethodError(f"'{system.name}' {lacks}: give inputs=[..] and independent coordinates, or use casadi_step")
+    if not system.inputs:
+        raise MethodError(f"'{system.name}' has no inputs: give inputs=[..], which its forces have in them")
 
 
 def _checked_duration(given: float | tuple[float, float]) -> tuple[float, float]:

@@ -31,22 +31,33 @@ class Derivatives:
     Attributes:
         program: solved by Newton's iteration.
         by_given: one a family.
+        curvatures: one a family, or none where first derivatives are all that is wanted. Of results phi and all that
+            they depend on, y = (u, parameters, time): at (u, multipliers mu of phi, changes dy) the slopes of mu . phi
+            by y, as they change along dy; ``None`` where phi is linear.
         lanes: changes that are carried along at a time.
     """
 
     program: Program
     by_given: tuple[GivenSlopes, ...]
+    curvatures: tuple[Kernel | None, ...] = ()
     lanes: int = 8
 
     @property
-    def families(self) -> tuple[tuple[Family, GivenSlopes], ...]:
-        """Points with the slopes of their kernels."""
-        return tuple(zip(self.program.families, self.by_given, strict=True))
+    def families(self) -> tuple[tuple[Family, GivenSlopes, Kernel | None], ...]:
+        """Points with the slopes of their kernels, and what bends these, if it is wanted and not zero."""
+        bends = self.curvatures or (None,) * len(self.by_given)
+        return tuple(zip(self.program.families, self.by_given, bends, strict=True))
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that the program lacks."""
-        return tuple(each.kernel for each in self.by_given if each.kernel)
+        return tuple(each for each in (*(given.kernel for given in self.by_given), *self.curvatures) if each)
+
+    @property
+    def bent(self) -> tuple[int, int]:
+        """Most numbers that a kernel of second derivatives is given, and that it gives; 0 and 0 without any."""
+        kernels = [each for each in self.curvatures if each]
+        return max((k.arguments for k in kernels), default=0), max((k.values for k in kernels), default=0)
 
     @property
     def given(self) -> int:
@@ -58,13 +69,25 @@ class Derivatives:
         """Numbers at all points: by h, by arguments, by parameters and time."""
         return sum(
             family.points * (family.slope.arguments + len(family.slope.results) + len(given.entries))
-            for family, given in self.families
+            for family, given, _ in self.families
         )
 
     @property
     def memory(self) -> int:
         """Doubles beside those of a step: slopes; changes of what is given, of unknowns, twice, of rows and points."""
         program = self.program
-        points = max(family.points * (family.slope.arguments + family.slope.values) for family in program.families)
-        wide = self.given + 2 * program.unknowns + program.sites * (program.blocks + 1) + points
-        return self.slopes + wide * self.lanes
+        wide = self.given + 2 * program.unknowns + program.sites * (program.blocks + 1) + self.at_points
+        if self.curvatures:
+            wide += 4 * self.given + 2 * program.unknowns + 3 * self.at_points
+        return self.slopes + wide * self.lanes + self.places
+
+    @property
+    def at_points(self) -> int:
+        """Arguments and results of all points of a family, the most of them."""
+        return max(family.points * (family.slope.arguments + family.slope.values) for family in self.program.families)
+
+    @property
+    def places(self) -> int:
+        """Arguments of all points of a family, the most of them, where second derivatives are wanted."""
+        wanted = self.program.families if self.curvatures else ()
+        return max((family.points * family.slope.arguments for family in wanted), default=0)

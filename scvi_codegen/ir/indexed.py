@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 
@@ -24,6 +25,7 @@ class LoopedKernel:
         kernel: of a potential or a force: a value a target, what is added to the force there (of a momentum: to the
             velocity); of a mass: one value, added to that of the only target.
         scalar: of a potential: L itself.
+        along: how many of the slots, the last, are those of a direction, not of the state.
     """
 
     text: str
@@ -33,6 +35,7 @@ class LoopedKernel:
     given: tuple[Access, ...]
     kernel: Kernel
     scalar: Kernel | None = None
+    along: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +53,9 @@ class IndexedProgram:
         forces, masses: loops.
         sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
         splitting: the kicks and drifts that replace it where the method is explicit.
+        control: steps that choose their length, if they are wanted.
+        products, diagonals: the derivatives of the forces times a direction, and their diagonals, where Newton's
+            iteration takes the place of the sweeps.
     """
 
     prefix: str
@@ -68,3 +74,11 @@ class IndexedProgram:
     masses: tuple[LoopedKernel, ...]
     sweep: SeparableSweep | HamiltonianSweep | None
     splitting: Splitting | None
+    control: Control | None = None
+    products: tuple[LoopedKernel, ...] = ()
+    diagonals: tuple[LoopedKernel, ...] = ()
+
+    @property
+    def error_power(self) -> int:
+        """The power of h with which what a curve leaves unresolved goes; 0 where it tells nothing."""
+        return 0 if self.sweep is None or (self.velocities and self.sweep.points == 1) else self.sweep.error_power

@@ -6,10 +6,10 @@ system of one coordinate serve all.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from sympy import Expr, S, Symbol
+from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import gradient
@@ -23,6 +23,7 @@ from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.lowering.solvers.ladder import control_of_sweep
 from scvi_codegen.lowering.solvers.separable import separable_sweep
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -32,7 +33,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 
-__all__ = ["lower_indexed", "one_coordinate"]
+__all__ = ["lower_indexed", "one_coordinate", "with_control"]
 
 
 def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
@@ -43,8 +44,8 @@ def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
     return LagrangianSystem.from_text(name=system.name, coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
 
 
-def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> IndexedProgram:
-    """The program of a system by a method.
+def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton: bool = False) -> IndexedProgram:
+    """The program of a system by a method, with Newton's iteration in place of sweeps if that is wanted.
 
     Raises:
         MethodError: for a method that solves its equations neither explicitly nor by sweeps over positions.
@@ -59,6 +60,12 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
     kernels = [_force(system, term, number) for number, term in enumerate(system.potentials)]
     kernels += [_pushing(system, force, number) for number, force in enumerate(system.forces, len(kernels))]
     forces = tuple(kernels)
+    products, diagonals = curvature(system) if newton else ((), ())
+    if newton and (splitting or system.momenta or system.velocities or not products):
+        raise MethodError(
+            "Newton's iteration is there for Lagrangians of sums over indices with curved potentials, forces of "
+            "positions and time, and methods that are not explicit: leave out solver='newton'"
+        )
     sweep = None if splitting else _sweep(one, method, velocities=bool(system.velocities))
     return IndexedProgram(
         prefix=prefix,
@@ -77,7 +84,16 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str) -> Indexed
         masses=tuple(_mass(system, term, number) for number, term in enumerate(system.masses)),
         sweep=sweep,
         splitting=splitting,
+        products=products,
+        diagonals=diagonals,
     )
+
+
+def with_control(program: IndexedProgram) -> IndexedProgram | None:
+    """The same with steps that choose their length; ``None`` where its curves tell no error."""
+    if program.sweep is None or not program.error_power:
+        return None
+    return replace(program, control=control_of_sweep(program.sweep))
 
 
 def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> SeparableSweep | HamiltonianSweep:
@@ -123,6 +139,58 @@ def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedK
         given=_given(force.slots, u),
         kernel=_kernel(system, f"force_{number}", values, force.slots, u, "Forces."),
     )
+
+
+def curvature(system: IndexedSystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
+    """The derivatives of forces by positions: times a direction, and their diagonals, by families."""
+    found = [_derived(system, term, number) for number, term in enumerate(_acting(system))]
+    pairs = [pair for pair in found if pair]
+    return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
+
+
+def _acting(system: IndexedSystem) -> Iterator[IndexedForce]:
+    """All forces, those of the potentials by their slots."""
+    for term in system.potentials:
+        moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
+        slopes = gradient(term.formula, [slot for slot, _ in moving])
+        targets = tuple((access, slopes[k]) for k, (_, access) in enumerate(moving) if k in slopes)
+        yield IndexedForce(loops=term.loops, slots=term.slots, targets=targets)
+    yield from system.forces
+
+
+def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
+    """Those of a force; nothing where it does not depend on positions."""
+    moving = [(slot, access) for slot, access in force.slots if access.array in system.state]
+    u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
+    rows = [gradient(formula, u) for _, formula in force.targets]
+    if not any(rows):
+        return None
+    along = [Add(*(slope * w[k] for k, slope in row.items())) for row in rows]
+    own = [
+        Add(*(slope for k, slope in row.items() if moving[k][1] == access))
+        for row, (access, _) in zip(rows, force.targets, strict=True)
+    ]
+    accesses, targets = tuple(access for _, access in moving), tuple(access for access, _ in force.targets)
+    given, text = _given(force.slots, u), comment_text(f"derivatives of {force}")
+    both = [*force.slots, *zip(w, accesses, strict=True)]
+    product = LoopedKernel(
+        text=text,
+        loops=force.loops,
+        slots=(*accesses, *accesses),
+        targets=targets,
+        given=given,
+        kernel=_kernel(system, f"product_{number}", along, both, [*u, *w], "Forces along a direction."),
+        along=len(accesses),
+    )
+    diagonal = LoopedKernel(
+        text=text,
+        loops=force.loops,
+        slots=accesses,
+        targets=targets,
+        given=given,
+        kernel=_kernel(system, f"diagonal_{number}", own, force.slots, u, "By the coordinate itself."),
+    )
+    return product, diagonal
 
 
 def _mass(system: IndexedSystem, term: MassTerm, number: int) -> LoopedKernel:

@@ -134,6 +134,7 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
         t=real(document.get("initial", {}).get("t", 0.0), "[initial] t"),
         parameters=groups["parameters"],
         tables={name: _whole(values, f"[tables] {name}") for name, values in groups["tables"].items()},
+        document=document,
         **_read_run(document.get("run", {})),
     )
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.counts import LARGEST_COUNT, checked_count
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.kinds import check_kind
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import real
+from scvi_codegen.models.model import check_step, real, steps_in
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -38,6 +38,7 @@ class IndexedModel:
         t: initial time.
         parameters: numbers, and arrays of them, by name; others keep their defaults.
         tables: whole numbers, (rows, columns), by name.
+        document: the sections of the file that it was read from.
 
     Raises:
         ModelFileError: naming the field; what the arrays are is checked where a run begins.
@@ -55,6 +56,7 @@ class IndexedModel:
     t: float = 0.0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
+    document: Mapping[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_kind(INDEXED, self.system, "system", ModelFileError)
@@ -64,15 +66,9 @@ class IndexedModel:
             raise ModelFileError("give exactly one of span and steps")
         for name in ("h", "t"):
             object.__setattr__(self, name, real(getattr(self, name), name))
-        if self.h == 0.0:
-            raise ModelFileError("the step is 0: it must be positive, or negative to go back")
         if self.span is not None:
             object.__setattr__(self, "span", real(self.span, "span"))
-            if not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
-                raise ModelFileError(
-                    f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
-                    "backward, of fewer than 2^53 steps"
-                )
+        check_step(self.h, self.span)
         if self.steps is not None:
             checked_count(self.steps, "steps", least=0, error=ModelFileError)
         checked_count(self.every, "every", least=1, error=ModelFileError)
@@ -86,7 +82,7 @@ class IndexedModel:
         if self.steps is not None:
             return self.steps
         assert self.span is not None  # by construction
-        return max(1, round(self.span / abs(self.h)))
+        return steps_in(self.span, self.h)
 
     def stepper(self) -> IndexedStepper:
         """Compiled for runs of any size; raises as :func:`~scvi_codegen.compile_indexed`."""

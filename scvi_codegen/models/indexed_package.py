@@ -3,6 +3,7 @@
 ring_svi/  ring_svi.h  ring_svi.c  support/         the integrator, of any number of coordinates
            main.c  Makefile                         ``make run`` runs it with a C compiler and libm
            q.txt  velocity.txt  field_m.txt  ..     arrays, a number a line
+           model.toml  model_q.csv  ..              what it was made from, for ``scvi-codegen verify ring_svi``
            interface.json                           checksums: what was edited since is not overwritten unasked
 """
 
@@ -18,12 +19,14 @@ import numpy as np
 from scvi_codegen.indexed_compiler import generate_indexed
 from scvi_codegen.kinds import PATH, SWITCH, of, takes
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
+from scvi_codegen.models.indexed_document import model_texts
 from scvi_codegen.models.indexed_model import IndexedModel
-from scvi_codegen.models.package import prefix_of
+from scvi_codegen.models.package import prefix_of, source_in
 from scvi_codegen.rendering.indexed import render_indexed_example
 from scvi_codegen.runtime.indexed_interface import read_arrays, read_state
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 
-__all__ = ["generate_sums"]
+__all__ = ["generate_sums", "load_sums"]
 
 
 @takes(model=of("an IndexedModel", IndexedModel), folder=PATH, force=SWITCH)
@@ -56,9 +59,22 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
         run={"t": model.t, "h": model.h, "steps": model.step_count, "every": model.every},
     )
     texts = {**source.files, **example, **{f"{name}.txt": _lines(values) for name, values in arrays.items()}}
-    described = {"title": interface.title, "sizes": problem.sizes}
+    texts |= model_texts(model)
+    described = {"title": interface.title, "sizes": problem.sizes, "declarations": source.declarations.split("\n")}
     write_folder(target, {**texts, INTERFACE_FILE: record_text(texts, **described)}, force=force)
     return target
+
+
+def load_sums(folder: str | os.PathLike[str], model: IndexedModel) -> IndexedStepper:
+    """The stepper of a generated folder of a model, compiled from the C text in it.
+
+    Raises:
+        PackageError: if the folder lacks a file or was written by another version.
+    """
+    target = Path(folder)
+    prefix = prefix_of(target)
+    _, interface = generate_indexed(model.system, model.method, prefix=prefix)
+    return IndexedStepper(source_in(target, prefix), interface)
 
 
 def _flat(state: Mapping[str, Any]) -> Any:

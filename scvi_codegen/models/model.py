@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.run import Run
     from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["DEFAULT_METHOD", "Model", "check_length", "real"]
+__all__ = ["DEFAULT_METHOD", "Model", "check_length", "check_step", "real", "steps_in"]
 
 DEFAULT_METHOD = SVI(8)
 """What the problems of the catalogue are integrated with unless another method is chosen."""
@@ -123,7 +123,7 @@ class Model:
                 "how many steps of tau a span takes is not known before: give steps (--steps) for this"
             )
         assert self.span is not None  # by construction
-        return max(1, round(self.span / abs(step)))
+        return steps_in(self.span, step)
 
     @property
     def ends_at_time(self) -> bool:
@@ -217,7 +217,7 @@ class Model:
         """The inputs, and what they make of the parameters at a time."""
         from scvi_codegen.runtime.driven import checked_inputs, parameters_of
 
-        found = checked_inputs(stepper, self.all_inputs())
+        found = checked_inputs(stepper.interface, self.all_inputs())
         return found, parameters_of(stepper, self.parameters, found)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
@@ -253,13 +253,7 @@ class Model:
         if self.h is None:
             self._check_tolerance()
             return
-        if self.h == 0.0:
-            raise ModelFileError("the step is 0: it must be positive, or negative to go back")
-        if self.span is not None and not 0.0 < self.span / abs(self.h) <= LARGEST_COUNT:
-            raise ModelFileError(
-                f"span is {self.span:g} with a step of {self.h:g}: it is a positive length of time, also for a run "
-                "backward, of fewer than 2^53 steps"
-            )
+        check_step(self.h, self.span)
 
     def _check_tolerance(self) -> None:
         assert self.tolerance is not None  # by construction
@@ -277,6 +271,22 @@ class Model:
         values = tuple(values)
         check_length(values, names, name)
         return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
+
+
+def check_step(h: float, span: float | None) -> None:
+    """Refuse a step of 0, and a span that is no number of steps."""
+    if h == 0.0:
+        raise ModelFileError("the step is 0: it must be positive, or negative to go back")
+    if span is not None and not 0.0 < span / abs(h) <= LARGEST_COUNT:
+        raise ModelFileError(
+            f"span is {span:g} with a step of {h:g}: it is a positive length of time, also for a run backward, of "
+            "fewer than 2^53 steps"
+        )
+
+
+def steps_in(span: float, h: float) -> int:
+    """The whole number (at least 1) of steps nearest to a length of time."""
+    return max(1, round(span / abs(h)))
 
 
 def check_length(values: Sequence[object], names: Sequence[str], where: str) -> None:

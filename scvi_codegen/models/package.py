@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.text import Embedded, ExampleRun
 
-__all__ = ["CERTIFICATE_FILE", "generate_package", "load_package", "prefix_of"]
+__all__ = ["CERTIFICATE_FILE", "MODEL", "example_of", "generate_package", "load_package", "model_text", "prefix_of"]
 
 OUTPUTS = 20
 COMPARED = 1e-9
@@ -92,26 +92,55 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
         PackageError: if the folder lacks a file or was written by another version.
         BuildError: without a C compiler, or if it refuses the text.
     """
-    target = Path(folder)
+    target, record = Path(folder), read_record(folder)
     try:
-        record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
-        if not isinstance(record, dict) or record.get("format") != FORMAT:
-            raise PackageError(f"{target / INTERFACE_FILE} has another format: generate the folder again")
         if "__init__.py" not in record["files"]:
             raise PackageError(f"{target} is for a microcontroller: for Python generate it without --embedded")
         interface = Interface.from_json(json.dumps(record["interface"]))
-        header, code = (_read(target / f"{interface.prefix}.{kind}") for kind in "hc")
-        declarations = "\n".join(record["declarations"])
-        support = tuple((name, _read(target / name)) for name in included(code))
-    except OSError as error:
-        raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, PackageError):
             raise
-        raise PackageError(f"{target / INTERFACE_FILE} is damaged ({error!r}): generate the folder again") from error
-    source = Source(prefix=interface.prefix, header=header, code=code, declarations=declarations, support=support)
-    controlled = source if ADVANCE_TO in declarations else None
+        raise _damaged(target, error) from error
+    source = source_in(target, interface.prefix)
+    controlled = source if ADVANCE_TO in source.declarations else None
     return Stepper(source, interface, controlled=lambda: controlled)
+
+
+def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a generated folder says of itself; raises as :func:`source_in`."""
+    target = Path(folder)
+    try:
+        record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
+    except ValueError as error:
+        raise _damaged(target, error) from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise PackageError(f"{target / INTERFACE_FILE} has another format: generate the folder again")
+    return record
+
+
+def source_in(folder: Path, prefix: str) -> Source:
+    """The C text in a generated folder.
+
+    Raises:
+        PackageError: if the folder lacks a file or was written by another version.
+    """
+    try:
+        header, code = (_read(folder / f"{prefix}.{kind}") for kind in "hc")
+        declarations = "\n".join(read_record(folder)["declarations"])
+        support = tuple((name, _read(folder / name)) for name in included(code))
+    except OSError as error:
+        raise PackageError(f"{folder} is not a generated package: {error.filename}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        if isinstance(error, PackageError):
+            raise
+        raise _damaged(folder, error) from error
+    return Source(prefix=prefix, header=header, code=code, declarations=declarations, support=support)
+
+
+def _damaged(folder: Path, error: Exception) -> PackageError:
+    return PackageError(f"{folder / INTERFACE_FILE} is damaged ({error!r}): generate the folder again")
 
 
 def _read(file: Path) -> str:
@@ -155,8 +184,8 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
     if single_file:
         source = source.amalgamated()
     texts = source.files
-    texts |= render_example(interface, _example(model, controlled=ADVANCE_TO in source.header), embedded or "double")
-    described = _model_text(model)
+    texts |= render_example(interface, example_of(model, controlled=ADVANCE_TO in source.header), embedded or "double")
+    described = model_text(model)
     if described is not None:
         texts["model.toml"] = described
     texts["README.md"] = _readme(
@@ -167,7 +196,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
     return {**texts, INTERFACE_FILE: _interface_text(source, interface, texts)}
 
 
-def _example(model: Model, *, controlled: bool) -> ExampleRun:
+def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     """The whole run of the model in at most about twenty lines of output."""
     from scvi_codegen.models.input_tables import tables_of_example
     from scvi_codegen.rendering.text import ExampleRun
@@ -254,7 +283,7 @@ Time is transformed: steps `h` are of tau, dt = g dtau with the monitor g, and `
 """
 
 
-def _model_text(model: Model) -> str | None:
+def model_text(model: Model) -> str | None:
     """The model file, or ``None`` for a method that a file cannot hold (a quadrature of the user's own)."""
     from scvi_codegen.models.model_file import dump_model
 

@@ -172,9 +172,14 @@ def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> s
         " ".join(flags),
         os.environ.get(FLAGS_VARIABLE, ""),
         _cffi_backend.__version__,
-        _processor() if "-march=native" in flags else platform.machine(),
+        _processor() if _tuned(compiler, flags) else platform.machine(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+def _tuned(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
+    """Whether any flag, wherever it stands, asks for the instructions of this processor (-march, -mcpu, -mtune)."""
+    return "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
 
 
 @cache

@@ -54,7 +54,7 @@ def with_events(source: Source, interface: Interface, functions: tuple[str | Exp
         EventError: naming the symbol or function at fault.
     """
     kernel, uses_velocity = _kernel(interface, functions)
-    return replace(source, events=render_events(_search(interface, kernel, uses_velocity)))
+    return replace(source, beside=render_events(_search(interface, kernel, uses_velocity)))
 
 
 def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:

@@ -11,7 +11,7 @@ from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.parts import Part, parts
 from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.rendering.lanes import Lanes
-from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment
+from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
 from scvi_codegen.rendering.target import Target
 
@@ -116,5 +116,5 @@ def _function(storage: str, code: Kernel | Part, arguments: Sequence[str], state
     lines = [wrapped(statement) for statement in statements]
     body = "\n".join(lines)
     laid_out = LAID_OUT.format(body) if any("\n" in line for line in lines) else body
-    head = wrapped(f"{storage} void {code.name}({', '.join(arguments)})", indent=0)
+    head = wrapped_prototype(f"{storage} void {code.name}({', '.join(arguments)})")
     return f"{head}\n{{\n{laid_out}\n}}"

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.rendering.control import ladder_text
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
 from scvi_codegen.rendering.lanes import LIBRARY, POINTS, SweepText, sweep_text
@@ -23,6 +24,14 @@ from scvi_codegen.rendering.stopping import MAX_ITERATIONS
 from scvi_codegen.rendering.target import DOUBLE
 
 __all__ = ["render_indexed", "render_indexed_example"]
+
+EXPLICIT_VECTORS, SWEEP_VECTORS = 4, 4
+"""Of work: positions, forces, increments; positions at the points, forces in this step and two before."""
+NEWTON_VECTORS = 4 + 17
+"""Beside these residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
+
+DIRECTION = "V"
+"""What the slots along a direction are read from."""
 
 Lines: TypeAlias = Callable[[int], list[str]]
 """Of a slot, by its number."""
@@ -41,7 +50,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
-        "forces": [_force_text(program, each) for each in program.forces],
+        "forces": [_force_text(program, each) for each in (*program.forces, *program.products, *program.diagonals)],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in program.masses],
         "force_names": [each.kernel.name for each in program.forces],
@@ -52,15 +61,19 @@ def render_indexed(program: IndexedProgram) -> Source:
         "vector_functions": _vector_functions(program),
         "coordinates": " + ".join(map(_product, program.coordinates)),
         "sweep": _sweep_text(program),
+        "work": _work(program),
+        "sweep_vectors": SWEEP_VECTORS,
         "hot": "static",
     }
     code = environment.get_template("indexed.c.jinja").render(context)
+    control = program.control
+    own = {f"support/{program.prefix}_ladder.h": ladder_text(control.ladder)} if control and control.ladder else {}
     return Source(
         prefix=program.prefix,
         header=environment.get_template("indexed.h.jinja").render(context),
         code=code,
         declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
-        support=tuple((name, support_text(name)) for name in included(code)),
+        support=tuple((name, own.get(name) or support_text(name)) for name in included(code)),
     )
 
 
@@ -77,8 +90,18 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
     return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
 
+def _work(program: IndexedProgram) -> int:
+    """Numbers of a coordinate: vectors over the points, or of leapfrog, four."""
+    if program.sweep is None:
+        return EXPLICIT_VECTORS
+    own = 2 * SWEEP_VECTORS if program.momenta else SWEEP_VECTORS + bool(program.velocities)
+    linear = NEWTON_VECTORS + program.sweep.lanes if program.products else 0
+    return (own + linear) * program.sweep.lanes
+
+
 def _sweep_text(program: IndexedProgram) -> SweepText | None:
-    sweep, kernels = program.sweep, [each.kernel for each in program.forces]
+    applied = (*program.forces, *program.products, *program.diagonals)
+    sweep, kernels = program.sweep, [each.kernel for each in applied]
     return sweep_text(sweep, POINTS, fallback="none", kernels=kernels) if sweep else None
 
 
@@ -135,7 +158,8 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     )
     zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
-    arguments = ["const problem *given", "const lanes *restrict X", "times t", *factor, "lanes *restrict F"]
+    direction = [f"const lanes *{DIRECTION}"] if looped.along else []
+    arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
     values = f"lanes value[{len(looped.targets)}]"
     return nest.function(f"static void add_{looped.kernel.name}", arguments, [*zero, *lines], values=values)
 
@@ -255,7 +279,8 @@ class _Nest:
         """What is known at a level: arguments, parameters."""
         for k, slot in enumerate(self.looped.slots):
             if self.level(slot) == level and self.source:
-                yield f"u[{k}] = {self.source}[{self.place_of(slot)}];"
+                source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
+                yield f"u[{k}] = {source}[{self.place_of(slot)}];"
         for k, access in enumerate(self.looped.given, self.scalars):
             if self.level(access) == level:
                 yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"

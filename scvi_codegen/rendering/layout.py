@@ -6,7 +6,15 @@ import re
 import textwrap
 from collections.abc import Sequence
 
-__all__ = ["WIDTH", "table", "wrapped", "wrapped_comment", "wrapped_comment_lines", "wrapped_prototypes"]
+__all__ = [
+    "WIDTH",
+    "table",
+    "wrapped",
+    "wrapped_comment",
+    "wrapped_comment_lines",
+    "wrapped_prototype",
+    "wrapped_prototypes",
+]
 
 WIDTH = 120
 CONTINUATION = 4
@@ -59,10 +67,11 @@ def wrapped_comment_lines(text: str) -> str:
 
 def wrapped_prototypes(text: str) -> str:
     """The text with every prototype in it broken between arguments, and only where it is too long."""
-    return PROTOTYPE.sub(lambda found: _wrapped_prototype(" ".join(found[0].split())), text)
+    return PROTOTYPE.sub(lambda found: wrapped_prototype(" ".join(found[0].split())), text)
 
 
-def _wrapped_prototype(prototype: str) -> str:
+def wrapped_prototype(prototype: str) -> str:
+    """The head of a function, broken between arguments where it is too long."""
     arguments = prototype.replace(" ", "\0").replace(",\0", ", ")  # no break within an argument
     return "\n".join(_lines(arguments, "", " " * CONTINUATION)).replace("\0", " ")
 

@@ -30,7 +30,7 @@ class Source:
         header, code: texts of ``<prefix>.h`` and ``<prefix>.c``.
         declarations: the header's inner part.
         support: name and text of each header that the code includes from beside it, in order.
-        events: the search for zero crossings, a header and a source of its own behind this one.
+        beside: a header and a source of its own that calls this one: the search for zero crossings, or FMI.
     """
 
     prefix: str
@@ -38,25 +38,25 @@ class Source:
     code: str
     declarations: str
     support: tuple[tuple[str, str], ...] = ()
-    events: Source | None = None
+    beside: Source | None = None
 
     @property
     def files(self) -> dict[str, str]:
         """Text by file name, ``/`` between folders."""
         own = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
-        return own | (self.events.files if self.events else {})
+        return own | (self.beside.files if self.beside else {})
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """What is compiled: this one, and the search for events if there is one."""
-        return (self, self.events) if self.events else (self,)
+        """What is compiled: this one, and that beside it."""
+        return (self, self.beside) if self.beside else (self,)
 
     def amalgamated(self) -> Source:
         """The same with each support header in the place where it is included."""
         texts = dict(self.support)
         code = INCLUDED.sub(lambda include: texts[include[1]] if include[1] in texts else include[0], self.code)
-        events = self.events.amalgamated() if self.events else None
-        return replace(self, code=code, support=(), events=events)
+        beside = self.beside.amalgamated() if self.beside else None
+        return replace(self, code=code, support=(), beside=beside)
 
     def to_record(self) -> dict[str, Any]:
         """Plain data, texts line by line, read back by :meth:`from_record`."""
@@ -64,18 +64,18 @@ class Source:
             "prefix": self.prefix,
             **{name: getattr(self, name).split("\n") for name in TEXTS},
             "support": {name: text.split("\n") for name, text in self.support},
-            "events": self.events.to_record() if self.events else None,
+            "beside": self.beside.to_record() if self.beside else None,
         }
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Source:
         """The source that :meth:`to_record` gave, also one of version 0.1, which has no support headers."""
-        events = record.get("events")
+        beside = record.get("beside")
         return cls(
             prefix=record["prefix"],
             **{name: "\n".join(record[name]) for name in TEXTS},
             support=tuple((name, "\n".join(lines)) for name, lines in record.get("support", {}).items()),
-            events=cls.from_record(events) if events else None,
+            beside=cls.from_record(beside) if beside else None,
         )
 
     def to_json(self) -> str:

@@ -47,6 +47,7 @@ class CompiledMethod:
         controlled: Callable[[], Source | None] = no_text,
         fallback: Callable[[], Source | None] = no_text,
         tangent: Callable[[], Source | None] = no_text,
+        curvature: Callable[[], Source | None] = no_text,
         changes: Callable[[int], Source | None] = no_text,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
@@ -54,7 +55,9 @@ class CompiledMethod:
         self.interface, self.flags, self.events = interface, flags, events
         self._ensemble, self._controlled, self._fallback, self._tangent = ensemble, controlled, fallback, tangent
         self._changes, self._with_changes = changes, dict[int, Source | None]()
+        self._curvature = curvature
         self._with_tangent: Binding | None = None
+        self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
         self._plain = source
         self.source = _watching(source, interface, events) if events else source
@@ -92,6 +95,11 @@ class CompiledMethod:
         """The C text with the derivatives of steps, derived when first asked for; ``None`` in transformed time."""
         return self._tangent()
 
+    @property
+    def second_derivatives(self) -> Source | None:
+        """The same with second derivatives, derived when first asked for."""
+        return self._curvature()
+
     def changes(self, count: int) -> Source | None:
         """The C text for many trajectories at once with so many small changes beside each, kept when asked for.
 
@@ -112,12 +120,29 @@ class CompiledMethod:
     def tangent(self) -> Binding:
         """The library with derivatives of steps, compiled when first asked for; MethodError where there is none."""
         if self._with_tangent is None:
-            source = self.derivatives
-            if source is None:
-                raise MethodError(f"there are no derivatives of the steps of '{self.title}'")
-            binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
-            self._with_tangent = binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
+            self._with_tangent = self._linearised(self.derivatives, "derivatives")
         return self._with_tangent
+
+    @property
+    def curvature(self) -> Binding:
+        """The library with second derivatives, too; as :attr:`tangent`."""
+        if self._with_curvature is None:
+            self._with_curvature = self._linearised(self.second_derivatives, "second derivatives")
+        return self._with_curvature
+
+    def _linearised(self, source: Source | None, what: str) -> Binding:
+        if source is None:
+            raise MethodError(f"there are no {what} of the steps of '{self.title}'{self._why_not()}")
+        binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
+        return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
+
+    def _why_not(self) -> str:
+        if not self.interface.energy_parameter:
+            return ""
+        return (
+            ": in transformed time the energy of the start is a parameter of every step, and time an integral along "
+            "them. Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
+        )
 
     def _load_fallback(self) -> building.Library:
         source = self.fallback
@@ -177,6 +202,7 @@ class CompiledMethod:
             controlled=self._controlled,
             fallback=self._fallback,
             tangent=self._tangent,
+            curvature=self._curvature,
             changes=self.changes,
             flags=self.flags,
             events=wanted,
@@ -204,6 +230,7 @@ class CompiledMethod:
             controlled=self._controlled,
             fallback=self._fallback,
             tangent=self._tangent,
+            curvature=self._curvature,
             changes=self.changes,
             flags=self.flags,
             events=self.events,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
-from scvi_codegen.runtime.inputs import Array, check_left_to_inputs
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.inputs import Array, TakesInputs, check_left_to_inputs
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -68,7 +69,7 @@ class Input:
 
 
 def checked_inputs(
-    stepper: Integrator, given: Mapping[str, Any] | None, trajectories: int | None = None
+    interface: TakesInputs, given: Mapping[str, Any] | None, trajectories: int | None = None
 ) -> dict[str, Input]:
     """Inputs as users give them: (t, values), (t, values, kind), or a piecewise polynomial of SciPy's.
 
@@ -77,8 +78,8 @@ def checked_inputs(
     Raises:
         StateError: for names that are no inputs, inputs that are not given, and data that make no function of time.
     """
-    names, given = stepper.interface.inputs, dict(given or {})
-    if stepper.interface.energy_parameter:
+    names, given = interface.inputs, dict(given or {})
+    if interface.energy_parameter:
         raise StateError("what moves in transformed time has no inputs: integrate(..., t_end=...) leads to a time")
     for name in given:
         if name not in names:
@@ -194,7 +195,7 @@ def drive(
 
 
 def stretches(
-    run: Run, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
+    run: Driven, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
 ) -> Iterator[int | None]:
     """Has the run ready for each stretch without a breakpoint or another step inside.
 
@@ -209,6 +210,19 @@ def stretches(
     for end in _ends(run.t, t_end, inputs):
         run.change(parameters=values(run.t + 0.5 * (end - run.t)), goal=replace(run.goal, t_end=end))
         yield None
+
+
+class Driven(Protocol):
+    """What is asked of a run whose inputs are data."""
+
+    goal: Goal | None
+
+    @property
+    def t(self) -> float: ...
+    @property
+    def h(self) -> float: ...
+    def change(self, *, parameters: Array, h: float | None = None, goal: Goal | None = None) -> None:
+        """Go on with others."""
 
 
 class Stretch(NamedTuple):

@@ -83,7 +83,7 @@ class DrivenEnsemble(Ensemble):
         if stepper.interface.monitor:
             raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
         count = len(checked_ensemble(stepper, q, q)[0])
-        data = checked_inputs(stepper, inputs, count)
+        data = checked_inputs(stepper.interface, inputs, count)
         check_left_to_inputs(stepper.interface, parameters)
         own, first = parameters_of_each(stepper, parameters, count), entered(t, t_end)
         start = parameters_at(stepper.parameters, own, data, first)

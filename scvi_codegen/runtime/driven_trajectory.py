@@ -17,6 +17,7 @@ from scvi_codegen.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.dense_output import checked_times, within
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
+from scvi_codegen.runtime.nearby_driven import NearbyDrivenMotions
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.trajectory import Trajectory, relative_changes
 
@@ -33,7 +34,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DrivenTrajectory:
+class DrivenTrajectory(NearbyDrivenMotions):
     """States along a run with inputs, and what follows from them, each with the parameters of its piece.
 
     Attributes:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest
 from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
@@ -22,6 +23,7 @@ from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.runtime.driven import checked_inputs
 from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
 from scvi_codegen.runtime.measurements import Measurements, distinct, state_names
+from scvi_codegen.runtime.segments import LOOSE, TIGHT, Chain, chained, joined
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Fit", "fit"]
@@ -52,6 +54,7 @@ class Fit:
         computed, residuals: (n, c) what the motion has there; what the measurements have beyond it.
         deviations: (c,) standard deviations of the noise, as given, else as the residuals tell.
         evaluations: how often the motion was computed.
+        jumps: (segments - 1, 2m) what is left between the end of each segment and the start of the next.
     """
 
     names: tuple[str, ...]
@@ -68,6 +71,7 @@ class Fit:
     residuals: Array
     deviations: Array
     evaluations: int
+    jumps: Array
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -115,6 +119,7 @@ def fit(
     deviations: ArrayLike | None = None,
     inputs: Mapping[str, Any] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    segments: int = 1,
 ) -> Fit:
     """Find parameters and the initial state of a motion from measurements, by nonlinear least squares.
 
@@ -134,6 +139,9 @@ def fit(
             left.
         inputs: as of :meth:`Stepper.drive`.
         bounds: (least, greatest) by names of unknowns, infinite where there is none.
+        segments: into how many parts a record is cut that is long beside the time in which nearby motions part, or
+            whose guess soon runs out of phase (multiple shooting): the state at the start of each is unknown, too, and
+            first guessed from the measurements where all coordinates are measured. They come to join in stages.
 
     Returns:
         A :class:`Fit`. An :class:`~scvi_codegen.AccuracyWarning` says where steps of h, not the measurements, tell an
@@ -148,24 +156,28 @@ def fit(
     from scipy.optimize import least_squares  # here: slow to import
 
     measurements = Measurements.checked(
-        stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper, inputs)
+        stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, state=state)
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not tell {len(model.names)} unknowns")
-    found = least_squares(
-        model.residuals,
-        model.guess,
-        jac=model.slopes,
-        bounds=model.bounded(bounds or {}),
-        x_scale="jac",
-    )
+    chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
+    if bounds and len(chain.parts) > 1:
+        raise StateError("bounds are those of a fit in one segment: leave one of the two out")
+    limits = [np.append(own, np.full(len(x) - len(own), free)) for own, free in model.bounded(bounds or {})]
+    several = len(chain.parts) > 1
+    if several:
+        chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
+    found = least_squares(chain.residuals, x, jac=chain.slopes, bounds=limits, x_scale="jac")
     if not found.success:
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
-    held = found.active_mask != 0
-    _check_told([name for name, at in zip(model.names, held, strict=True) if not at], found.jac[:, ~held])
-    fitted = model.fit(found.x, held, found.nfev, known_noise=deviations is not None)
-    if told := model.told_by_steps(fitted, ~held):
+    x, evaluations, held = found.x, found.nfev, found.active_mask != 0
+    _check_told(model.names, found.jac, held)
+    if several:
+        x, more = joined(chain, x)
+        evaluations, chain = evaluations + more, replace(chain, jump=TIGHT)
+    fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
+    if told := _told_by_steps(chain, fitted, x, ~held):
         warnings.warn(told, AccuracyWarning, stacklevel=3)
     return fitted
 
@@ -184,7 +196,6 @@ class _Model:
     names: tuple[str, ...]
     places: NDArray[np.intp]
     known: Array
-    at: Array | None = None
 
     @classmethod
     def checked(
@@ -225,8 +236,8 @@ class _Model:
         """(k,) to begin with."""
         return self.known[self.places]
 
-    def bounded(self, given: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
-        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given."""
+    def bounded(self, given: Mapping[str, tuple[float, float]]) -> tuple[tuple[Array, float], tuple[Array, float]]:
+        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given, as beside each."""
         low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for name, ends in given.items():
             if name not in self.names:
@@ -239,108 +250,86 @@ class _Model:
             if not pair[0] < self.guess[k] < pair[1]:
                 raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
             low[k], high[k] = pair
-        return low, high
+        return (low, -np.inf), (high, np.inf)
 
-    def residuals(self, x: Array) -> Array:
-        """Of all measurements, in standard deviations; infinite where a motion fails, from which SciPy turns back."""
-        try:
-            return self._evaluated(x)[0]
-        except StepFailedError:
-            if self.at is None:
-                raise
-            return np.full(int(self.measurements.used.sum()), np.inf)
-
-    def slopes(self, x: Array) -> Array:
-        """(measurements, k) of the same."""
-        return self._evaluated(x)[1]
-
-    def _all(self, x: Array) -> Array:
-        values = self.known.copy()
-        values[self.places] = x
-        return values
-
-    def _evaluated(self, x: Array) -> tuple[Array, Array]:
-        """Both, of one computation of the motion."""
-        if self.at is None or not np.array_equal(x, self.at):
-            measurements, values = self.measurements, self._all(x)
-            size = 2 * measurements.stepper.dimension
-            changes = np.zeros((len(x), measurements.stepper.given))
-            changes[np.arange(len(x)), self.places] = 1.0
-            computed, slopes = measurements.motion(values[:size], changes, values[size:])
-            self.at, self.computed = x.copy(), computed
-            scaled = (computed - measurements.measured) / measurements.deviations
-            self.found = scaled[measurements.used], (slopes / measurements.deviations[:, np.newaxis])[measurements.used]
-        return self.found
-
-    def fit(self, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
-        """What was found; ``held``: (k,) by a bound."""
-        measurements, values = self.measurements, self._all(x)
+    def fit(self, chain: Chain, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
+        """What was found; ``held``: (unknowns,) by a bound."""
+        measurements, values, count = self.measurements, chain.values(x), len(self.names)
         m = measurements.stepper.dimension
-        scaled, slopes = self._evaluated(x)
-        free = len(scaled) - int((~held).sum())
+        scaled, slopes = chain.scaled(x), chain.slopes(x)
+        free = len(scaled) - int((~held[:count]).sum())
         noise = 1.0 if known_noise else float(np.sqrt(scaled @ scaled / free)) if free else np.nan
         inverse = np.linalg.pinv(slopes[:, ~held])
         covariance = np.full((len(x), len(x)), np.nan)
         covariance[np.ix_(~held, ~held)] = noise**2 * inverse @ inverse.T
         return Fit(
             names=self.names,
-            values=np.array(x),
-            covariance=covariance,
-            at_bounds=tuple(name for name, at in zip(self.names, held, strict=True) if at),
+            values=np.array(x[:count]),
+            covariance=covariance[:count, :count],
+            at_bounds=tuple(name for name, at in zip(self.names, held[:count], strict=True) if at),
             parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=True)),
             q=values[:m],
             p=values[m : 2 * m],
             start=measurements.start,
             t=measurements.t,
             observed=measurements.observed,
-            computed=self.computed,
-            residuals=measurements.measured - self.computed,
+            computed=chain.computed,
+            residuals=measurements.measured - chain.computed,
             deviations=noise * measurements.deviations,
             evaluations=evaluations,
+            jumps=chain.jumps,
         )
 
-    def told_by_steps(self, fitted: Fit, free: NDArray[np.bool_]) -> str:
-        """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
 
-        What moves by less than a millionth of the largest unknown is left alone: data without noise have no errors.
-        """
-        finer = replace(self, measurements=self.measurements.halved(), known=self._all(fitted.values), at=None)
-        errors, found = np.sqrt(np.diag(fitted.covariance)), fitted.values.copy()
-        noticed = np.maximum(errors, NOTICED * np.abs(found).max(initial=0.0))
-        with suppress(StepFailedError):
-            for _ in range(NEARER):
-                scaled, slopes = finer._evaluated(found)
-                found[free] -= np.linalg.pinv(slopes[:, free]) @ scaled
-                moved = np.abs(found - fitted.values)[free]
-                if not (moved > noticed[free]).any():
-                    return ""
-            ratios = moved / errors[free]
-            name = [name for name, at in zip(self.names, free, strict=True) if at][int(np.argmax(ratios))]
-            return (
-                f"h is too long for this fit: with steps half as long {name} is {ratios.max():.1f} standard errors "
-                "away. Take a shorter h, or a method of higher order"
-            )
-        return ""
+def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_]) -> str:
+    """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
+
+    What moves by less than a millionth of the largest unknown is left alone: data without noise have no errors.
+    """
+    finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
+    count, found = len(fitted.names), x.copy()
+    errors, told = np.sqrt(np.diag(fitted.covariance)), free[:count]
+    noticed = np.maximum(errors, NOTICED * np.abs(fitted.values).max(initial=0.0))
+    with suppress(StepFailedError):
+        for _ in range(NEARER):
+            scaled, slopes = finer.evaluated(found)
+            found[free] -= np.linalg.pinv(slopes[:, free]) @ scaled
+            moved = np.abs(found - x)[:count][told]
+            if not (moved > noticed[told]).any():
+                return ""
+        ratios = moved / errors[told]
+        name = [name for name, at in zip(fitted.names, told, strict=True) if at][int(np.argmax(ratios))]
+        return (
+            f"h is too long for this fit: with steps half as long {name} is {ratios.max():.1f} standard errors "
+            "away. Take a shorter h, or a method of higher order"
+        )
+    return ""
 
 
 def _of_inputs(stepper: Stepper) -> set[str]:
     return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
 
 
-def _check_told(names: Sequence[str], slopes: Array) -> None:
-    """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is."""
-    if not names:
+def _check_told(names: Sequence[str], slopes: Array, held: NDArray[np.bool_]) -> None:
+    """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is.
+
+    Args:
+        names: of the first unknowns; states at later nodes have none.
+        slopes: (rows, unknowns).
+        held: (unknowns,) by a bound.
+    """
+    if held.all():
         return
+    own = [*names, *[""] * (len(held) - len(names))]
+    free, slopes = [name for name, at in zip(own, held, strict=True) if not at], slopes[:, ~held]
     sizes = np.sqrt((slopes**2).sum(axis=0))
     if nothing := np.flatnonzero(sizes <= SAME * sizes.max(initial=0.0)).tolist():
-        raise FitError(
-            f"these measurements do not tell {names[nothing[0]]}: they do not depend on it. Take it as known"
-        )
+        raise FitError(f"these measurements do not tell {free[nothing[0]]}: they do not depend on it. Take it as known")
     singular, directions = np.linalg.svd(slopes / sizes)[1:]
     if singular[-1] > SAME * singular[0]:
         return
     shares = np.abs(directions[-1])
-    told = [names[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist()]
+    told = [free[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist() if free[k]]
     raise FitError(
         f"these measurements do not tell {', '.join(told[:-1])} and {told[-1]} apart: changed together, they leave all "
         "that is measured as it is. Take one of them as known"

@@ -18,11 +18,26 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.kept_states import KeptStates
-from scvi_codegen.runtime.linearised import Sensitivity, Starts
+from scvi_codegen.runtime.linearised import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.retaken import refuse_strays, steps_between
 
-__all__ = ["Gradient", "carried", "carry", "pieces", "pulled_back", "sensitivity", "starts_of"]
+__all__ = [
+    "Gradient",
+    "backward",
+    "carried",
+    "carry",
+    "changes_of",
+    "checked_slopes",
+    "finite",
+    "forward",
+    "gradient_of",
+    "pieces",
+    "pulled_back",
+    "seeds_of",
+    "sensitivity",
+    "starts_of",
+]
 
 MOST_STEPS = 1024
 """Of a piece, where all states are kept."""
@@ -49,38 +64,60 @@ class Gradient:
 
 
 def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
-    """(n, 2m, k) what becomes of (2m, k) directions of (q, p); all 2m without any, the derivative of each state.
+    """(n, 2m, k) what becomes of (2m, k) directions of (q, p), or (2m + parameters + 2, k) of all that is given.
+
+    Without any, of all 2m of (q, p): the derivative of each state.
 
     Raises:
         StateError: for directions of another shape, and states that do not stand at whole steps.
     """
     size = 2 * states.stepper.dimension
-    given = np.eye(size) if directions is None else _finite(directions, "directions")
-    if given.ndim not in (1, 2) or len(given) != size:
-        raise StateError(f"directions have shape ({size},) or ({size}, k), not {given.shape}")
-    changes = np.zeros((given.size // size, states.stepper.given))
-    changes[:, :size] = given.reshape(size, -1).T
-    return _forward(states, changes).reshape(len(states), *given.shape)
+    given = np.eye(size) if directions is None else finite(directions, "directions")
+    found, _ = forward(states, changes_of(states.stepper, given))
+    return found.reshape(len(states), size, *given.shape[1:])
+
+
+def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
+    """(k, given) changes of all that a run starts from: directions of (q, p), or of (q, p, parameters, t, h).
+
+    Raises:
+        StateError: for directions of another shape.
+    """
+    size, given = 2 * stepper.dimension, stepper.given
+    if directions.ndim not in (1, 2) or len(directions) not in (size, given):
+        raise StateError(
+            f"directions have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
+            f"parameters, t, h), not {directions.shape}"
+        )
+    changes = np.zeros((directions[0].size, given))
+    changes[:, : len(directions)] = directions.reshape(len(directions), -1).T
+    return changes
 
 
 def sensitivity(states: KeptStates) -> Sensitivity:
     """Of all states, by all that the run started from."""
-    columns = _forward(states, np.eye(states.stepper.given))
+    columns, _ = forward(states, np.eye(states.stepper.given))
     return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_one_length(states))
 
 
 def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
     """The transpose of :func:`sensitivity` applied to (n, 2m) or (n, 2m, c) slopes of functions by the states."""
-    size, m = 2 * states.stepper.dimension, states.stepper.dimension
-    slopes = _finite(cotangents, "cotangents")
-    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (len(states), size):
-        shape = f"({len(states)}, {size})"
-        raise StateError(
-            f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
-        )
-    seeds = np.zeros((len(states), slopes[0].size // size, states.stepper.given))
-    seeds[:, :, :size] = slopes.reshape(len(states), size, -1).transpose(0, 2, 1)
-    now = np.zeros_like(seeds[0])
+    slopes = checked_slopes(states.stepper, len(states), cotangents)
+    seeds = seeds_of(states.stepper, slopes)
+    found = backward(states, seeds, np.zeros_like(seeds[0]))
+    return gradient_of(states, found.T.reshape(states.stepper.given, *slopes.shape[2:]))
+
+
+def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
+    """(n, c, given) from (n, 2m) or (n, 2m, c)."""
+    size = 2 * stepper.dimension
+    seeds = np.zeros((len(slopes), slopes[0].size // size, stepper.given))
+    seeds[:, :, :size] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
+    return seeds
+
+
+def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
+    """(c, given) slopes at the start, from those by each state and, now, by all that is behind the last."""
     for first, last in reversed(list(pieces(states))):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
@@ -89,25 +126,43 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
         vectors[-1] += now
         carry(states, starts, numbers, vectors, back=True)
         now = vectors[0]
-    found = (now + seeds[0]).T.reshape(states.stepper.given, *slopes.shape[2:])
+    start: Array = now + seeds[0]
+    return start
+
+
+def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
+    """(n, 2m) or (n, 2m, c) as they are; StateError for another shape than of so many states."""
+    size, slopes = 2 * stepper.dimension, finite(cotangents, "cotangents")
+    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (count, size):
+        shape = f"({count}, {size})"
+        raise StateError(
+            f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
+        )
+    return slopes
+
+
+def gradient_of(states: KeptStates, found: Array) -> Gradient:
+    """From (given, ..) slopes."""
+    m = states.stepper.dimension
     return Gradient(
         q=found[:m],
-        p=found[m:size],
-        parameters=found[size:-2],
+        p=found[m : 2 * m],
+        parameters=found[2 * m : -2],
         t=found[-2],
         h=found[-1] if _has_one_length(states) else None,
     )
 
 
-def _finite(given: ArrayLike, name: str) -> Array:
+def finite(given: ArrayLike, name: str) -> Array:
+    """An array of numbers; StateError where some are none."""
     array = real_array(given, name)
     if not np.isfinite(array).all():
         raise StateError(f"there are {name} that are not finite")
     return array
 
 
-def _forward(states: KeptStates, changes: Array) -> Array:
-    """(n, 2m, count) what becomes of (count, given) changes at the start."""
+def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
+    """(n, 2m, count) what becomes of (count, given) changes at the start, and (count, given) at the end."""
     size = 2 * states.stepper.dimension
     found = np.empty((len(states), size, len(changes)))
     found[0] = changes[:, :size].T
@@ -119,7 +174,7 @@ def _forward(states: KeptStates, changes: Array) -> Array:
         kept = np.flatnonzero(numbers[1:] > 0) + 1
         found[numbers[kept]] = vectors[kept, :, :size].transpose(0, 2, 1)
         changes = vectors[-1]
-    return found
+    return found, changes
 
 
 def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:

@@ -39,6 +39,8 @@ class IndexedInterface:
         maps: what symmetries conserve.
         accesses: every access of an array, with the loops around it.
         depends_on_time: whether energy is not conserved.
+        inputs: names of functions of time given as data, each five of the parameters.
+        solver: of the equations of a step, in a word.
     """
 
     prefix: str
@@ -56,6 +58,10 @@ class IndexedInterface:
     maps: tuple[IndexedMap, ...]
     accesses: tuple[tuple[Access, tuple[Loop, ...]], ...]
     depends_on_time: bool
+    inputs: tuple[str, ...] = ()
+    solver: str = "fixed-point"
+    energy_parameter = ""
+    """That of transformed time, which sums over indices do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

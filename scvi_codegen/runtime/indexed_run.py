@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -14,92 +15,102 @@ from numpy.typing import ArrayLike
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.indices import IndexedMap
-from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_interface import (
     IndexedInterface,
     Numbers,
     read_arrays,
     read_state,
 )
+from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.portions import SLICE_SECONDS
 
-__all__ = ["IndexedRun"]
+__all__ = ["IndexedMark", "IndexedRun"]
 
 ADVICE = {
-    "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h",
+    "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
+    "or solver='newton' where the fast motions are stiff bonds at rest",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
+    "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
 }
-MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t")
+NEWTON_ADVICE = {**ADVICE, "not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"}
+CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
+"""Of steps that choose their length."""
+MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOICE)
 """Of a run, beside its arrays."""
+STATE = ("q", "p", "carry_q", "carry_p")
+"""Arrays of numbers that change from step to step, but for what guesses are made of."""
 
 ALIGNMENT = 64
 """Bytes: those of the widest vector."""
 
 
+@dataclass(frozen=True, slots=True)
+class IndexedMark:
+    """A state of a run: its arrays, its numbers, sweeps up to it."""
+
+    arrays: Mapping[str, Numbers]
+    moments: Mapping[str, Any]
+    iterations: int
+
+
 class IndexedRun:
     """The memory of a run; made by :meth:`IndexedStepper.start`.
 
+    Args:
+        problem: what moves.
+        q: positions by name, of the shapes of the problem.
+        moving: momenta, velocities or nothing, by name, and what they are.
+        h: the step; 0 where steps choose their length.
+        t: the time.
+        goal: where such steps lead.
+        options: when sweeps end.
+
     Attributes:
+        problem: its parameters may change on the way.
+        goal, options: as given.
         iterations: sweeps of all steps yet.
-        sizes: value of each size.
     """
 
     def __init__(
         self,
-        interface: IndexedInterface,
-        binding: Binding,
+        problem: IndexedProblem,
+        q: Mapping[str, Numbers],
+        moving: tuple[Any, str],
         *,
-        q: ArrayLike | Mapping[str, ArrayLike],
-        p: ArrayLike | Mapping[str, ArrayLike] | None,
-        velocity: ArrayLike | Mapping[str, ArrayLike] | None,
         h: float,
         t: float,
-        parameters: Mapping[str, ArrayLike] | None,
-        tables: Mapping[str, ArrayLike] | None,
-        options: SolverOptions | None,
+        goal: Goal | None = None,
+        options: SolverOptions | None = None,
     ) -> None:
-        self.interface, self._binding, self.iterations = interface, binding, 0
-        self._options = binding.options(options)
-        given = read_arrays(interface, q, parameters, tables)
-        self.sizes, self._kept = given.sizes, (given.places, given.fields)
-        self._problem = self._new_problem(given.numbers)
-        self._start(given.state, self._momenta(p, velocity), checked_step(h), checked_number(t, "t"))
+        self.problem, self.goal, self.iterations = problem, goal, 0
+        self._binding, self.options = problem.binding, options
+        self._options = self._binding.options(options)
+        self._start(q, moving, h, t)
 
     def __repr__(self) -> str:
         return f"<IndexedRun of {self.interface.title}: {self.sizes}, t = {self.t:g} after {self.steps} steps>"
 
-    def _new_problem(self, numbers: list[float]) -> Any:
-        places, fields = self._kept
-        problem = self._binding.new("problem *")
-        for k, name in enumerate(self.interface.sizes):
-            problem.size[k] = self.sizes[name]
-        for k, array in enumerate(self.interface.fields):
-            problem.field[k] = self._binding.pointer(fields[array.name].reshape(-1))
-        for k, table in enumerate(self.interface.tables):
-            problem.table[k] = self._binding.pointer(places[table.name].reshape(-1))
-        for k, value in enumerate(numbers):
-            problem.parameters[k] = value
-        return problem
+    @property
+    def interface(self) -> IndexedInterface:
+        """Names and shapes."""
+        return self.problem.interface
 
-    def _momenta(self, p: Any, velocity: Any) -> tuple[Any, str]:
-        if velocity is not None and self.interface.momenta:
-            raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
-        if p is not None and velocity is not None:
-            raise StateError("give momenta p or the velocity, not both")
-        return (p, "momenta") if velocity is None else (velocity, "velocities")
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Value of each size."""
+        return self.problem.arrays.sizes
 
     def _start(self, state: Mapping[str, Numbers], moving: tuple[Any, str], h: float, t: float) -> None:
-        n = self._binding.function("coordinates")(self._problem)
+        n = self.problem.count
         state_of, rest_of = aligned(2 * n), aligned(2 * n)  # of a Hamiltonian momenta stand behind positions
         self._numbers = {"q": state_of[:n], "p": state_of[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
         self._numbers["inverse_mass"] = aligned(n)
         self._numbers["work"] = aligned(n * self._binding.constant("WORK"))
-        inverse = self._numbers["inverse_mass"]
-        if self._binding.function("inverse_masses")(self._problem, self._pointer("inverse_mass")):
-            place = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
-            raise StateError(f"coordinate {place} of {n} has no positive mass: every one needs a kinetic energy")
+        self._find_masses()
         self._numbers["q"][:] = self._flat(state)
         given, what = moving
         if given is not None:
@@ -107,11 +118,73 @@ class IndexedRun:
             for name, array in values.items():
                 if array.shape != state[name].shape:
                     raise StateError(f"{what}: '{name}' has the shape {array.shape}, positions {state[name].shape}")
-            self._numbers["p"][:] = self._flat(values) if what == "momenta" else self._flat(values) / inverse
+            flat = self._flat(values)
+            self._numbers["p"][:] = flat if what == "momenta" else flat / self._numbers["inverse_mass"]
         self._run = self._binding.new("run *")
         self._run.t, self._run.h = t, h
         for name in self._numbers:
             setattr(self._run, name, self._pointer(name))
+
+    def _find_masses(self) -> None:
+        inverse = self._numbers["inverse_mass"]
+        if self._binding.function("inverse_masses")(self.problem.struct, self._pointer("inverse_mass")):
+            place = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
+            what = f"coordinate {place} of {len(inverse)}"
+            raise StateError(f"{what} has no positive mass: every one needs a kinetic energy")
+
+    def change(
+        self,
+        *,
+        parameters: Mapping[str, ArrayLike] | Sequence[float] | Numbers | None = None,
+        h: float | None = None,
+        goal: Goal | None = None,
+    ) -> None:
+        """Go on with other parameters (arrays of them, too), another step, another goal; what is not given stays.
+
+        Momenta stay where masses change.
+
+        Raises:
+            StateError: for names, shapes and numbers that do not fit.
+        """
+        if parameters is not None:
+            self.problem = self.problem.with_parameters(parameters)
+            self._find_masses()
+        if h is not None and checked_step(h) != self.h:
+            self._run.h, self._run.guess = h, 0
+        self.goal = goal or self.goal
+
+    def hold(self, **inputs: float) -> None:
+        """Go on with inputs held at numbers: between the samples of a controller."""
+        self.problem = self.problem.held(inputs)
+
+    def apart(self, h: float, goal: Goal | None = None) -> IndexedRun:
+        """A run of its own from the present state, to the last bit, by other steps."""
+        other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, goal=goal, options=self.options)
+        for name in ("carry_q", "carry_p"):
+            other._numbers[name][:] = self._numbers[name]
+        other._run.t_low = self._run.t_low
+        return other
+
+    @property
+    def mark(self) -> IndexedMark:
+        """The present state, for :meth:`rewind`."""
+        kept = {name: self._numbers[name].copy() for name in STATE}
+        moments = {name: getattr(self._run, name) for name in MOMENTS}
+        return IndexedMark(kept, moments, self.iterations)
+
+    def stand_at(self, other: IndexedRun) -> None:
+        """The state and the time of another run of the same problem; no step more, and the next without a guess."""
+        for name in STATE:
+            self._numbers[name][:] = other._numbers[name]
+        self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
+
+    def rewind(self, mark: IndexedMark) -> None:
+        """Back to a state; the next step begins without a guess."""
+        for name, values in mark.arrays.items():
+            self._numbers[name][:] = values
+        for name, value in mark.moments.items():
+            setattr(self._run, name, value)
+        self._run.guess, self.iterations = 0, mark.iterations
 
     def _pointer(self, name: str) -> Any:
         return self._binding.pointer(self._numbers[name])
@@ -179,7 +252,7 @@ class IndexedRun:
     def energies(self) -> tuple[float, float, float]:
         """Kinetic and potential energy of the present state, and their sum, in twice the precision; 0, H and H."""
         found, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
-        self._binding.function("energies")(self._problem, self.t, *pointers, self._binding.pointer(found))
+        self._binding.function("energies")(self.problem.struct, self.t, *pointers, self._binding.pointer(found))
         return (float(found[0]), float(found[1]), float(found[2]))
 
     @property
@@ -203,23 +276,35 @@ class IndexedRun:
         """When that step began."""
         return float(self._run.error_t)
 
+    @property
+    def rejected(self) -> int:
+        """Steps that were tried and taken again, shorter."""
+        return int(self._run.rejected)
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the goal is reached."""
+        return self.goal is not None and self.t == self.goal.t_end
+
     def save(self) -> bytes:
         """All of it, arrays and tables, for :meth:`IndexedStepper.restore`: a file of NumPy's (.npz)."""
-        places, fields = self._kept
-        numbers = [self._problem.parameters[k] for k in range(len(self.interface.parameters))]
-        moments = [getattr(self._run, name) for name in MOMENTS]
-        saved: dict[str, Any] = {f"table {name}": array for name, array in places.items()}
-        saved |= {f"field {name}": array for name, array in fields.items()}
+        arrays, moments = self.problem.arrays, [float(getattr(self._run, name)) for name in MOMENTS]
+        saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
+        saved |= {f"field {name}": array for name, array in arrays.fields.items()}
         saved |= {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
-        file = io.BytesIO()
-        title = np.array(self.interface.title)
-        np.savez(file, title=title, parameters=numbers, moments=moments, iterations=self.iterations, **saved)
+        file, title = io.BytesIO(), np.array(self.interface.title)
+        np.savez(file, title=title, parameters=arrays.numbers, moments=moments, iterations=self.iterations, **saved)
         return file.getvalue()
 
     @classmethod
     def restored(
-        cls, interface: IndexedInterface, binding: Binding, saved: bytes, options: SolverOptions | None
+        cls,
+        interface: IndexedInterface,
+        binding: Binding,
+        saved: bytes,
+        options: SolverOptions | None,
+        goal: Goal | None = None,
     ) -> Self:
         """The run that :meth:`save` gave.
 
@@ -231,19 +316,15 @@ class IndexedRun:
             if str(found["title"]) != interface.title:
                 raise StateError(f"this is a run of '{found['title']}', not of '{interface.title}'")
             moments = dict(zip(MOMENTS, found["moments"].tolist(), strict=True))
-            run = cls(
+            arrays = read_arrays(
                 interface,
-                binding,
-                q={array.name: found[f"state {array.name}"] for array in interface.coordinates},
-                p=None,
-                velocity=None,
-                h=moments["h"],
-                t=moments["t"],
-                parameters=dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
+                {array.name: found[f"state {array.name}"] for array in interface.coordinates},
+                dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
                 | {field.name: found[f"field {field.name}"] for field in interface.fields},
-                tables={table.name: found[f"table {table.name}"] for table in interface.tables},
-                options=options,
+                {table.name: found[f"table {table.name}"] for table in interface.tables},
             )
+            problem = IndexedProblem(interface, binding, arrays)
+            run = cls(problem, arrays.state, (None, ""), h=moments["h"], t=moments["t"], goal=goal, options=options)
             for name, array in run._numbers.items():
                 array[:] = found[f"memory {name}"]
             for name, value in moments.items():
@@ -262,7 +343,7 @@ class IndexedRun:
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] | None = None,
     ) -> None:
-        """So many steps.
+        """So many steps; of those that choose their length no more than lead to the goal.
 
         Args:
             steps: their number.
@@ -274,17 +355,27 @@ class IndexedRun:
         """
         steps, done, portion = checked_count(steps, "steps", least=0), 0, 1
         report = self._binding.new("report *")
-        while done < steps and not (stop and stop()):
+        while done < steps and not self.arrived and not (stop and stop()):
             size, began = min(portion, steps - done), time.perf_counter()
-            status = self._binding.function("advance")(self._run, self._problem, size, self._options, report)
+            status = self._steps(size, report)
             done += report.steps
             self.iterations += report.iterations
             if status:
-                raise step_failure(status, report, step=self.steps, h=self.h, advice=ADVICE)
+                h = 0.0 if self.goal else self.h
+                advice = NEWTON_ADVICE if self.interface.solver == "newton" else ADVICE
+                raise step_failure(status, report, step=self.steps, h=h, advice=advice)
             if progress is not None:
                 progress(self.steps)
             elapsed = max(time.perf_counter() - began, 1e-6)
             portion = max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed)))
+
+    def _steps(self, size: int, report: Any) -> int:
+        """The status of so many."""
+        problem, goal = self.problem.struct, self.goal
+        if goal is None:
+            return int(self._binding.function("advance")(self._run, problem, size, self._options, report))
+        to = (goal.t_end, goal.tolerance, size)
+        return int(self._binding.function("advance_to")(self._run, problem, *to, self._options, report))
 
 
 def aligned(count: int) -> Numbers:

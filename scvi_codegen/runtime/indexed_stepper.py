@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
-from scvi_codegen.runtime.indexed_interface import IndexedInterface
+from scvi_codegen.runtime.compiled_method import no_text
+from scvi_codegen.runtime.driven import checked_inputs, end_of, entered, parameters_at, stretches
+from scvi_codegen.runtime.events import EventLike, as_events
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, read_arrays
+from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
+from scvi_codegen.runtime.inputs import check_inputs_given, check_left_to_inputs
 
 __all__ = ["IndexedStepper"]
 
@@ -26,17 +34,27 @@ __all__ = ["IndexedStepper"]
 class IndexedStepper:
     """One method for one system of any number of coordinates, compiled once for all.
 
+    Args:
+        controlled: gives the text with steps that choose their length; ``None`` where there are none.
+
     Attributes:
         source: the C text.
         interface: names and shapes.
         flags: of the C compiler.
     """
 
-    def __init__(self, source: Source, interface: IndexedInterface, *, flags: tuple[str, ...] = TUNED_FLAGS) -> None:
-        self.source, self.interface, self.flags = source, interface, flags
+    def __init__(
+        self,
+        source: Source,
+        interface: IndexedInterface,
+        *,
+        controlled: Callable[[], Source | None] = no_text,
+        flags: tuple[str, ...] = TUNED_FLAGS,
+    ) -> None:
+        self.source, self.interface, self.flags, self._controlled_text = source, interface, flags, controlled
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_rebuild, (self.source, self.interface, self.flags))
+        return (_rebuild, (self.source, self.interface, self._controlled_text(), self.flags))
 
     def __repr__(self) -> str:
         return f"IndexedStepper({self.interface.title})"
@@ -50,43 +68,69 @@ class IndexedStepper:
     def _binding(self) -> Binding:
         return Binding(load(self.source, flags=self.flags), self.interface.prefix)
 
+    @cached_property
+    def _controlled(self) -> Binding:
+        """With steps that choose their length."""
+        source = self._controlled_text()
+        if source is None:
+            raise MethodError(
+                f"{self.interface.method} has no steps that choose their length for this system: they need a curve "
+                "of velocities or forces at two points or more, which tells the error of a step; give h and steps"
+            )
+        return Binding(load(source, flags=self.flags), self.interface.prefix)
+
     def start(
         self,
         q: ArrayLike | Mapping[str, ArrayLike],
         p: ArrayLike | Mapping[str, ArrayLike] | None = None,
         *,
         velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
-        h: float,
+        h: float | None = None,
         t: float = 0.0,
+        t_end: float | None = None,
+        tolerance: float | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
         options: SolverOptions | None = None,
     ) -> IndexedRun:
-        """A run; arguments as of :meth:`integrate`.
+        """A run by steps of h, or of their own lengths to t_end; arguments as of :meth:`integrate`.
 
         Raises:
             StateError: on wrong names, shapes and numbers, and where an index would leave its array.
+            MethodError: where steps have no error that would choose their length.
         """
+        goal = _goal(h, t_end, tolerance)
+        if velocity is not None and self.interface.momenta:
+            raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
+        if p is not None and velocity is not None:
+            raise StateError("give momenta p or the velocity, not both")
+        arrays = read_arrays(self.interface, q, parameters, tables)
         return IndexedRun(
-            self.interface,
-            self._binding,
-            q=q,
-            p=p,
-            velocity=velocity,
-            h=h,
-            t=t,
-            parameters=parameters,
-            tables=tables,
+            IndexedProblem(self.interface, self._controlled if goal else self._binding, arrays),
+            arrays.state,
+            (p, "momenta") if velocity is None else (velocity, "velocities"),
+            h=0.0 if h is None else checked_step(h),
+            t=checked_number(t, "t"),
+            goal=goal,
             options=options,
         )
 
-    def restore(self, saved: bytes, *, options: SolverOptions | None = None) -> IndexedRun:
-        """The run whose :meth:`IndexedRun.save` gave these bytes, to go on exactly as it would have.
+    def restore(
+        self,
+        saved: bytes,
+        *,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        options: SolverOptions | None = None,
+    ) -> IndexedRun:
+        """The run whose :meth:`IndexedRun.save` gave these bytes, to go on as it would have; give its goal again.
 
         Raises:
             StateError: for bytes that are no saved run, or one of another integrator.
         """
-        return IndexedRun.restored(self.interface, self._binding, saved, options)
+        goal = None if t_end is None else Goal.checked(t_end, tolerance)
+        binding = self._controlled if goal else self._binding
+        return IndexedRun.restored(self.interface, binding, saved, options, goal)
 
     @takes(StateError, parameters=MAPPING, tables=MAPPING, observe=FUNCTION, progress=FUNCTION)
     def integrate(
@@ -95,8 +139,10 @@ class IndexedStepper:
         p: ArrayLike | Mapping[str, ArrayLike] | None = None,
         *,
         velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
-        h: float,
-        steps: int,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
         every: int = 1,
         t: float = 0.0,
         parameters: Mapping[str, ArrayLike] | None = None,
@@ -104,14 +150,17 @@ class IndexedStepper:
         observe: Callable[[IndexedRun], ArrayLike] | None = None,
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
+        events: EventLike | Sequence[EventLike] | None = None,
     ) -> IndexedTrajectory:
-        """Run ``steps`` steps of h and keep every ``every``-th state, the initial one first.
+        """Run ``steps`` steps of h, or to t_end, and keep every ``every``-th state, the initial one first.
 
         Args:
             q: initial positions: an array of the declared shape, or several by name. Their lengths are the sizes.
             p, velocity: momenta, or velocities in their place, in the same way; by default 0.
             h: step, negative to go back.
             steps, every: numbers of steps.
+            t_end: in place of h and steps: where to go, by steps that choose their length. The last ends there exactly.
+            tolerance: error of the end of such a step, relative to the largest coordinate; by default round-off.
             t: initial time.
             parameters: numbers, and arrays of them, by name; others keep their defaults.
             tables: (rows, columns) whole numbers by name; (rows,) do for a single column.
@@ -119,24 +168,106 @@ class IndexedStepper:
                 ``velocity``, ``energy`` are those of the moment; a number or an array, always of one shape.
             options: when sweeps end.
             progress: called now and then with the number of steps done.
+            events: zeros to find, as ``events`` of the trajectory; a terminal one ends it. An
+                :class:`~scvi_codegen.Event`, its function alone, ``"q[0] - 1"``, ``"sum(i in N, q[i]**2) - 5"``, of
+                coordinates, velocities, momenta, parameters and t, or several.
 
         Returns:
-            :class:`IndexedTrajectory`, steps // every + 1 states.
+            :class:`IndexedTrajectory`, steps // every + 1 states; the one at t_end or at a terminal event is kept, too.
 
         Raises:
             StateError: on wrong names, shapes and numbers, where an index would leave its array, and for observations
                 that are no real numbers or change their shape.
+            EventError: for an event that is no formula, or is not finite.
+            MethodError: where steps have no error that would choose their length.
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
         every = checked_count(every, "every", least=1)
-        steps = checked_count(steps, "steps", least=0)
-        run = self.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables, options=options)
-        kept = IndexedRecord(run, observe)
-        kept.follow(steps, every, progress=progress)
-        found = kept.trajectory()
-        warn_of_long_steps(found, remedy="")
-        return found
+        check_inputs_given(self.interface, parameters)
+        if h is not None and steps is None and t_end is None:
+            raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
+        if h is None and steps is not None:
+            raise StateError("so many steps need their length h; those that choose theirs lead to t_end, alone")
+        count = np.inf if steps is None else checked_count(steps, "steps", least=0)
+        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables, "options": options}
+        run = self.start(q, p, velocity=velocity, h=h, t_end=t_end, tolerance=tolerance, **beside)
+        record = IndexedRecord(run, observe, as_events(events))
+        record.follow(count, every, progress=progress)
+        return _said(record)
+
+    @takes(StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION)
+    def drive(
+        self,
+        q: ArrayLike | Mapping[str, ArrayLike],
+        p: ArrayLike | Mapping[str, ArrayLike] | None = None,
+        *,
+        inputs: Mapping[str, Any],
+        velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        every: int = 1,
+        t: float = 0.0,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+        observe: Callable[[IndexedRun], ArrayLike] | None = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        events: EventLike | Sequence[EventLike] | None = None,
+    ) -> IndexedTrajectory:
+        """Run a system whose inputs are data: steps end at their breakpoints, so that the order is kept.
+
+        Args:
+            inputs: by name, as of :meth:`Stepper.drive`: ``(t, values)``, ``(t, values, "cubic")``, a ``CubicSpline``.
+            h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
+            steps, t_end: with h one of both; without it ``t_end``.
+            q, p, velocity, tolerance, every, t, parameters, tables, observe, options, progress, events: as of
+                :meth:`integrate`; states at breakpoints are kept, too.
+
+        Raises:
+            StateError: for inputs that are not given for all of the run, or make no function of time.
+            StepFailedError: if a step fails; its ``trajectory`` holds the states before.
+        """
+        every = checked_count(every, "every", least=1)
+        data, end = checked_inputs(self.interface, inputs), end_of(t, h, steps, t_end)
+        check_left_to_inputs(self.interface, parameters)
+        controlled = {"t_end": end, "tolerance": tolerance} if h is None else {"h": h}
+        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables, "options": options}
+        run = self.start(q, p, velocity=velocity, **controlled, **beside)
+        numbers = np.array(run.problem.arrays.numbers)
+        values = partial(parameters_at, self.interface.parameters, numbers, data)
+        run.change(parameters=values(entered(t, end)))
+        record = IndexedRecord(run, observe, as_events(events))
+        record.take(keep=True)
+        for count in stretches(run, data, end, values):
+            record.go_on(np.inf if count is None else run.steps + count, every, progress=progress, to_end=True)
+            if record.search and record.search.ended:
+                break
+        return _said(record)
 
 
-def _rebuild(source: Source, interface: IndexedInterface, flags: tuple[str, ...]) -> IndexedStepper:
-    return IndexedStepper(source, interface, flags=flags)
+def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal | None:
+    """Where steps lead that choose their length."""
+    if (h is None) == (t_end is None):
+        raise StateError(
+            "the step h, for steps of one length, or t_end, for those that choose theirs: give one of them"
+        )
+    if t_end is not None:
+        return Goal.checked(t_end, tolerance)
+    if tolerance is not None:
+        raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
+    return None
+
+
+def _said(record: IndexedRecord) -> IndexedTrajectory:
+    """What was kept, after what is to be said of its worst step."""
+    found = record.trajectory()
+    warn_of_long_steps(found, remedy="")
+    return found
+
+
+def _rebuild(
+    source: Source, interface: IndexedInterface, controlled: Source | None, flags: tuple[str, ...]
+) -> IndexedStepper:
+    return IndexedStepper(source, interface, controlled=lambda: controlled, flags=flags)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,11 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files.export import write_whole
 from scvi_codegen.native.arguments import real_array
+from scvi_codegen.runtime.dense_output import checked_times
+from scvi_codegen.runtime.events import Event
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.indexed_between import Departure, states_between
+from scvi_codegen.runtime.indexed_events import IndexedCrossings, IndexedSearch
 from scvi_codegen.runtime.indexed_interface import Numbers
 from scvi_codegen.runtime.indexed_run import IndexedRun
 
@@ -31,9 +36,12 @@ class IndexedTrajectory:
         energies: (k, 3) kinetic and potential energy, and their sum.
         maps: (k, count) what symmetries conserve, in the order of ``stepper.momentum_map_names``.
         inverse_masses: 1/m of every coordinate, of the shape of one state; nothing where a Hamiltonian is given.
-        h: step; steps: their number; iterations: sweeps of all of them.
+        h: step, or that of the last where steps choose their length; steps: their number; iterations: sweeps of all.
         step_error, step_error_t: an estimate of the error of the end of the worst step, relative to the largest
             coordinate, and when it began; not numbers for explicit methods.
+        goal: where steps lead that choose their length; rejected: those that were taken again, shorter.
+        events: what was found of each event, in their order.
+        departures: how the run goes on from each state, for those between.
     """
 
     t: Numbers
@@ -48,11 +56,28 @@ class IndexedTrajectory:
     iterations: int
     step_error: float
     step_error_t: float
-    goal: None = None
+    goal: Goal | None = None
+    rejected: int = 0
+    events: tuple[IndexedCrossings, ...] = ()
+    departures: tuple[Departure, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())
-        return f"<IndexedTrajectory of {self.steps} steps of {self.h:g}: {arrays}>"
+        lengths = "" if self.goal else f" of {self.h:g}"
+        return f"<IndexedTrajectory of {self.steps} steps{lengths}: {arrays}>"
+
+    def at(self, t: ArrayLike) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+        """Positions and momenta at (n,) times between those kept, (n, ..) by the name of their array.
+
+        By steps of the method itself from the kept state before, the last of them shorter.
+
+        Raises:
+            StateError: for times outside, and where states were not kept.
+            StepFailedError: if such a step fails.
+        """
+        if len(self.departures) < len(self.t):
+            raise StateError("states between need all that were kept whole: leave out observe")
+        return states_between(self.departures, self.t, self.q, self.p, checked_times(t, "t"))
 
     @property
     def velocity(self) -> dict[str, Numbers]:
@@ -92,10 +117,23 @@ class IndexedTrajectory:
 
 
 class IndexedRecord:
-    """What is kept of a run as it goes."""
+    """What is kept of a run as it goes.
 
-    def __init__(self, run: IndexedRun, observe: Callable[[IndexedRun], ArrayLike] | None = None) -> None:
+    Args:
+        run: at its start.
+        observe: what is kept of a state in place of all of it.
+        events: zeros of functions to look for.
+    """
+
+    def __init__(
+        self,
+        run: IndexedRun,
+        observe: Callable[[IndexedRun], ArrayLike] | None = None,
+        events: Sequence[Event] = (),
+    ) -> None:
         self.run, self.observe = run, observe
+        self.search = IndexedSearch(run, events) if events else None
+        self.departures: list[Departure] = []
         self.t: list[float] = []
         self.energies: list[tuple[float, float, float]] = []
         self.maps: list[Numbers] = []
@@ -104,28 +142,60 @@ class IndexedRecord:
 
     def follow(
         self,
-        steps: int,
+        steps: float,
         every: int,
         *,
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] | None = None,
     ) -> None:
-        """The first state, and every so many-th of so many steps.
+        """The first state, every so many-th of so many steps or of those that lead to a goal, and the one there.
 
         Raises:
             StepFailedError: if one fails; its ``trajectory`` holds the states before.
         """
         self.take(keep=True)
-        while self.run.steps < steps and not (stop and stop()):
+        self.go_on(steps, every, progress=progress, stop=stop)
+
+    def go_on(
+        self,
+        steps: float,
+        every: int,
+        *,
+        progress: Callable[[int], None] | None = None,
+        stop: Callable[[], bool] | None = None,
+        to_end: bool = False,
+    ) -> None:
+        """The same without the first state; the last is kept, too, if it is wanted."""
+        run, last = self.run, self.run.steps
+        self.departures[-1] = Departure.of(run)
+        while run.steps < steps and not self.ended and not (stop and stop()):
             try:
-                self.run.advance(
-                    min(every - self.run.steps % every, steps - self.run.steps), progress=progress, stop=stop
-                )
+                self._advance(int(min(every - run.steps % every, steps - run.steps)), progress, stop)
             except StepFailedError as error:
                 error.trajectory = self.trajectory()
                 raise
-            if self.run.steps % every == 0:
-                self.take(keep=self.run.steps + every > steps)
+            arrived = self.ended or (to_end and run.steps >= steps)
+            if run.steps % every == 0 or arrived:
+                self.take(keep=arrived or run.steps + every > steps)
+                last = run.steps
+        if to_end and last != run.steps:
+            self.take(keep=True)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run is at its goal, or at an event that ends it."""
+        return self.run.arrived or (self.search is not None and self.search.ended)
+
+    def _advance(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
+        if self.search is None:
+            self.run.advance(steps, progress=progress, stop=stop)
+            return
+        for _ in range(steps):
+            self.search.step()
+            if progress is not None:
+                progress(self.run.steps)
+            if self.ended or (stop and stop()):
+                return
 
     def take(self, *, keep: bool) -> None:
         """The present state, whole if nobody observes or it is to be kept."""
@@ -136,6 +206,7 @@ class IndexedRecord:
             self.observed.append(self._observed(self.observe(self.run)))
         if keep or self.observe is None:
             self.states.append((self.run.q, self.run.p))
+            self.departures.append(Departure.of(self.run))
 
     def _observed(self, given: ArrayLike) -> Numbers:
         found, when = real_array(given, "what observe returns"), f"at t = {self.run.t:g}"
@@ -160,6 +231,10 @@ class IndexedRecord:
             iterations=run.iterations,
             step_error=run.step_error,
             step_error_t=run.step_error_t,
+            goal=run.goal,
+            rejected=run.rejected,
+            events=self.search.crossings() if self.search else (),
+            departures=tuple(self.departures),
         )
 
 

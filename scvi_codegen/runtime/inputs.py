@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from scvi_codegen.rendering.source import Interface
 __all__ = [
     "Array",
     "Parameters",
+    "TakesInputs",
     "check_inputs_given",
     "check_left_to_inputs",
     "checked_parameters",
@@ -30,6 +31,22 @@ __all__ = [
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 """By name, others keeping their defaults, or all in order."""
+
+
+class TakesInputs(Protocol):
+    """What is asked of an interface for its inputs."""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names."""
+
+    @property
+    def energy_parameter(self) -> str:
+        """Of transformed time, or nothing."""
 
 
 def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
@@ -84,20 +101,20 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
     return values
 
 
-def inputs_not_given(interface: Interface, parameters: Any) -> tuple[str, ...]:
+def inputs_not_given(interface: TakesInputs, parameters: Any) -> tuple[str, ...]:
     """The inputs of which parameters say nothing; all in order say everything."""
     if parameters is not None and not isinstance(parameters, Mapping):
         return ()
     return tuple(name for name in interface.inputs if f"{name}_0" not in (parameters or {}))
 
 
-def check_inputs_given(interface: Interface, parameters: Any) -> None:
+def check_inputs_given(interface: TakesInputs, parameters: Any) -> None:
     """Raise :class:`StateError` where a step would take an input for 0 that nobody gave."""
     if missing := inputs_not_given(interface, parameters):
         raise missing_input(missing[0])
 
 
-def check_left_to_inputs(interface: Interface, parameters: Any) -> None:
+def check_left_to_inputs(interface: TakesInputs, parameters: Any) -> None:
     """Raise :class:`StateError` for parameters, given by name, that the data of inputs say."""
     for k in columns_of_inputs(interface):
         if isinstance(parameters, Mapping) and (name := interface.parameters[k]) in parameters:
@@ -112,7 +129,7 @@ def missing_input(name: str) -> StateError:
     )
 
 
-def columns_of_inputs(interface: Interface) -> list[int]:
+def columns_of_inputs(interface: TakesInputs) -> list[int]:
     """Places of the parameters that inputs are made of: coefficients by power, and the breakpoint they count from."""
     return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
 

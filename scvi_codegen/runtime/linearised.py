@@ -190,3 +190,34 @@ class LinearisedMethod(CompiledMethod):
             failed = int(report.steps) if not back else len(starts.h) - 1 - int(report.steps)
             raise step_failure(status, report, step=failed, h=float(starts.h[failed]))
         return q1, p1
+
+    def bend(
+        self, starts: Starts, changes: Array, vectors: Array, parameters: Array, options: SolverOptions | None
+    ) -> None:
+        """Carry slopes back along steps, in place, and how they change where what the steps start from does.
+
+        Args:
+            starts: of n steps.
+            changes: (n, count, 2m + k + 2) of (q, p, parameters, t, h) of each step, as :meth:`linearise` carries them.
+            vectors: (n + 1, 2, count, 2m + k + 2) slopes and their changes: to those in i is added what step i makes of
+                those in i + 1.
+            parameters, options: as of :meth:`linearise`.
+
+        Raises:
+            MethodError: in transformed time.
+            StepFailedError: if Newton's iteration does not converge.
+        """
+        binding = self.curvature
+        report = binding.new("report *")
+        status = binding.function("bend")(
+            len(starts.h),
+            *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
+            binding.options(options),
+            vectors.shape[2],
+            *map(binding.pointer, (changes, vectors)),
+            report,
+            binding.workspace(),
+        )
+        if status:
+            failed = len(starts.h) - 1 - int(report.steps)
+            raise step_failure(status, report, step=failed, h=float(starts.h[failed]))

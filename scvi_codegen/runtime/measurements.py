@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,8 +95,32 @@ class Measurements:
         """(n, c) where there is a value."""
         return np.isfinite(self.measured)
 
-    def motion(self, state: Array, changes: Array, parameters: Array) -> tuple[Array, Array]:
-        """(n, c) values at the measurements, (n, c, k) what they change by where the start does by (k, given)."""
+    def cut(self, count: int) -> tuple[Measurements, ...]:
+        """So many parts of about as many measurements, each from that at which the one before ends; at most n - 1."""
+        firsts = np.unique(np.linspace(0, len(self.t), count, endpoint=False).astype(int))
+        nodes = [0, *self.places[firsts[1:]].tolist(), int(self.places[-1])]
+        return tuple(self._part(begin, end, last=end == nodes[-1]) for begin, end in pairwise(dict.fromkeys(nodes)))
+
+    def _part(self, begin: int, end: int, *, last: bool) -> Measurements:
+        """Of the steps from one number until before another."""
+        pieces, done = [], 0
+        for t, h in self.pieces:
+            of = slice(max(begin - done, 0), max(end - done, 0))
+            pieces.append((t[of], h[of]))
+            done += len(h)
+        rows = (self.places >= begin) & ((self.places < end) | last)
+        steps = tuple(piece for piece in pieces if len(piece[1]))
+        start = float(steps[0][0][0])
+        own = replace(self, t=self.t[rows], measured=self.measured[rows], places=self.places[rows] - begin)
+        return replace(own, pieces=steps, start=start)
+
+    def motion(self, state: Array, changes: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+        """What the motion has at the measurements, and where it ends.
+
+        Returns:
+            (n, c) values at the measurements, (n, c, k) what they change by where the start does by (k, given); (2m,)
+            state at the end, (k, given) what that changes by, with all that goes on behind it.
+        """
         m, done = self.stepper.dimension, 0
         values = np.tile(state[self.columns], (len(self.t), 1))  # at the start, also where no step follows
         slopes = np.tile(changes[:, self.columns].T, (len(self.t), 1, 1))
@@ -111,7 +136,7 @@ class Measurements:
             values[here] = states[rows][:, self.columns]
             slopes[here] = vectors[rows][:, :, self.columns].transpose(0, 2, 1)
             state, changes, done = states[-1], vectors[-1], done + len(h)
-        return values, slopes
+        return values, slopes, state, changes
 
 
 def _steps(

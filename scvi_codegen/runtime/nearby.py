@@ -11,6 +11,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import SWITCH, takes
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.gradients import Gradient, carried, pulled_back, sensitivity
+from scvi_codegen.runtime.hessians import hessian_product
 from scvi_codegen.runtime.kept_states import Array, KeptStates
 from scvi_codegen.runtime.linearised import Sensitivity
 from scvi_codegen.runtime.spreading import Changes, along
@@ -29,7 +30,8 @@ class NearbyMotions(KeptStates):
     def tangent(self, directions: ArrayLike | None = None) -> Array:
         """(n, 2m, k) what becomes of (2m, k) directions of (q, p) at the first state; all 2m without any.
 
-        The exact derivative of the computed states, lengths of steps held (:meth:`Stepper.jacobian`).
+        The exact derivative of the computed states, lengths of steps held (:meth:`Stepper.jacobian`). Directions may
+        be (2m + parameters + 2, k), too, of (q, p, parameters, t, h).
 
         Raises:
             MethodError: in transformed time.
@@ -59,6 +61,28 @@ class NearbyMotions(KeptStates):
             StateError: for another shape, and states that do not stand at whole steps.
         """
         return pulled_back(self, cotangents)
+
+    def hessian_product(
+        self, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None = None
+    ) -> Gradient:
+        """The Hessian of a function F of the states, by all that the run started from, times directions.
+
+        The derivative of :meth:`pullback` along directions, exact to round-off: once forward and back along the run
+        for all of them, whatever the number of parameters; with ``np.eye(stepper.given)`` the whole Hessian.
+
+        Args:
+            cotangents: (n, 2m) slopes of F by (q, p) of each state.
+            directions: (2m,) or (2m, k) of (q, p), or (2m + parameters + 2,) or (.., k) of (q, p, parameters, t, h).
+            curvatures: (n, 2m, 2m) second slopes of F by (q, p) of each state; without any, F is linear in the states.
+
+        Returns:
+            A :class:`Gradient`, (m,) or (m, k) and so on: its changes along the directions.
+
+        Raises:
+            MethodError: in transformed time.
+            StateError: for another shape, and states that do not stand at whole steps.
+        """
+        return hessian_product(self, cotangents, directions, curvatures)
 
     def deviations(self, count: int | None = None, *, directions: ArrayLike | None = None) -> Deviations:
         """What becomes of small changes of the initial state: what all indicators of chaos are told from.

@@ -39,7 +39,10 @@ class Stepper(Ensembles):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives)
+        second = (
+            self.second_derivatives if self._with_curvature else None
+        )  # what takes long to derive goes if it is there
+        texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives, second)
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events, self._with_changes))
 
     @takes(StateError, progress=FUNCTION)
@@ -188,7 +191,7 @@ class Stepper(Ensembles):
             StepFailedError: if a step fails; its ``trajectory`` holds the states of that piece before.
         """
         stepper = self if events is None else self.with_events(events)
-        data = checked_inputs(self, inputs)
+        data = checked_inputs(self.interface, inputs)
         end = end_of(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         run = stepper.start(
@@ -247,7 +250,7 @@ def _rebuild(
     events: tuple[Event, ...],
     with_changes: Mapping[int, Source | None],
 ) -> Stepper:
-    ensemble, controlled, fallback, tangent = (*texts, None)[:4]
+    ensemble, controlled, fallback, tangent, curvature = (*texts, None, None)[:5]
     return Stepper(
         source,
         interface,
@@ -255,6 +258,7 @@ def _rebuild(
         controlled=lambda: controlled,
         fallback=lambda: fallback,
         tangent=lambda: tangent,
+        curvature=lambda: curvature,
         changes=with_changes.get,
         flags=flags,
         events=events,

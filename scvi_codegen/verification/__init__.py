@@ -31,6 +31,7 @@ from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
+from scvi_codegen.verification.guesses import guess_checks
 from scvi_codegen.verification.identities import identity_checks
 from scvi_codegen.verification.pace import Pace, of_one_pace, pace_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
@@ -96,6 +97,7 @@ def verify(
     checks = (
         *(pace_checks(Pace(subject, stepper, _in_own_time(system), tolerance)) if paced else ()),
         *step_checks(subject),
+        *guess_checks(subject),
         *(() if system.constraints else roundoff_checks(subject)),
         *structure_checks(subject),
         *derivative_checks(subject),

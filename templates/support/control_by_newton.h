@@ -1,4 +1,5 @@
-/* Trials of steps that choose their length, by Newton's iteration. Before it: run.h, newton_solver.h, stage_error.h. */
+/* Trials of steps that choose their length, by Newton's iteration. Before it: run.h, newton_solver.h, stage_error.h.
+ * After it: rungs.h. */
 #define HOT static
 #define SHORT_STEPS_FAIL 0
 

@@ -94,24 +94,36 @@ static int first_stray(const flow_way *way, const real *states, int length)
   return length;
 }
 
-/* Carries the vectors over so many steps behind those done. */
-static int carry_piece(const flow_way *way, const real *x, long long done, int length, int back, solver_report *report)
+/* How many steps a piece behind those done has. */
+static int piece_after(const flow_way *way, long long done)
+{
+  return (int)(way->steps - done < FLOW_PIECE ? way->steps - done : FLOW_PIECE);
+}
+
+/* Where the steps of a piece behind those done start. */
+static void place_piece(const flow_way *way, const real *x, long long done, int length)
 {
   const real *states = way->states + done * FLOW_STATE;
-  int status, stray;
   for (int k = 0; k < length; k++) {
     way->t[k] = x[GIVEN_H - 1] + (real)(done + k) * x[GIVEN_H];
     way->h[k] = x[GIVEN_H];
     memcpy(way->q + k * M, states + k * FLOW_STATE, sizeof(real) * M);
     memcpy(way->p + k * M, states + k * FLOW_STATE + M, sizeof(real) * M);
   }
+}
+
+/* Carries the vectors over so many steps behind those done. */
+static int carry_piece(const flow_way *way, const real *x, long long done, int length, int back, solver_report *report)
+{
+  int status, stray;
+  place_piece(way, x, done, length);
   status = NAME(linearise)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, back, way->count, way->vectors,
       way->q1, way->p1, report, way->workspace);
   if (status != OK) {
     report->steps = back ? done + length - 1 - report->steps : done + report->steps;
     return status;
   }
-  stray = first_stray(way, states, length);
+  stray = first_stray(way, way->states + done * FLOW_STATE, length);
   if (stray < length) {
     report->steps = done + stray;
     report->t = way->t[stray];
@@ -147,7 +159,7 @@ static int push_along(const flow_way *way, const real *x, const real *changes, r
   memcpy(way->vectors, changes, sizeof(real) * (size_t)across);
   tell_changes(way, 0, way->vectors, kept);
   for (long long done = 0; done < way->steps && status == OK; done += length) {
-    length = (int)(way->steps - done < FLOW_PIECE ? way->steps - done : FLOW_PIECE);
+    length = piece_after(way, done);
     memset(way->vectors + across, 0, sizeof(real) * (size_t)(across * length));
     status = carry_piece(way, x, done, length, 0, report);
     for (int k = 1; k <= length; k++)
@@ -164,7 +176,7 @@ static int pull_along(const flow_way *way, const real *x, const real *kept, real
   int status = OK, length = 0;
   memset(way->vectors, 0, sizeof(real) * (size_t)across);
   for (long long end = way->steps; end > 0 && status == OK; end -= length) {
-    length = (int)(end < FLOW_PIECE ? end : FLOW_PIECE);
+    length = piece_after(way, way->steps - end);
     memcpy(way->vectors + length * across, way->vectors, sizeof(real) * (size_t)across);
     memset(way->vectors, 0, sizeof(real) * (size_t)(across * length));
     for (int k = 1; k <= length; k++)

@@ -19,14 +19,14 @@ static parts_of_work divide(const run_memory *run, long long n)
 }
 
 /* Slopes continued from former steps. */
-static void continue_slopes(const run_memory *run, const parts_of_work *parts, long long n)
+static void continue_slopes(const parts_of_work *parts, long long n, const struct guess_tables *tables, long long guess)
 {
   const long long apart = 2 * n;
   for (int g = 0; g < GROUPS; g++)
     for (long long i = 0; i < apart; i++)
-      parts->G[g * apart + i] = run->guess == 1
-          ? given_by_all(LAST_ALONE, g, &parts->last[i], apart)
-          : given_by_all(LAST, g, &parts->last[i], apart) + given_by_all(BEFORE, g, &parts->before[i], apart);
+      parts->G[g * apart + i] = guess == 1 ? given_by_all(tables->alone, g, &parts->last[i], apart)
+                                           : given_by_all(tables->last, g, &parts->last[i], apart) +
+              given_by_all(tables->before, g, &parts->before[i], apart);
 }
 
 /* n places of y from `first` on by their rates, of which a table and weights make increments; returned is the sum of
@@ -101,15 +101,17 @@ static void move(run_memory *run, const lanes *rates, const lanes *end, const la
   }
 }
 
-/* Errors of positions become errors of momenta in a sweep, and back in the next: changes are judged in pairs. */
-static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
-    solver_report *report)
+/* Sweeps until the points rest. Errors of positions become errors of momenta in a sweep, and back in the next: changes
+ * are judged in pairs. The tables continue so many steps; then `guess` is how many are best continued into the next,
+ * and `error` what the curve leaves unresolved. */
+static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
+    long long *guess, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
-  double first = 0.0, last = INFINITY, change = 0.0, error;
+  double first = 0.0, last = INFINITY, change = 0.0;
   int status = 0;
-  if (run->guess > 0)
-    continue_slopes(run, &parts, n);
+  if (*guess > 0)
+    continue_slopes(&parts, n, tables, *guess);
   else
     memset(parts.G, 0, sizeof(lanes) * GROUPS * 2 * (size_t)n);
   for (int k = 0; status == 0; k++) {
@@ -130,14 +132,15 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
     return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
   if (!finite_slopes(parts.G, n))
     return NOT_FINITE;
-  error = unresolved(run, parts.G + n, n);
-  if (run->error == run->error && !(error <= run->error)) {
-    run->error = error;
-    run->error_t = run->t;
-  }
-  move(run, parts.G + n, POINT_END_POSITION, POSITION_WEIGHT, 0, n);
-  move(run, parts.G, POINT_END_MOMENTUM, MOMENTUM_WEIGHT, n, n);
-  run->guess = run->guess > 0 && first < GOOD_GUESS ? 2 : 1;
-  run->turn = (run->turn + 1) % 3;
+  *error = unresolved(run, parts.G + n, n);
+  *guess = steps_to_continue(*guess, first);
   return OK;
+}
+
+/* On to the end of the step that was solved. */
+static void go_on(run_memory *run, long long n)
+{
+  const lanes *G = divide(run, n).G;
+  move(run, G + n, POINT_END_POSITION, POSITION_WEIGHT, 0, n);
+  move(run, G, POINT_END_MOMENTUM, MOMENTUM_WEIGHT, n, n);
 }

@@ -1,6 +1,6 @@
-/* A step of any number of coordinates by sweeps, for constant diagonal masses and forces of position, time and perhaps
- * velocity: that of separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h,
- * contraction.h, the tables, forces. */
+/* A step of any number of coordinates, for constant diagonal masses and forces of position, time and perhaps velocity:
+ * that of separable_sweep.h, a coordinate at a time, with norms over all of them. Before it: points.h, contraction.h,
+ * the tables, forces. After it: solve, by sweeps or by Newton's iteration. */
 
 /* The parts of work, group after group of points: positions of all coordinates (velocities behind them), and forces
  * there in this step, the last and the one before. */
@@ -49,7 +49,8 @@ static void forces_at_points(const run_memory *run, const problem *given, const 
 
 /* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate, and its
  * drift. */
-static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
+static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n,
+    const struct guess_tables *tables, long long guess)
 {
   double largest = DBL_MIN;
   for (long long i = 0; i < n; i++) {
@@ -57,14 +58,15 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
       lanes bend = lanes_of(0.0);
-      if (run->guess == 1)
-        bend = given_by_all(LAST_ALONE, g, &parts->last[i], n);
-      else if (run->guess > 1)
-        bend = given_by_all(LAST, g, &parts->last[i], n) + given_by_all(BEFORE, g, &parts->before[i], n);
+      if (guess == 1)
+        bend = given_by_all(tables->alone, g, &parts->last[i], n);
+      else if (guess > 1)
+        bend = given_by_all(tables->last, g, &parts->last[i], n) +
+            given_by_all(tables->before, g, &parts->before[i], n);
       if (VELOCITIES) /* forces were continued, of which velocities are made, too */
         parts->F[g * n + i] = bend;
       parts->X[g * OF_EACH * n + i] = run->q[i] + DRIFT[g] * drift;
-      if (!VELOCITIES && run->guess > 0)
+      if (!VELOCITIES && guess > 0)
         parts->X[g * OF_EACH * n + i] += unit * bend;
     }
     for (int g = 0; VELOCITIES && g < GROUPS; g++)
@@ -72,74 +74,6 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
     largest = larger(largest, fabs(run->q[i]) + fabs(drift));
   }
   return largest;
-}
-
-/* The points by the forces; returned is the sum of the squares of what that changes, and added to `size`, if it is not
- * NULL, that of the sizes of the coordinates. */
-static double improve(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n, double *size)
-{
-  lanes total = lanes_of(0.0);
-  for (long long i = 0; i < n; i++) {
-    double low;
-    const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes x = (run->q[i] + DRIFT[g] * drift) + unit * given_by_all(PRODUCT, g, &parts->F[i], n);
-      const lanes moved = x - parts->X[g * OF_EACH * n + i];
-      total += moved * moved;
-      parts->X[g * OF_EACH * n + i] = x;
-    }
-    if (size) {
-      const double of_one = fabs(run->q[i]) + fabs(drift) + fabs(unit * at_point(&parts->F[i], n, 0));
-      *size += of_one * of_one;
-    }
-  }
-  return lanes_total(total);
-}
-
-#if VELOCITIES
-/* Velocities at the points by the forces; returned is the sum of the squares of what that changes, times h. */
-static double improve_velocities(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
-{
-  lanes total = lanes_of(0.0);
-  for (int g = 0; g < GROUPS; g++) {
-    lanes *V = parts->X + (g * OF_EACH + 1) * n;
-    for (long long i = 0; i < n; i++) {
-      const lanes kick = run->carry_p[i] + by->h * given_by_all(VELOCITY, g, &parts->F[i], n);
-      const lanes v = run->inverse_mass[i] * (run->p[i] + kick), moved = by->h * (v - V[i]);
-      total += moved * moved;
-      V[i] = v;
-    }
-  }
-  return lanes_total(total);
-}
-#else
-static double improve_velocities(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
-{
-  (void)run, (void)parts, (void)by, (void)n;
-  return 0.0;
-}
-#endif
-
-/* x + (y + rest) for a rest that is less than the rounding of x + y, which would round it away. */
-static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
-{
-  const lanes sum = x + y, part = sum - x;
-  return sum + (((x - (sum - part)) + (y - part)) + rest);
-}
-
-/* The points with all digits of the coefficients. */
-static void last_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n)
-{
-  for (long long i = 0; i < n; i++) {
-    double drift_low;
-    const double drift = drift_of(run, i, &drift_low), inverse = run->inverse_mass[i];
-    for (int g = 0; g < GROUPS; g++) {
-      const lanes sum = given_by_all(PRODUCT, g, &parts->F[i], n), low = given_by_all(PRODUCT_LOW, g, &parts->F[i], n);
-      const lanes rest = run->carry_q[i] + DRIFT[g] * drift_low + DRIFT_LOW[g] * drift;
-      parts->X[g * OF_EACH * n + i] = sum_of_three(lanes_of(run->q[i]), DRIFT[g] * drift + inverse * (by->square * sum),
-          rest + inverse * (by->square * low + by->square_low * sum));
-    }
-  }
 }
 
 /* The largest coordinate at the last point: of a step from rest at 0 the only size there is. */
@@ -190,42 +124,9 @@ static void move(run_memory *run, const lanes *F, const lengths *by, long long n
   }
 }
 
-/* Sweeps until the points rest; then once more with all digits of the coefficients, and on to the end of the step. */
-static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
-    solver_report *report)
+/* On to the end of the step that was solved. */
+static void go_on(run_memory *run, long long n)
 {
-  const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
-  double largest = first_positions(run, &parts, &by, n), size = 0.0, first = 0.0, last = INFINITY, error;
-  int status = 0;
-  improve_velocities(run, &parts, &by, n);
-  forces_at_points(run, given, parts.X, parts.F, n);
-  for (int k = 0; status == 0; k++) {
-    double change = improve(run, &parts, &by, n, k == 0 ? &size : NULL);
-    change += improve_velocities(run, &parts, &by, n);
-    change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
-    forces_at_points(run, given, parts.X, parts.F, n);
-    status = sweep_status(change, last, options, k);
-    first = k == 0 ? change : first;
-    last = change;
-    report->iterations++;
-  }
-  report->change = sqrt(last);
-  if (status < 0)
-    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
-  last_positions(run, &parts, &by, n);
-  if (largest <= DBL_MIN)
-    largest = largest_at_end(parts.X, n);
-  improve_velocities(run, &parts, &by, n);
-  forces_at_points(run, given, parts.X, parts.F, n);
-  if (!examine(run, parts.F, &by, n, largest, &error))
-    return NOT_FINITE;
-  if (run->error == run->error && !(error <= run->error)) {
-    run->error = error;
-    run->error_t = run->t;
-  }
-  move(run, parts.F, &by, n);
-  run->guess = run->guess > 0 && first < GOOD_GUESS ? 2 : 1;
-  run->turn = (run->turn + 1) % 3;
-  return OK;
+  move(run, divide(run, n).F, &by, n);
 }

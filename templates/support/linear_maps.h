@@ -32,7 +32,8 @@ typedef void slope_kernel(const real *u, real t, const real *parameters, real *v
 typedef void value_kernel(const real *u, real t, const real *parameters, real *value);
 
 /* Points of one kind: how many there are of everything; where arguments come from, where results go; the kernel with
- * its slopes by the arguments, and, given ones, by parameters and time: {i, j}, j from the first parameter on. */
+ * its slopes by the arguments, and, given ones, by parameters and time: {i, j}, j from the first parameter on; how all
+ * of these change, where results are not linear and it is asked for. */
 typedef struct {
   int points, arguments, results, slopes, given, gathers, scatters, blocks;
   const linear_loop *gather, *scatter;
@@ -41,6 +42,7 @@ typedef struct {
   slope_kernel *kernel;
   value_kernel *by_given;
   const int (*given_pair)[2];
+  value_kernel *curvature;
 } point_family;
 
 static real power_of(real h, int k)
@@ -51,6 +53,23 @@ static real power_of(real h, int k)
   return k < 0 ? 1 / product : product;
 }
 
+/* The arguments at each point. */
+static void arguments_of(const point_family *f, const step_data *step, const real *z, real *at)
+{
+  for (int g = 0; g < f->gathers; g++) {
+    const linear_loop *loop = f->gather + g;
+    const real scale = power_of(step->h, loop->power);
+    gather(loop->table, f->points, scale, z + loop->first * B, loop->sites, at + loop->offset, f->arguments, 1);
+    if (loop->from_state)
+      offset(step, f->points, at + loop->offset, f->arguments);
+  }
+}
+
+static real time_of(const point_family *f, const step_data *step, int n)
+{
+  return step->t + (f->abscissa ? f->abscissa[n] * step->h : 0);
+}
+
 /* At each point: by h, unknowns held, the slopes of arguments and of what results are multiplied by; those of results
  * by arguments; those by parameters and time. Returns where they end. */
 static real *slopes_of(const point_family *f, const step_data *step, const real *z, real *by_h)
@@ -58,15 +77,9 @@ static real *slopes_of(const point_family *f, const step_data *step, const real 
   const real h = step->h;
   real *value = by_h + f->points * f->arguments, *slope = value + f->points * f->results;
   real *given = slope + f->points * f->slopes;
-  for (int g = 0; g < f->gathers; g++) {
-    const linear_loop *loop = f->gather + g;
-    real *u = by_h + loop->offset;
-    gather(loop->table, f->points, power_of(h, loop->power), z + loop->first * B, loop->sites, u, f->arguments, 1);
-    if (loop->from_state)
-      offset(step, f->points, u, f->arguments);
-  }
+  arguments_of(f, step, z, by_h);
   for (int n = 0; n < f->points; n++) {
-    const real t = step->t + (f->abscissa ? f->abscissa[n] * h : 0), *u = by_h + n * f->arguments;
+    const real t = time_of(f, step, n), *u = by_h + n * f->arguments;
     f->kernel(u, t, step->parameters, value + n * f->results, slope + n * f->slopes);
     if (f->given)
       f->by_given(u, t, step->parameters, given + n * f->given);

@@ -117,11 +117,11 @@ static void push_step(const linearised_step *at)
   flow(0, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
 }
 
-/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): its transpose. */
-static void pull_step(const linearised_step *at)
+/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): its transpose. In dz stand
+ * slopes by unknowns that there are beside it. */
+static void pull_on(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
-  memset(at->dz, 0, sizeof(wide) * N);
   flow(1, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
   for (int i = 0; i < M; i++)
     flow(1, at->v + M + i, 1, at->rows + i * (B + 1) + B);
@@ -130,6 +130,12 @@ static void pull_step(const linearised_step *at)
   solve_back(at);
   through_points(at, 1, at->v, NULL);
   momentum_rows(at, 1);
+}
+
+static void pull_step(const linearised_step *at)
+{
+  memset(at->dz, 0, sizeof(wide) * N);
+  pull_on(at);
 }
 
 /* Adds to vectors `to` what the step makes of `from`, WIDTH at a time. */

@@ -27,21 +27,31 @@ static XLA_FFI_Error *failure(const XLA_FFI_CallFrame *frame, int status, const 
   return frame->api->XLA_FFI_Error_Create(&error);
 }
 
+/* How many steps, and how many between kept states, as attributes, which come sorted by name; count at a time. */
+static flow_way way_of(const XLA_FFI_CallFrame *frame, int count)
+{
+  const long long *every = ((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
+  const long long *steps = ((XLA_FFI_Scalar *)frame->attrs.attrs[1])->value;
+  const flow_way way = {.steps = *steps, .every = *every, .count = count};
+  return way;
+}
+
+static long long rows_of(const XLA_FFI_Buffer *x)
+{
+  long long rows = 1;
+  for (long long i = 0; i + 1 < x->rank; i++)
+    rows *= x->dims[i];
+  return rows;
+}
+
 /* x (.., GIVEN), and for changes and slopes those, (.., count, size), to results. */
 static XLA_FFI_Error *flow_of_frame(flow_part part, XLA_FFI_CallFrame *frame)
 {
   const XLA_FFI_Buffer *x = frame->args.args[0], *given = part == FLOW_STATES ? x : frame->args.args[1];
   const XLA_FFI_Buffer *found = frame->rets.rets[0];
-  const long long *every = ((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value; /* attributes come sorted by name */
-  const long long *steps = ((XLA_FFI_Scalar *)frame->attrs.attrs[1])->value;
-  const int count = part == FLOW_STATES ? 0 : (int)given->dims[x->rank - 1];
-  flow_way way = {.steps = *steps, .every = *every, .count = count};
+  flow_way way = way_of(frame, part == FLOW_STATES ? 0 : (int)given->dims[x->rank - 1]);
   solver_report report;
-  long long rows = 1;
-  int status;
-  for (long long i = 0; i + 1 < x->rank; i++)
-    rows *= x->dims[i];
-  status = flow_rows(part, &way, rows, x->data, given->data, found->data, &report);
+  const int status = flow_rows(part, &way, rows_of(x), x->data, given->data, found->data, &report);
   return status == OK ? NULL : failure(frame, status, &report);
 }
 

@@ -481,8 +481,9 @@ class TestTables:
     def test_growth_is_measured(self, monkeypatch):
         monkeypatch.setattr(sums, "GROWTH", (100, 100_000))
         rows = sums.run_growth(bench.Plan(quick=True), lambda text: None).rows
-        assert [row["coordinates"] for row in rows] == [100, 100_000] * 3
-        assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::2], rows[1::2], strict=True))
+        assert [row["coordinates"] for row in rows] == [100, 100_000, 256] * 3
+        assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::3], rows[1::3], strict=True))
+        assert all(row["gigabytes_s"] > 0.0 for row in rows)
 
     @pytest.mark.full
     def test_compilers_and_processors_are_measured(self, monkeypatch):

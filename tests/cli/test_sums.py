@@ -141,6 +141,26 @@ def test_generate(ring: str) -> None:
     assert invoke("generate", ring, "-o", "ring_svi", "--force").exit_code == 0
 
 
+def test_a_folder_is_verified_as_it_stands(ring: str, tmp_path: Path) -> None:
+    """Also with arrays from files, which are elsewhere later; a fault in its C is found."""
+    np.save("start.npy", np.sin(np.arange(8.0)))
+    Path("masses.csv").write_text("m\n" + "".join(f"{1 + k / 8}\n" for k in range(8)))
+    text = RING.replace('q = "sin(2*pi*i/N)"', 'q = { file = "start.npy" }').replace(
+        "i in N, q_dot", "i in N, m[i]*q_dot"
+    )
+    Path("ring.toml").write_text(text.replace("k = 1.0", 'k = 1.0\n"m[N]" = { file = "masses.csv" }'))
+    assert invoke("generate", ring, "-o", "ring_svi").exit_code == 0
+    Path("start.npy").unlink()
+    result = invoke("verify", "ring_svi")
+    assert result.exit_code == 0, result.output
+    assert set(json.loads(Path("ring_svi/certificate.json").read_text())["q"]) < set(np.sin(np.arange(8.0)).tolist())
+    code = Path("ring_svi/ring_svi.c").read_text()
+    assert "parameters[0]" in code
+    Path("ring_svi/ring_svi.c").write_text(code.replace("shift_i_plus_1]", "shift_i_plus_1 - 1]"))
+    result = invoke("verify", "ring_svi")
+    assert result.exit_code == 1, result.output
+
+
 @pytest.mark.parametrize("axes", ["q[N]", "q[N, 2]", "q[N, M]"])
 def test_pictures(axes: str, tmp_path: Path) -> None:
     """Of a line in time, of bodies, of a plane."""

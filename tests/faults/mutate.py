@@ -13,6 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import re
+import shutil
 import sys
 import tempfile
 from collections import Counter
@@ -22,8 +24,11 @@ from checkout import ROOT, copied, run
 from operators import Place, places
 
 PACKAGE = ("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables")
+DERIVING = ("ir", "lowering", "rendering", "methods", "mechanics", "formulas", "tables")
+"""What all cases come from; of the others one shows as much."""
 NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
 """Words for people; their tests are of words."""
+OF_C = ("support/*.h", "*.c.jinja", "parts/*.c.jinja", "parts/newton/*.c.jinja")
 CERTIFIED = (
     "kepler/svi-3",
     "cart/svi",
@@ -33,20 +38,47 @@ CERTIFIED = (
     "kepler/composition",
     "double/verlet",
 )
+MOST_CASES = 4
 NEAR: dict[str, tuple[str, ...]] = {
+    "templates/support/indexed": (
+        "runtime/test_indexed.py",
+        "verification/test_indexed.py",
+        "rendering/test_indexed.py",
+    ),
+    "templates/indexed": ("runtime/test_indexed.py", "rendering/test_indexed.py"),
+    "templates/main": ("models/test_package.py",),
+    "templates/parts/main": ("models/test_package_inputs.py",),
+    "templates/support/constraints": ("methods/test_constraints.py", "methods/test_rolling.py"),
+    "templates/support/density": ("runtime/test_density.py",),
+    "templates/support/exchanges": ("runtime/test_exchanges.py",),
+    "templates/support/inputs": ("runtime/test_driven.py", "models/test_package_inputs.py"),
+    "templates/support/push": ("runtime/test_sensitivity.py", "runtime/test_deviations.py"),
+    "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
+    "templates/support/flow": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
+    "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
+    "templates/support/xla": ("frameworks/test_jax.py", "rendering/test_flow_text.py"),
+    "templates/support/float": ("rendering/test_c_text.py",),
+    "templates/support/lent": ("runtime/test_fallback.py",),
+    "templates/support/borrowed": ("runtime/test_fallback.py",),
+    "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
     "templates/support/events": ("runtime/test_events.py",),
     "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
     "templates/support/control": ("runtime/test_controlled_steps.py", "lowering/test_ladder.py"),
     "templates/support/legendre": ("runtime/test_given_velocities.py", "runtime/test_stepper.py"),
     "templates/support/clock": ("runtime/test_clock.py", "mechanics/test_transformed_time.py"),
-    "templates/support/newton": ("lowering/test_newton.py", "lowering/test_stiff_newton.py"),
-    "templates/support/band": ("lowering/test_newton.py", "lowering/test_ordering.py"),
+    "templates/support/newton": (
+        "lowering/test_iterations.py",
+        "lowering/test_newton.py",
+        "lowering/test_stiff_newton.py",
+    ),
+    "templates/support/band": ("lowering/test_band.py", "lowering/test_newton.py"),
     "templates/support/crowd": ("runtime/test_ensemble.py",),
     "templates/support/many": ("runtime/test_ensemble.py",),
     "templates/support/trajectories": ("runtime/test_ensemble.py", "runtime/test_drift.py"),
     "templates/": (
+        "lowering/test_iterations.py",
+        "lowering/test_sweeps.py",
         "lowering/test_contraction.py",
-        "lowering/test_counts.py",
         "runtime/test_quantities.py",
         "lowering/test_collocation_solver.py",
         "runtime/test_stepper.py",
@@ -71,6 +103,22 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_clock.py",
         "runtime/test_distributed.py",
     ),
+    "scvi_codegen/runtime/indexed": ("runtime/test_indexed.py", "models/test_indexed_model_file.py"),
+    **{
+        f"scvi_codegen/runtime/{stem}": ("runtime/test_deviations.py", "runtime/test_tangents.py")
+        for stem in ("changes_in_lanes", "spreading", "nearby", "growth", "deviations")
+    },
+    **{
+        f"scvi_codegen/runtime/{stem}": ("runtime/test_sensitivity.py", "runtime/test_periodic.py")
+        for stem in ("gradients", "linearised", "compiled_method", "periodic")
+    },
+    "scvi_codegen/runtime/driven": ("runtime/test_driven.py", "runtime/test_driven_ensemble.py"),
+    "scvi_codegen/runtime/longest": ("runtime/test_longest_step.py",),
+    "scvi_codegen/runtime/constrain": ("methods/test_constraints.py", "methods/test_rolling.py"),
+    "scvi_codegen/lowering/indexed": ("lowering/test_indexed_sums.py", "runtime/test_indexed.py"),
+    "scvi_codegen/rendering/indexed": ("rendering/test_indexed.py", "runtime/test_indexed.py"),
+    "scvi_codegen/mechanics/indexed": ("mechanics/test_indexed.py", "runtime/test_indexed.py"),
+    "scvi_codegen/formulas/indexed": ("formulas/test_indexed.py", "runtime/test_indexed.py"),
     "scvi_codegen/native": ("native",),
     "scvi_codegen/mechanics": ("mechanics",),
     "scvi_codegen/files": ("files", "results/test_recording.py", "results/test_ensemble_files.py"),
@@ -79,14 +127,19 @@ NEAR: dict[str, tuple[str, ...]] = {
 }
 
 
-MOST_WORDS = 160
+OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
+PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *OF_CLANG)
+NOTHING_RUN = 4
+"""Status of pytest where a name was cut."""
+MOST_WORDS = 300
 """Of a result: characters of what noticed the fault."""
 
 
 def drawn(count: int, seed: int, only: str) -> list[Place]:
     """As many faults of C as of Python, of each file about as many as it has lines."""
     python = [path for room in PACKAGE for path in (ROOT / "scvi_codegen" / room).rglob("*.py")]
-    kinds = (list((ROOT / "templates/support").glob("*.h")), [path for path in python if path.name not in NOT_TRIED])
+    templates = [path for way in OF_C for path in (ROOT / "templates").glob(way)]
+    kinds = (templates, [path for path in python if path.name not in NOT_TRIED])
     chooser, chosen = random.Random(seed), []
     for files in kinds:
         own = [place for path in sorted(files) for place in places(ROOT, str(path.relative_to(ROOT)))]
@@ -95,26 +148,39 @@ def drawn(count: int, seed: int, only: str) -> list[Place]:
     return [place for pair in zip(*chosen, strict=False) for place in pair] if all(chosen) else chosen[0] or chosen[1]
 
 
-def near(path: str) -> tuple[str, ...]:
-    """The test files that stand next to a file; the longest beginning decides."""
+def near(path: str) -> list[str]:
+    """The test files that stand next to a file: that of its name, and those of the longest beginning of its path."""
     key = max((key for key in NEAR if path.startswith(key)), key=len)
-    return tuple(f"tests/{name}" for name in NEAR[key])
+    own = sorted(str(found.relative_to(ROOT)) for found in ROOT.glob(f"tests/*/test_{Path(path).stem}.py"))
+    return list(dict.fromkeys([*own, *(f"tests/{name}" for name in NEAR[key])]))
 
 
 def noticed(copy: Path, place: Place) -> tuple[str, str]:
     """What noticed a fault, and in which words; ``""`` if nothing did."""
-    cases = [case for case in CERTIFIED if not place.path.startswith("templates") or place.path in used(copy)[case]]
+    cases = [case for case in CERTIFIED if certifies(copy, case, place.path)][:MOST_CASES]
     code, output = run(copy, sys.executable, "tests/faults/certify.py", *cases) if cases else (0, "")
     if code == 3:
         return "stillborn", output[:MOST_WORDS]
     if code:
         return "certificate", output[:MOST_WORDS]
-    existing = [name for name in near(place.path) if (copy / name).exists()]
-    for name in existing:
-        code, output = run(copy, sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", name)
+    for name in near(place.path):
+        code, output = run(copy, *PYTEST, name)
         if code:
             return name, output[:MOST_WORDS]
     return "", ""
+
+
+def fails_anyway(copy: Path, words: str) -> bool:
+    """Whether the test that noticed a fault does so without one: something it needs is not there."""
+    failed = re.search(r"tests/\S+\.py::.*?(?= - |$)", words)
+    return failed is not None and run(copy, *PYTEST, failed[0])[0] not in (0, NOTHING_RUN)
+
+
+def certifies(copy: Path, case: str, path: str) -> bool:
+    """Whether the certificate of a case has to do with a file."""
+    if path.startswith("templates/support"):
+        return path in used(copy)[case]
+    return path.startswith(("templates", *(f"scvi_codegen/{room}" for room in DERIVING))) or case == CERTIFIED[0]
 
 
 USED: dict[str, set[str]] = {}
@@ -148,6 +214,8 @@ def main() -> None:
             (copy / place.path).write_text(place.applied(text))
             by, words = noticed(copy, place)
             (copy / place.path).write_text(text)
+            if by not in ("", "stillborn", "certificate") and fails_anyway(copy, words):
+                raise SystemExit(f"without the fault, too: {words}")
             known[fault] = by
             with given.results.open("a") as results:
                 results.write(json.dumps({"fault": fault, "caught by": by, "words": words}) + "\n")

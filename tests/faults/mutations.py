@@ -31,6 +31,7 @@ from faults import (
     wrong_rule,
     wrong_tableau,
 )
+from iterations import ITERATIONS
 from paces import PACES
 from sabotage import changed_property, changed_result, of_entries
 
@@ -398,4 +399,5 @@ MUTATIONS = (
     Mutation("the chain rule of L_d lost", case("kepler/scvi"), as_printed),
     *BESIDE,
     *PACES,
+    *ITERATIONS,
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from checkout import ROOT, copied, run
+from mutate import NEAR
 from tiers import first_of_each
 
 Edit = dict[str, str]
@@ -36,6 +37,11 @@ def test_edits_find_their_text() -> None:
         if (ROOT / edit["file"]).read_text("utf-8").count(edit["old"]) != 1
     ]
     assert lost == []
+
+
+def test_what_random_faults_are_shown_to_is_there() -> None:
+    """Tests that were moved would notice nothing, and nobody that they do not."""
+    assert [name for names in NEAR.values() for name in names if not (ROOT / "tests" / name).exists()] == []
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,31 @@ def test_transformations_apply_in_any_order():
     assert_allclose(along, together[0][0] @ jnp.array([0.3, 0.4]), rtol=1e-11)
 
 
+@pytest.mark.parametrize("every", [None, 50])
+def test_second_derivatives_are_those_of_leapfrog(every):
+    """Which JAX differentiates twice itself; forward and back over a gradient, compiled, of batches, times vectors."""
+    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, every=every)
+
+    def along(x):
+        q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
+        return (q**2 * p + jnp.sin(p)).sum()
+
+    def expected_along(x):
+        q, p = leapfrog(x)[:, :: every or STEPS]
+        q, p = (q, p) if every else (q[-1:], p[-1:])
+        return (q**2 * p + jnp.sin(p)).sum()
+
+    x = given()
+    expected = jax.hessian(expected_along)(x)
+    size = np.abs(expected).max()
+    assert_allclose(jax.jit(jax.hessian(along))(x), expected, atol=1e-11 * size)
+    assert_allclose(jax.jacrev(jax.grad(along))(x), expected, atol=1e-11 * size)
+    beside = jax.vmap(jax.hessian(along))(jnp.stack([1.01 * x, x]))
+    assert_allclose(beside[1], expected, atol=1e-11 * size)
+    product = jax.jvp(jax.grad(along), (x,), (jnp.arange(8.0),))[1]
+    assert_allclose(product, expected @ jnp.arange(8.0), atol=1e-10 * size)
+
+
 def test_a_jacobian_linearises_a_trajectory_once():
     flow = jax_flow(kepler(), steps=30)
     q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
@@ -202,8 +227,10 @@ def test_a_step_that_fails_says_when():
 def test_what_there_is_not_is_refused():
     q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
     flow = jax_flow(kepler(), steps=5)
-    with pytest.raises(MethodError, match="no second derivatives"):
-        jax.hessian(lambda q: flow(q, p, h=H)[0].sum())(q)
+    with pytest.raises(MethodError, match=r"no second derivatives forward of forward.* take jax\.hessian"):
+        jax.jacfwd(jax.jacfwd(lambda q: flow(q, p, h=H)[0].sum()))(q)
+    with pytest.raises(MethodError, match="no third derivatives"):
+        jax.jacrev(jax.hessian(lambda q: flow(q, p, h=H)[0].sum()))(q)
     with pytest.raises(StateError, match="q is float32, but a flow is computed in binary64"):
         flow(q.astype(jnp.float32), p, h=H)
     with pytest.raises(StateError, match=r"p must have shape \(.., 2\), not \(3,\)"):

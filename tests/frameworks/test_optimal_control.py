@@ -160,3 +160,78 @@ def test_what_makes_no_sense_is_said(changed, error, said):
     asked = {"system": SWING, "method": SVI(2), **UP, **changed}
     with pytest.raises(error, match=said):
         optimal_control(**asked)
+
+
+BOB = LagrangianSystem.from_text(
+    name="bob",
+    coordinates=["x", "y"],
+    lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+    constraints=["x**2 + y**2 = 1"],
+    forces={"x": "u"},
+    inputs=["u"],
+)
+ANGLE = LagrangianSystem.from_text(
+    name="angle", coordinates=["a"], lagrangian="a_dot**2/2 + cos(a)", forces={"a": "u*cos(a)"}, inputs=["u"]
+)
+
+
+def test_constraints_hold_at_all_times_and_the_optimum_is_that_of_an_angle():
+    """A bob on a rod, from rest below to rest at half a right angle: as with its angle alone."""
+    known, turn = {"steps": 10, "duration": 2.0, "cost": "u**2", "degree": 1}, np.linspace(0.0, 0.5, 11)
+    free = optimal_control(ANGLE, SVI(3), start={"a": 0.0, "a_dot": 0.0}, end={"a": 0.5, "a_dot": 0.0}, **known)
+    held = optimal_control(
+        BOB,
+        SVI(3, "gauss-lobatto:4"),
+        start={"x": 0.0, "y": (None, 0.0), "x_dot": 0.0},
+        end={"x": float(np.sin(0.5)), "y": (None, 0.0), "x_dot": 0.0},
+        guess={"x": np.sin(turn), "y": -np.cos(turn)},
+        **known,
+    )
+    assert held.cost == pytest.approx(free.cost, rel=1e-5)
+    assert_allclose(held.q, np.c_[np.sin(free.q[:, 0]), -np.cos(free.q[:, 0])], atol=1e-4)
+    assert np.abs(np.hypot(*held.q.T) - 1.0).max() < 1e-10
+    stepper = compile_stepper(BOB, SVI(3, "gauss-lobatto:4"), flags=QUICK_FLAGS)
+    again = stepper.drive(held.q[0], held.p[0], inputs=held.inputs, h=held.h, t_end=2.0)
+    assert_allclose(again.q, held.q, atol=1e-9)
+
+
+def test_a_blade_goes_where_it_points():
+    """A skate, turned and pushed by inputs: constraints of velocities; it parks aside without a step aside."""
+    skate = LagrangianSystem.from_text(
+        name="skate",
+        coordinates=["x", "y", "a"],
+        lagrangian="(x_dot**2 + y_dot**2 + a_dot**2)/2",
+        constraints=["x_dot*sin(a) - y_dot*cos(a)"],
+        forces={"x": "u*cos(a)", "y": "u*sin(a)", "a": "w"},
+        inputs=["u", "w"],
+    )
+    method = SVI(2, "gauss-lobatto:3")
+    rest = {"x_dot*cos(a) + y_dot*sin(a)": 0.0, "a_dot": 0.0}
+    parked = optimal_control(
+        skate,
+        method,
+        steps=12,
+        duration=3.0,
+        start={"x": 0.0, "y": 0.0, "a": 0.0, **rest},
+        end={"x": 1.0, "y": 0.3, "a": 0.0, **rest},
+        cost="u**2 + w**2",
+        degree=1,
+    )
+    stepper = compile_stepper(skate, method, flags=QUICK_FLAGS)
+    again = stepper.drive(parked.q[0], parked.p[0], inputs=parked.inputs, h=parked.h, t_end=3.0)
+    assert_allclose(again.q, parked.q, atol=1e-8)
+    assert_allclose(parked.q[-1], [1.0, 0.3, 0.0], atol=1e-9)
+    assert np.abs(again.constraint_values()[1]).max() < 1e-10
+
+
+def test_a_constraint_that_an_input_moves_is_refused():
+    led = LagrangianSystem.from_text(
+        name="led",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["x = u"],
+        forces={"y": "w"},
+        inputs=["u", "w"],
+    )
+    with pytest.raises(MethodError, match="a constraint has an input in it, and would jump"):
+        optimal_control(led, SVI(1, "gauss-lobatto:2"), steps=3, duration=1.0, start={}, end={})

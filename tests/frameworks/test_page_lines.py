@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
 from scipy.special import ellipk
 
-from scvi_codegen import SVI, MissingLibraryError, casadi_flow, compile_stepper, jax_flow, problem
+from scvi_codegen import SVI, MissingLibraryError, casadi_flow, compile_stepper, jax_flow, problem, torch_flow
 
 PAGE = (Path(__file__).parents[2] / "docs" / "frameworks.md").read_text(encoding="utf-8")
-LIBRARIES = {"jax": jax_flow, "casadi": casadi_flow}
+LIBRARIES = {"jax": jax_flow, "casadi": casadi_flow, "torch": torch_flow}
 
 
 def printed(library, capfd):
@@ -46,6 +46,15 @@ def test_lines_for_jax(capfd):
 
     by_mu = (end(1.0 + 1e-5).q[-1, 0] - end(1.0 - 1e-5).q[-1, 0]) / 2e-5
     assert_allclose(found, [by_mu, 63 * end(1.0).velocity[-1, 0]], rtol=1e-5)
+
+
+def test_lines_for_torch(capfd):
+    pytest.importorskip("torch", reason="needs the extra 'torch'")
+    stepper = compile_stepper(problem("kepler").system, "svi:8", flags=QUICK_FLAGS)
+    run = stepper.integrate([0.5, 0.0], [0.0, 3**0.5], h=0.1, steps=63)
+    slopes = np.zeros((64, 4))
+    slopes[-1, 0] = 1.0
+    assert_allclose(printed("torch", capfd), run.pullback(slopes).parameters, rtol=1e-3)
 
 
 def test_lines_for_casadi(capfd):

@@ -13,7 +13,13 @@ import sympy
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of, lagrangian_twin
+from scvi_codegen.mechanics.hamiltonian import (
+    HamiltonianSystem,
+    hamiltonian_of,
+    lagrangian_of,
+    lagrangian_twin,
+    positive_parameters,
+)
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import (
     SCVI,
@@ -323,3 +329,14 @@ def test_the_derivation_shows_the_momenta_at_the_points() -> None:
     assert {"35a", "35d"} <= set(numbers)
     assert "H = " in derived.to_text()
     assert {"P_1", "P_2", "N_1", "nu_2"} <= {symbol.name for symbol in derived.unknowns}
+
+
+def test_parameters_are_taken_for_positive_where_their_values_are():
+    """Roots of squares of others keep their signs; 0 says nothing of the sign of other values."""
+    system = LagrangianSystem.from_text(
+        name="signs",
+        coordinates=["q"],
+        lagrangian="a*q_dot**2/2 - b*q - c*q**2",
+        parameters={"a": 1.0, "b": 0.0, "c": -1.0},
+    )
+    assert [given.name for given in positive_parameters(system)] == ["a"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
@@ -26,12 +27,15 @@ from scvi_codegen.methods import (
     Composition,
     ExplicitEuler,
     Gauss,
+    LobattoIIIA,
     RadauIIA,
+    RungeKutta,
     SpectralCollocation,
     StoermerVerlet,
 )
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import point_vortices
+from scvi_codegen.tables.tableau import Tableau
 
 ROUNDOFF = 3e-14
 
@@ -375,6 +379,31 @@ WRONG_GENERATORS = {
 def test_a_wrong_generator_is_refused_with_its_rate(message):
     with pytest.raises(SystemDefinitionError, match=re.escape(message)):
         check_symmetry(ROTATOR, **WRONG_GENERATORS[message])
+
+
+HALF, QUARTER = Fraction(1, 2), Fraction(1, 4)
+DIAGONAL = Tableau(name="two midpoints", A=((QUARTER, 0), (HALF, QUARTER)), b=(HALF, HALF), c=(QUARTER, 3 * QUARTER))
+"""Symplectic, of order 2 with two stages: no method of Gauss."""
+
+
+@pytest.mark.parametrize(
+    ("method", "polynomials", "curve", "quadrature"),
+    [
+        (Gauss(2), 2, 2, 4),
+        (Gauss(3), 2, 3, 6),
+        (RungeKutta(DIAGONAL), 2, -1, -1),
+        (RadauIIA(2), 1, -1, -1),
+        (LobattoIIIA(3), 1, -1, -1),
+        (Gauss(2, form="position"), 0, -1, -1),
+        (SVI(3), 2, 3, 6),
+        (SVI(2, "gauss-lobatto:3"), 0, 2, 4),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_what_methods_claim_to_conserve(method, polynomials, curve, quadrature):
+    """GNI, theorems IV.2.1 and IV.2.2; Gauss methods are variational, their curves of degree s."""
+    claim = method.exactness
+    assert (claim.polynomials, claim.curve, claim.quadrature) == (polynomials, curve, quadrature)
 
 
 def test_a_gauge_of_ones_own():

@@ -79,7 +79,7 @@ def test_stretches_of_c_are_those_of_python(model, seed):
     stepper = compile_stepper(model.system, model.method)
     t, end = ((0.0, 3.0), (3.0, 0.05))[seed % 2]
     h = np.copysign(generator.uniform(0.05, 0.3), end - t)
-    inputs = checked_inputs(stepper, given)
+    inputs = checked_inputs(stepper.interface, given)
     ours, theirs = (stepper.start([0.3], [0.1], h=h, t=t) for _ in range(2))
     table, kept = _tables(stepper, inputs)
     values = np.array(stepper.defaults)

@@ -6,6 +6,7 @@ import multiprocessing
 import shutil
 import subprocess
 import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ import pytest
 
 from scvi_codegen.errors import BuildError, ScviCodegenError
 from scvi_codegen.native import building
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.source import TEXTS, Source
 
 FAST = ("-O0",)
 HERE = Path(__file__).parent
@@ -99,6 +100,117 @@ def test_another_text_or_flag_is_another_entry(changed, cache):
     answer()
     building.load(**{"source": source(), "flags": FAST, **changed})
     assert len(entries(cache)) == 2
+
+
+def compiler_saying(tmp_path: Path, version: str, name: str = "own-cc") -> str:
+    """A compiler that is nothing but what it says of itself."""
+    script = tmp_path / name
+    script.write_text(f"#!/bin/sh\necho '{version}'\n")
+    script.chmod(0o755)
+    return str(script)
+
+
+def other_compiler(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", compiler_saying(tmp_path, "1.0", "other-cc"))
+
+
+def compiler_renewed(tmp_path, monkeypatch):
+    compiler_saying(tmp_path, "1.0, mended")
+    building._compiler_version.cache_clear()
+
+
+def compiler_of_several_words(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", f"{tmp_path / 'own-cc'} -pipe")
+
+
+def more_flags(tmp_path, monkeypatch):
+    monkeypatch.setenv(building.FLAGS_VARIABLE, "-O1")
+
+
+def other_cffi(tmp_path, monkeypatch):
+    monkeypatch.setattr(building._cffi_backend, "__version__", "0.0")
+
+
+@pytest.mark.parametrize(
+    "change", [other_compiler, compiler_renewed, compiler_of_several_words, more_flags, other_cffi]
+)
+def test_whatever_code_depends_on_outside_its_text_has_a_part_in_its_name(change, tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", compiler_saying(tmp_path, "1.0"))
+    monkeypatch.delenv(building.FLAGS_VARIABLE, raising=False)
+    before = building.fingerprint(source(), flags=FAST)
+    assert building.fingerprint(source(), flags=FAST) == before
+    change(tmp_path, monkeypatch)
+    assert building.fingerprint(source(), flags=FAST) != before
+
+
+def test_a_compiler_of_several_words_is_told_apart_by_them_and_by_what_it_says(tmp_path, monkeypatch):
+    found = set()
+    for version, word in (("1.0", "-pipe"), ("1.1", "-pipe"), ("1.0", "-m32")):
+        monkeypatch.setenv("CC", f"{compiler_saying(tmp_path, version)} {word}")
+        building._compiler_version.cache_clear()
+        found.add(building.fingerprint(source(), flags=FAST))
+    assert len(found) == 3
+
+
+def test_every_part_of_a_text_has_a_part_in_its_name():
+    whole = replace(source(), support=(("support/a.h", "/* a */"),), beside=source())
+    changed = [
+        replace(whole, prefix="other"),
+        replace(whole, header=f"{whole.header}/* more */"),
+        replace(whole, code=f"{whole.code}/* more */"),
+        replace(whole, declarations=f"{whole.declarations}double more(void);"),
+        replace(whole, support=(("support/a.h", "/* b */"),)),
+        replace(whole, support=(("support/b.h", "/* a */"),)),
+        replace(whole, beside=None),
+        replace(whole, beside=source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")),
+    ]
+    assert {field.name for field in fields(Source)} == {"prefix", *TEXTS, "support", "beside"}
+    names = [building.fingerprint(each, flags=FAST) for each in (whole, *changed)]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("where", ["flags", "environment", "compiler", "not at all"])
+def test_code_for_this_processor_alone_is_not_taken_for_that_of_another(where, tmp_path, monkeypatch):
+    native, names = "-march=native", []
+    monkeypatch.setenv(building.FLAGS_VARIABLE, native if where == "environment" else "")
+    monkeypatch.setenv("CC", f"{compiler_saying(tmp_path, '1.0')} {native if where == 'compiler' else '-pipe'}")
+    for processor in ("one", "another"):
+        monkeypatch.setattr(building, "_processor", lambda processor=processor: processor)
+        names.append(building.fingerprint(source(), flags=(*FAST, native) if where == "flags" else FAST))
+    assert (names[0] == names[1]) == (where == "not at all")
+
+
+@pytest.mark.parametrize(
+    "line", ["model name\t: other", "flags\t\t: fpu avx512f", "Features\t: sve", "CPU part\t: 0xd40"]
+)
+def test_processors_are_told_apart_by_all_that_tuning_looks_at(line, monkeypatch):
+    def processor(text: str) -> str:
+        monkeypatch.setattr(Path, "read_text", lambda self: text)
+        return building._processor.__wrapped__()
+
+    common = "processor\t: 0\nmodel name\t: some\nflags\t\t: fpu avx\nFeatures\t: asimd\nCPU part\t: 0xd0c\n"
+    key = line.split(":")[0]
+    other = "".join(f"{line if each.startswith(key) else each}\n" for each in common.splitlines())
+    assert processor(common) != processor(other)
+    assert processor(common) == processor(common.replace("processor\t: 0", "processor\t: 1"))
+
+
+def flags_of_each_command(monkeypatch, flags: tuple[str, ...], given: Source) -> list[list[str]]:
+    commands = compiler_runs(monkeypatch)
+    building.load(given, flags=flags)
+    return commands
+
+
+def test_flags_of_the_environment_follow_those_given_in_every_command(monkeypatch):
+    """Declarations that depend on the processor, the text, and the library made of it."""
+    monkeypatch.setenv(building.FLAGS_VARIABLE, "-O1 -pipe")
+    chosen = f"#ifdef __OPTIMIZE__\n{source().declarations}#endif\n"
+    commands = flags_of_each_command(monkeypatch, FAST, replace(source(), declarations=chosen))
+    kinds = {next((flag for flag in ("-E", "-c", "-shared") if flag in command), ""): command for command in commands}
+    assert set(kinds) == {"-E", "-c", "-shared"}
+    for kind, command in kinds.items():
+        assert {"-O1", "-pipe"} <= set(command)
+        assert kind == "-shared" or command.index("-O0") < command.index("-O1")
 
 
 def flip(path: Path) -> None:

@@ -125,7 +125,7 @@ def test_parts_are_compiled_at_the_same_time(tmp_path, monkeypatch):
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
-    library = building.load(replace(part("first"), events=part("second")), flags=PORTABLE_FLAGS).lib
+    library = building.load(replace(part("first"), beside=part("second")), flags=PORTABLE_FLAGS).lib
     assert library.first() == library.second() == 2
 
 

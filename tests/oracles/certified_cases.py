@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,9 +12,11 @@ from samples import (
     linkage,
     oscillator,
     pumped_cart_pole,
+    pumped_chain,
     pumped_swing,
     pushed_pendulum,
     sleigh,
+    tangle,
     turning_wire,
 )
 
@@ -47,6 +50,13 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
     "oscillator": (oscillator(), (0.7,), (0.2,), 1.5),
     "double": (problem("double-pendulum").system, (0.9, -0.6), (1.0, 0.5), 0.05),
     "cart": (pumped_cart_pole(), (0.2, 0.9), (0.4, -0.7), 0.1),
+    "tangle": (tangle(), (0.4, 0.5, 0.1, -0.4), (-0.2, -0.4, 0.2, 0.6), 0.1),
+    "chain": (
+        pumped_chain(),
+        tuple(math.sin(i) / 2 for i in range(8)),
+        tuple(math.cos(2 * i) / 2 for i in range(8)),
+        0.1,
+    ),
     "linkage": (linkage(), (0.0, 1.0, 1.94, 1.5), (0.1, 0.2, 0.0, 0.3), 0.02),
     "sleigh": (sleigh(), (0.3, -0.4, 0.5), (1.155222551473559, 0.8681156930772079, 0.56), 0.1),
     "wire": (turning_wire(), (0.5, 0.4), (0.4, -0.3), 0.1),
@@ -58,6 +68,7 @@ STATES: dict[str, tuple[MechanicalSystem, tuple[float, ...], tuple[float, ...], 
 METHODS: dict[str, Callable[[], Method]] = {
     "svi": lambda: SVI(2),
     "svi-3": lambda: SVI(3),
+    "svi-4": lambda: SVI(4),
     "svi-8": lambda: SVI(8),
     "lobatto-svi": lambda: SVI(2, "gauss-lobatto:3"),
     "hermite": lambda: SVI(3, "hermite:2"),
@@ -94,6 +105,7 @@ WHOLE = """
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
+    tangle/svi tangle/scvi tangle/sc chain/svi-4 field/gauss
     slowed/svi-3 pushed/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)

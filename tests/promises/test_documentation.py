@@ -29,7 +29,7 @@ MINUTES = "scvi-codegen reproduce all"
 """Takes minutes of processor time."""
 PICTURE = re.compile(r"!\[[^]]+\]\((\w+\.svg)\)")
 """One that the code of a page draws."""
-PEERS = ("astropy", "casadi", "heyoka", "rebound")
+PEERS = ("astropy", "casadi", "fmpy", "heyoka", "rebound")
 """Libraries that a page may show beside this one, and without which it is skipped."""
 SHOWN = {"python", "text", "console", "sh", "toml", "c", "julia", "diff"}
 """Languages of blocks."""

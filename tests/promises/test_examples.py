@@ -28,10 +28,12 @@ pytestmark = pytest.mark.long
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = (
     "balanced_cart_pole",
+    "ceres_orbit",
     "collisions_in_space",
     "curves_and_quadratures",
     "duffing_fit",
     "eccentric_comet",
+    "field_on_two_processes",
     "halo_orbits",
     "hanging_chain",
     "henon_heiles_map",
@@ -284,6 +286,18 @@ def test_a_cart_balances_its_pole(output_of):
     assert float(later) < 0.05
     assert float(last) < 1e-3
     assert float(re.search(r"ends (\S+) away", output)[1]) < 1e-12
+
+
+def test_the_orbit_of_ceres_tells_the_mass_of_jupiter(output_of, tmp_path):
+    """To two thousandths of the published one, as far as the approximate orbits of the planets let it."""
+    output = output_of("ceres_orbit")
+    found, published = map(float, re.search(r"1/(\S+) of the Sun; 1/(\S+) by other", output).groups())
+    assert published == 1047.3
+    assert found == pytest.approx(published, rel=2e-3)
+    alone, helped = map(float, re.findall(r"within (\S+) au", output))
+    assert alone > 5e-3
+    assert helped < 5e-5
+    assert (tmp_path / "ceres_orbit.png").stat().st_size > 10_000
 
 
 def test_a_duffing_oscillator_is_found_in_a_noisy_recording(output_of):

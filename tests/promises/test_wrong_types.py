@@ -59,6 +59,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "save_model": {"model": MODEL, "path": "no such folder/file"},
     "load_package": {"folder": "no such folder"},
     "generate_package": {"model": MODEL, "folder": "no such/folder", "solver": "auto", "force": False},
+    "generate_fmu": {"model": MODEL, "path": "no such/one.fmu", "solver": "auto", "force": False},
     "load_run": {"folder": "no such folder"},
     "resume_run": {"folder": "no such folder"},
     "SVI": {"degree": 2, "quadrature": None, "nodes": None, "space": None},

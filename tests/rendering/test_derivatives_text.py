@@ -23,11 +23,13 @@ CASES = {
 
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("second", [False, True])
 @pytest.mark.parametrize("name", CASES)
-def test_compiles_without_a_warning(name, compiler, tmp_path):
+def test_compiles_without_a_warning(name, second, compiler, tmp_path):
     system, method = CASES[name]
     program = program_of(system, method, solver="newton")
-    source = render_derivatives(derivatives_of(system, discretise(system, method), program)).amalgamated()
+    derivatives = derivatives_of(system, discretise(system, method), program, second=second)
+    source = render_derivatives(derivatives).amalgamated()
     (tmp_path / f"{source.prefix}.h").write_text(source.header)
     (tmp_path / "all.c").write_text(source.code)
     check_style(source.code)

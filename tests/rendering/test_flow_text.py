@@ -7,7 +7,7 @@ from samples import linkage, pumped_cart_pole
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, compile_stepper, problem
-from scvi_codegen.rendering.flow import with_casadi_flow, with_xla_flow
+from scvi_codegen.rendering.flow import with_casadi_flow, with_flow_of_rows, with_xla_flow
 
 STRICT = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {
@@ -39,8 +39,22 @@ def test_compiles_without_a_warning(name, compiler, tmp_path):
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
+def test_flows_of_rows_compile_without_a_warning(tmp_path):
+    stepper = compile_stepper(*CASES["kepler"])
+    for source in (
+        with_flow_of_rows(stepper.derivatives),
+        with_flow_of_rows(stepper.second_derivatives, second=True),
+    ):
+        check_style(source.amalgamated().code)
+        compile_with("gcc", ["-Wno-missing-prototypes"], source.amalgamated(), tmp_path)
+
+
 def test_compiles_with_the_interface_of_xla(tmp_path):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
-    source = with_xla_flow(compile_stepper(*CASES["kepler"]).derivatives, "0").amalgamated()
+    stepper, flags = compile_stepper(*CASES["kepler"]), ["-isystem", jax.ffi.include_dir()]
+    source = with_xla_flow(stepper.derivatives, "0").amalgamated()
     check_style(source.code)
-    compile_with("gcc", ["-isystem", jax.ffi.include_dir()], source, tmp_path)
+    compile_with("gcc", flags, source, tmp_path)
+    second = with_xla_flow(stepper.second_derivatives, "0", second=True).amalgamated()
+    check_style(second.code)
+    compile_with("gcc", flags, second, tmp_path)

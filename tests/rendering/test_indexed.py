@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from style import check_style
 
-from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate, with_control
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.building import find_compiler
@@ -39,7 +39,7 @@ EXPLICIT = ("damped", "stoermer-verlet")
 FORCES = {"damped": {"q[i]": "-m[i]*q_dot[i]*q[i]", "q[N-1]": "cos(t)"}}
 
 
-def rendered(name: str, method: str) -> Source:
+def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     """The text of an integrator."""
     coordinates, formula = FORMULAS[name]
     system = IndexedSystem.from_text(
@@ -50,7 +50,10 @@ def rendered(name: str, method: str) -> Source:
         tables=["bonds[B, 2]"],
         forces=FORCES.get(name),
     )
-    return render_indexed(lower_indexed(system, as_method(method, one_coordinate(system)), "indexed"))
+    program = lower_indexed(system, as_method(method, one_coordinate(system)), "indexed", newton=newton)
+    controlled = with_control(program)
+    assert controlled is not None or method == "stoermer-verlet"
+    return render_indexed(controlled or program)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +62,17 @@ def rendered(name: str, method: str) -> Source:
 )
 def test_it_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
     """No warnings, in the style of all C here, and nothing that is not declared in the header."""
-    source = rendered(name, method)
+    check_strict(rendered(name, method), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["bodies", "all forms"])
+def test_newtons_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
+    """The same."""
+    check_strict(rendered(name, "svi:4", newton=True), tmp_path)
+
+
+def check_strict(source: Source, tmp_path: Path) -> None:
+    """As one compiles a library."""
     for path, text in source.files.items():
         (tmp_path / path).parent.mkdir(exist_ok=True)
         (tmp_path / path).write_text(text)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+from dataclasses import replace
 
 import pytest
 
 import scvi_codegen as sc
 from scvi_codegen import compiler
+from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 from scvi_codegen.rendering import text_cache
 
@@ -66,6 +69,79 @@ def test_anything_else_is(made, other):
     sc.compile_stepper(spring(), sc.SVI(2))
     other()
     assert len(made) == 2
+
+
+def keys(change: dict, **options) -> tuple[str, ...]:
+    """What the name of a text is made from."""
+    given = {
+        "name": "pair",
+        "coordinates": ["q", "r"],
+        "lagrangian": "q_dot**2/2 + r_dot**2/2 - a*q**2/2 - b*r**2*q",
+        "parameters": {"a": 1.0, "b": 2.0},
+        "forces": {"q": "-a*q_dot"},
+        "inputs": ["u", "w"],
+    }
+    system = sc.LagrangianSystem.from_text(**{**given, **change})
+    found = compiler._Texts(
+        system, **{"method": sc.SVI(2), "solver": "auto", "prefix": None, "symmetries": (), "monitor": None, **options}
+    )
+    return found.key
+
+
+def test_all_that_a_text_depends_on_has_a_part_in_its_name():
+    changes = [
+        {"name": "another"},
+        {"coordinates": ["r", "q"]},
+        {"lagrangian": "q_dot**2/2 + r_dot**2/2 - a*q**2/2 - b*r**2"},
+        {"parameters": {"b": 2.0, "a": 1.0}},
+        {"parameters": {"a": 1.0, "b": 2.0 + 2.0**-51}},
+        {"parameters": {"a": 1.0, "b": 2.0, "c": 3.0}},
+        {"forces": {"r": "-a*q_dot"}},
+        {"forces": {"q": "-b*q_dot"}},
+        {"forces": {}},
+        {"inputs": ["w", "u"]},
+        {"inputs": ["u"]},
+        {"constraints": ["q - r"]},
+        {"constraints": ["q_dot - r"]},
+    ]
+    turning, *_ = sc.symmetries(problem("kepler").system)
+    options = [
+        {"method": sc.SVI(3)},
+        {"method": sc.SVI(2, "gauss-lobatto:3")},
+        {"solver": "newton"},
+        {"prefix": "other"},
+        {"symmetries": (turning,)},
+        {"symmetries": (replace(turning, name="spinning"),)},
+        {"symmetries": (replace(turning, gauge=turning.gauge + 1),)},
+        {"monitor": "frequency"},
+        {"monitor": "distance"},
+    ]
+    found = [keys({}), *map(keys, changes), *(keys({}, **option) for option in options)]
+    assert len(set(found)) == len(found)
+    assert keys({}) == found[0]
+
+
+def test_every_file_of_the_generator_has_a_part_in_the_name(tmp_path, monkeypatch):
+    package, templates = tmp_path / "package", tmp_path / "templates"
+    files = [
+        package / "compiler.py",
+        package / "ir/kernel.py",
+        templates / "stepper.c.jinja",
+        templates / "support/a.h",
+    ]
+    for path in files:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("one")
+    monkeypatch.setattr(text_cache, "PACKAGE", package)
+    monkeypatch.setattr(text_cache, "template_folder", lambda: templates)
+    found = [text_cache._generator.__wrapped__()]
+    for k, path in enumerate(files):
+        path.write_text("two")  # as long as before
+        os.utime(path, ns=(k, 10**9 + k))
+        found.append(text_cache._generator.__wrapped__())
+    monkeypatch.setattr(text_cache.sympy, "__version__", "0.0")
+    found.append(text_cache._generator.__wrapped__())
+    assert len(set(found)) == len(found)
 
 
 def test_another_generator_makes_it_anew(made, monkeypatch):

@@ -24,7 +24,9 @@ from scvi_codegen.models.model_file import dump_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
+from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run, writing
+from scvi_codegen.runtime.portions import record
+from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -61,6 +63,27 @@ class TestRecording:
         while not found.finished:
             found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
         assert looks > 3
+        assert digests("a.run") == digests("whole.run")
+
+    @pytest.mark.parametrize("every", [1, 7])
+    def test_steps_that_nobody_kept_are_made_again(self, kepler, every, monkeypatch):
+        """Ctrl-C within a portion: the run stands beyond the last state that was kept, and so does its memory."""
+        recorded(kepler, 600, every=every, folder="whole.run")
+        left = iter([*[False] * 5, True])
+
+        def interrupted(run: Run, steps: int | None = None, **settings: object) -> Trajectory:
+            made = record(run, steps, **settings)
+            if next(left):
+                raise KeyboardInterrupt
+            return made
+
+        with monkeypatch.context() as patch:
+            patch.setattr(writing, "record", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                recorded(kepler, 600, every=every, checkpoint_seconds=1e9)
+        found = load_run("a.run")
+        assert 0 < found.resumed().steps == found.steps < 600
+        assert resume_run("a.run").finished
         assert digests("a.run") == digests("whole.run")
 
     def test_options_and_parameters_are_kept(self, kepler):

@@ -265,3 +265,77 @@ def test_residuals_are_drawn():
     assert_allclose(axes.get_lines()[0].get_ydata(), found.residuals[:, 0])
     inside = np.abs(found.residuals) < 2 * found.deviations
     assert 0.9 < inside.mean() < 1.0
+
+
+CHAOTIC = {"l": 0.8, "m": 1.3}
+
+
+@cache
+def two_rods():
+    """A double pendulum, of masses as m to 1, and a noisy record of its angles over 17 Lyapunov times."""
+    system = LagrangianSystem.from_text(
+        name="two rods",
+        coordinates=["a", "b"],
+        lagrangian="(m + 1)*a_dot**2/2 + l**2*b_dot**2/2 + l*a_dot*b_dot*cos(a - b) + 9.81*((m + 1)*cos(a) + l*cos(b))",
+        parameters={"m": 1.0, "l": 1.0},
+    )
+    stepper = compile_stepper(system, SVI(6), flags=QUICK_FLAGS)
+    run = stepper.integrate([2.0, 2.5], [0.0, 0.0], h=0.02, steps=600, every=2, parameters=CHAOTIC)
+    return stepper, run, run.q + NOISE * np.random.default_rng(0).normal(size=run.q.shape)
+
+
+def test_a_chaotic_record_is_fitted_in_segments():
+    """Nearby motions part e^17-fold: from its start alone the motion is lost, in segments it is found."""
+    stepper, run, noisy = two_rods()
+    known = {"q": noisy[0], "p": [0.05, -0.05], "h": 0.02}
+    lost = fit(stepper, run.t, noisy, **known)
+    assert np.abs(lost.residuals).max() > 100 * NOISE
+    found = fit(stepper, run.t, noisy, segments=20, deviations=NOISE, **known)
+    truth = np.array([*(CHAOTIC[name] for name in found.names[:2]), 2.0, 2.5, 0.0, 0.0])
+    squares, axes = np.linalg.eigh(found.covariance)  # the least are those of what chaos tells far below rounding
+    away = (axes.T @ (found.values - truth))[squares > 1e-10 * squares.max()]
+    assert (away**2 / squares[squares > 1e-10 * squares.max()]).sum() < 22.5  # chi squared of 6, at a thousandth
+    assert found.standard_errors["l"] < 1e-4
+    assert np.sqrt((found.residuals**2).mean()) == pytest.approx(NOISE, rel=0.1)
+    assert found.jumps.shape == (19, 4)
+    assert np.abs(found.jumps).max() < 1e-9
+
+
+def test_segments_find_what_one_finds():
+    """Of a record that is neither long nor chaotic: the same least squares, the same errors."""
+    known = GUESS | {"unknown": SOME}
+    whole = fit(oscillator(), TIMES, recorded(1)[0], **known)
+    parts = fit(oscillator(), TIMES, recorded(1)[0], segments=5, **known)
+    assert_allclose(parts.values, whole.values, rtol=1e-7)
+    assert_allclose(parts.covariance, whole.covariance, rtol=1e-4, atol=1e-6 * np.abs(whole.covariance).max())
+    assert whole.jumps.shape == (0, 2)
+    momenta = fit(oscillator(), TIMES, recorded(1)[1], observed=["p_x"], segments=3, **known)  # no coordinate measured
+    assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], atol=0.05)
+
+
+def test_segments_with_a_known_start_and_inputs():
+    system = LagrangianSystem.from_text(
+        name="pushed",
+        coordinates=["x"],
+        lagrangian="m*x_dot**2/2 - k*x**2/2",
+        parameters={"m": 1.5, "k": 2.0},
+        forces={"x": "u"},
+        inputs=["u"],
+    )
+    stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
+    push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
+    run = stepper.drive([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
+    times = np.linspace(0.13, 7.9, 60)
+    known = {"q": [0.5], "p": [0.0], "start": 0.0, "h": 0.05, "inputs": push, "state": False}
+    found = fit(stepper, times, run.at(times)[0], parameters={"m": 1.0, "k": 1.0}, segments=4, **known)
+    assert found.names == ("m", "k")
+    assert_allclose(found.values, [1.5, 2.0], rtol=1e-7)
+
+
+def test_what_segments_do_not_have():
+    with pytest.raises(StateError, match="bounds are those of a fit in one segment"):
+        fit(oscillator(), TIMES, recorded()[0], segments=3, bounds={"delta": (0.0, 1.0)}, unknown=SOME, **GUESS)
+    with pytest.raises(StateError, match="segments"):
+        fit(oscillator(), TIMES, recorded()[0], segments=0, unknown=SOME, **GUESS)
+    with pytest.raises(FitError, match=r"do not come to join: .* fewer unknowns"):
+        fit(oscillator(), TIMES, recorded(5)[0], segments=3, unknown=[*SOME, "m", "gamma"], **GUESS)

@@ -9,6 +9,7 @@ from samples import QUICK_FLAGS
 from scvi_codegen.advice.motion import solve_motion
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Composition, Gauss, StoermerVerlet, as_method
 from scvi_codegen.models.problems import problem
 
@@ -31,6 +32,23 @@ def test_velocities_stand_for_momenta_with_the_parameters_and_the_time_of_the_ru
     assert stepper.momentum(other.q, other.velocity, other.t, given["parameters"]) == pytest.approx(other.p, rel=1e-13)
     run = stepper.start(Q, velocity=V, **given)
     assert np.array_equal(run.record(20).q, one.q)
+
+
+def test_velocities_of_momenta_that_are_not_linear_are_found_to_round_off():
+    """Newton's iteration for L_v = p, where one that ends early is seen only when it ends between two squares."""
+    system = LagrangianSystem.from_text(
+        name="relativistic particle in space",
+        coordinates=["x", "y", "z"],
+        lagrangian="-m*c**2*sqrt(1 - (x_dot**2 + y_dot**2 + z_dot**2)/c**2) - x*y - z**2",
+        parameters={"m": 0.7, "c": 1.3},
+    )
+    stepper = compile_stepper(system, SVI(1), flags=QUICK_FLAGS)
+    generator, (m, c) = np.random.default_rng(5), (0.7, 1.3)
+    for p in generator.normal(size=(100, 3)):
+        energy = np.sqrt((m * c) ** 2 + p @ p)
+        condition = (energy / (m * c)) ** 2
+        assert np.abs(stepper.velocity(p, p) - c * p / energy).max() < 64 * 2.0**-52 * max(1.0, condition)
+        assert np.abs(stepper.momentum(p, c * p / energy) - p).max() < 16 * 2.0**-52 * condition * np.abs(p).max()
 
 
 def test_ensembles_take_velocities_each_with_its_parameters():

@@ -46,6 +46,8 @@ OWN = {"pushed/svi": Case(pushed_pendulum(), lambda: SVI(2), (0.4,), (-0.8,), 0.
 T = 0.3
 EXACT, BOUND = 1e-13, 3e-13
 """Relative; of constrained systems, whose equations h makes ill-conditioned."""
+SECOND, SECOND_BOUND = 1e-13, 1e-11
+"""The same of second derivatives."""
 
 
 @cache
@@ -95,6 +97,45 @@ def test_derivatives_by_all_that_a_step_starts_from(name):
         omega = np.kron([[0, 1], [-1, 0]], np.eye(m))
         assert np.abs(found.state.T @ omega @ found.state - omega).max() < 4e-15
     assert np.array_equal(found.state, stepper.jacobian(q, p, h, T, stepper.defaults))
+
+
+def bent(stepper, q, p, h, t, weights):
+    """(given, given) second derivatives of weights . (q1, p1) of a step."""
+    size, starts = stepper.given, Starts.chain(q, p, np.array([t]), np.array([h]))
+    changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
+    changes[0], vectors[1, 0, :, : 2 * len(q)] = np.eye(size), weights
+    stepper.linearise(starts, changes, stepper.defaults, None, chained=True)
+    stepper.bend(starts, changes, vectors, stepper.defaults, None)
+    return vectors[0, 1]
+
+
+def second_difference(case, start, direction, weights):
+    """Of weights . (q1, p1) along a direction, of the paper's equations solved in 60 digits."""
+    m, width = len(weights) // 2, mp.mpf(10) ** -15
+    step = DerivedStep(case.system, paper_equations(case.system, case.method()))
+    ends = []
+    for by in (1, 0, -1):
+        x = [mp.mpf(a) + by * width * mp.mpf(b) for a, b in zip(start, direction, strict=True)]
+        found = step.with_parameters(x[2 * m : -2])(x[:m], x[m : 2 * m], x[-1], x[-2])
+        ends.append(mp.fdot(weights.tolist(), [*found.q, *found.p]))
+    return float((ends[0] - 2 * ends[1] + ends[2]) / width**2)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_second_derivatives_by_all_that_a_step_starts_from(name):
+    """Along directions in which all entries count alike; and symmetric, by which all of them are told."""
+    case, stepper, q, p, h = given(name)
+    rng, start = np.random.default_rng(7), np.array([*q, *p, *stepper.defaults, T, h])
+    weights = rng.normal(size=2 * len(q))
+    found = bent(stepper, q, p, h, T, weights)
+    sizes = 1.0 / np.sqrt(np.maximum(np.abs(found).max(axis=1), 1e-6 * np.abs(found).max()))
+    scaled = sizes[:, np.newaxis] * found * sizes
+    tolerance = SECOND_BOUND if case.system.constraints else SECOND
+    assert np.abs(scaled - scaled.T).max() < tolerance
+    for _ in range(3):
+        direction = rng.normal(size=len(start))
+        exact = second_difference(case, start, sizes * direction, weights)
+        assert abs(direction @ scaled @ direction - exact) < tolerance * np.abs(direction).sum() ** 2
 
 
 @pytest.mark.parametrize("name", NAMES)

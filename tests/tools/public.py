@@ -1,4 +1,4 @@
-"""What is public, a line each: names with their signatures, options of the command line.
+"""What is public, a line each: names and their signatures, options of commands, keys of model files, names in C.
 
 python tests/tools/public.py      writes it to tests/corpus/public.txt, which test_public.py compares.
 """
@@ -6,6 +6,7 @@ python tests/tools/public.py      writes it to tests/corpus/public.txt, which te
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,18 +16,24 @@ import click
 
 import scvi_codegen
 from scvi_codegen.cli import main
+from scvi_codegen.methods import ARGUMENTS
+from scvi_codegen.models import indexed_file, model_file
+from scvi_codegen.runtime import distributed
 
 __all__ = ["KEPT", "public"]
 
 KEPT = Path(__file__).parents[1] / "corpus" / "public.txt"
 PACKAGE = "scvi_codegen."
+METHOD = scvi_codegen.SVI(2, "gauss-lobatto:3")
+"""Of headers: one that keeps constraints."""
 PLAIN = (int, float, str, type, type(None))
 """Defaults that are told; "there is none" is a type."""
 
 
 def public() -> str:
     """All lines, sorted."""
-    return "\n".join(sorted([*_python(), *_command_line(main, "$ scvi-codegen")])) + "\n"
+    found = (*_python(), *_command_line(main, "$ scvi-codegen"), *_model_files(), *_headers())
+    return "\n".join(sorted(found)) + "\n"
 
 
 def _python() -> Iterator[str]:
@@ -40,6 +47,8 @@ def _python() -> Iterator[str]:
             yield name + _signature(thing)
         else:
             yield f"{name}: {type(thing).__name__}"
+    for name in distributed.__all__:
+        yield f"{distributed.__name__}.{name}{_signature(getattr(distributed, name))}"
 
 
 def _members(name: str, kind: type) -> Iterator[str]:
@@ -88,6 +97,34 @@ def _command_line(command: click.Command, words: str) -> Iterator[str]:
     for parameter in command.params:
         for option in (*parameter.opts, *parameter.secondary_opts):
             yield f"{words} {option}" if option.startswith("-") else f"{words} {option.upper()}"
+
+
+def _model_files() -> Iterator[str]:
+    """Sections and their keys; in brackets of a method those that it takes."""
+    for of, file in (("", model_file), (" of sums", indexed_file)):
+        for section in file.SECTIONS:
+            yield from (f"[{section}]{of} {key}".rstrip() for key in ("", *file.KEYS.get(section, ())))
+    for method, keys in ARGUMENTS.items():
+        yield f"[method] {method} {' '.join(keys)}".rstrip()
+
+
+def _headers() -> Iterator[str]:
+    """Names in generated headers: of a free motion, a held one, one with an input, and one in a time of its own."""
+    kepler = scvi_codegen.problem("kepler").system
+    given: tuple[dict[str, Any], ...] = (
+        {"constraints": ["x**2 + y**2 = 1"]},
+        {"forces": {"x": "u"}, "inputs": ["u"]},
+    )
+    falling = "(x_dot**2 + y_dot**2)/2 - y"
+    others = [
+        scvi_codegen.LagrangianSystem.from_text(name="falling", coordinates=["x", "y"], lagrangian=falling, **more)
+        for more in given
+    ]
+    names = set()
+    for system in (kepler, scvi_codegen.reparametrise(kepler, "distance"), *others):
+        source, _ = scvi_codegen.generate_source(system, METHOD, prefix="one", controlled=True)
+        names |= set(re.findall(r"\b(?:one|ONE)_\w+", source.header))
+    yield from (f"in C: {name}" for name in names - {"ONE_H"})
 
 
 if __name__ == "__main__":

@@ -117,6 +117,36 @@ def turning_wire() -> LagrangianSystem:
     )
 
 
+def tangle() -> LagrangianSystem:
+    """Four coordinates that all meet, each pair in its own way: a mass matrix without zeros, potentials, time."""
+    return LagrangianSystem.from_text(
+        name="tangle",
+        coordinates=["x", "y", "z", "w"],
+        lagrangian="""
+            a*x_dot**2 + (2 + sin(x*z))*y_dot**2/2 + b*(1 + w**2)*z_dot**2/2 + (3 + cos(y))*w_dot**2/2
+            + (1 + x*y)*x_dot*y_dot/3 + cos(w)*x_dot*z_dot/2 + z*x_dot*w_dot/4 + (1 + z**2)*y_dot*z_dot/3
+            + sin(x)*y_dot*w_dot/2 + y*z_dot*w_dot/3 + c*x*y*w_dot + sin(t)*z*y_dot
+            - (x**4 + y**4 + z**4 + w**4)/4 - (x - z)**2 - x*y*w/2 - cos(2*y - w + t)
+        """,
+        parameters={"a": 0.8, "b": 1.3, "c": 0.4},
+    )
+
+
+def pumped_chain(count: int = 8) -> LagrangianSystem:
+    """Neighbours that meet in masses, where pivots are exchanged, and in springs that change with time."""
+    numbers, pairs = range(count), [(i, i + 1) for i in range(count - 1)]
+    masses = [f"m*(1 + {i % 2})*x{i}_dot**2/2" for i in numbers] + [
+        f"{3 - 2 * (i % 2)}*x{i}_dot*x{j}_dot" for i, j in pairs
+    ]
+    springs = [f"(x{j} - x{i})**4/4 + (1 + a*sin(w*t))*(x{j} - x{i})**2/2" for i, j in pairs]
+    return LagrangianSystem.from_text(
+        name="pumped chain",
+        coordinates=[f"x{i}" for i in numbers],
+        lagrangian=f"{' + '.join(masses)} - ({' + '.join(springs)}) - x0**2/2",
+        parameters={"m": 1.1, "a": 0.3, "w": 1.1},
+    )
+
+
 def three_bodies() -> LagrangianSystem:
     """Three masses in the plane, each pair joined by a spring that is stiffer the longer it is."""
     pairs = (("a", "b"), ("b", "c"), ("a", "c"))

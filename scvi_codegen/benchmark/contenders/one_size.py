@@ -1,4 +1,4 @@
-"""A ring of one size in a fresh process: time to the first step, time a step, memory."""
+"""A ring or a field of one size in a fresh process: time to the first step, time a step, memory."""
 
 from __future__ import annotations
 
@@ -7,21 +7,26 @@ import sys
 import time
 from pathlib import Path
 
-from scvi_codegen.benchmark.sums import ring
+from scvi_codegen.benchmark.sums import field, ring
 from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import as_method
 
 __all__: list[str] = []
 
 
-def _one_size(method: str, count: int) -> str:
+LENGTHS = {"ring": 0.1, "field": 0.03}
+"""Of steps."""
+
+
+def _one_size(method: str, name: str, size: int) -> str:
     """What a fresh process measures."""
     began = time.perf_counter()
-    each = ring(count, 1.0)
-    run = compile_indexed(each.system, method).start(each.q, velocity=each.v, h=0.1)
+    each = {"ring": ring, "field": field}[name](size, 1.0)
+    count = each.q.size
+    run = compile_indexed(each.system, method).start(each.q, velocity=each.v, h=LENGTHS[name])
     run.advance(1)
     first = time.perf_counter() - began
     run.advance(3)
@@ -31,21 +36,31 @@ def _one_size(method: str, count: int) -> str:
         run.advance(steps)
         best = min(best, (time.process_time() - start) / steps)
     iterations = (run.iterations - sweeps) / (7 * steps)
-    operations = _operations(each.system, method, iterations)
-    memory = _most_memory()
-    numbers = (first, 1e9 * best / count, iterations, 1e-9 * operations * count / best, memory)
+    program = lower_indexed(each.system, as_method(method, one_coordinate(each.system)), name)
+    rates = [1e-9 * each * count / best for each in (_operations(program, iterations), _bytes(program, iterations))]
+    numbers = (first, 1e9 * best / count, iterations, *rates, _most_memory())
     return " ".join(map(repr, numbers))
 
 
-def _operations(system: IndexedSystem, method: str, sweeps: float) -> float:
+def _operations(program: IndexedProgram, sweeps: float) -> float:
     """Additions, multiplications and the like, a coordinate and step: of kernels, and of the products with tables."""
-    program = lower_indexed(system, as_method(method, one_coordinate(system)), "ring")
     force = sum(_counted(each.kernel) for each in program.forces)
     if program.sweep is None:
         drifts = program.splitting.drifts if program.splitting is not None else ()
         return sum(map(bool, drifts)) * (force + 4)  # a kick and a drift are each a product and a sum
     points = program.sweep.points
     return (sweeps + program.sweep.sweeps_after) * points * (force + 2 * points)
+
+
+def _bytes(program: IndexedProgram, sweeps: float) -> float:
+    """What is read and written of arrays in a coordinate and step, every array once a loop.
+
+    A sweep clears and adds up forces and reads positions, then reads forces, positions and state and writes positions;
+    a leap adds to increments by positions, then reads momenta, positions and both increments, and writes two arrays.
+    """
+    if program.sweep is None:
+        return 8.0 * len(program.splitting.drifts if program.splitting else ()) * (3 + 7)
+    return 8.0 * (sweeps + program.sweep.sweeps_after) * (7 * program.sweep.lanes + 3)
 
 
 def _counted(kernel: Kernel) -> int:
@@ -64,4 +79,4 @@ def _most_memory() -> float:
 
 
 if __name__ == "__main__":
-    print(_one_size(sys.argv[1], int(sys.argv[2])))
+    print(_one_size(sys.argv[1], sys.argv[2], int(sys.argv[3])))

@@ -1,4 +1,4 @@
-"""``scvi-codegen generate``: C, a Makefile and a Python package in a folder."""
+"""``scvi-codegen generate``: C, a Makefile and a Python package in a folder; or an FMU."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import reporting, tell
 from scvi_codegen.cli.sums import refuse
+from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import generate_sums
 from scvi_codegen.models.package import generate_package
@@ -20,7 +21,12 @@ __all__ = ["generate"]
 @click.command()
 @model_arguments
 @click.option(
-    "-o", "--output", type=click.Path(), required=True, metavar="DIR", help="Folder; its name is the C prefix."
+    "-o",
+    "--output",
+    type=click.Path(),
+    required=True,
+    metavar="DIR",
+    help="Folder, or NAME.fmu; the name is the C prefix.",
 )
 @SOLVER_OPTION
 @click.option("--force", is_flag=True, help="Overwrite files of the same names that were edited or are not ours.")
@@ -30,6 +36,7 @@ __all__ = ["generate"]
     help="C for a microcontroller, in this precision, without a Python package.",
 )
 @click.option("--single-file", is_flag=True, help="One C file without support headers beside it, as for --embedded.")
+@click.option("--fmu", is_flag=True, help="An FMU 3.0 for co-simulation in the place of a folder: -o NAME.fmu.")
 @reporting
 def generate(
     model_name: str,
@@ -38,6 +45,7 @@ def generate(
     force: bool,
     embedded: Embedded | None,
     single_file: bool,
+    fmu: bool,
     **choices: Any,
 ) -> None:
     """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
@@ -47,6 +55,9 @@ def generate(
     Of a model of sums over indices the folder has C for any number of coordinates, and the initial state as text beside
     it; no Python package.
 
+    With --fmu the output is one file, which Modelica tools, Simulink and FMPy import: the compiled library, the C, and
+    what describes its variables.
+
     \b
     Example:
       scvi-codegen generate planar-pendulum -o pendulum_svi
@@ -54,11 +65,23 @@ def generate(
       python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
     """
     model = read_model(model_name, Choices(**choices))
+    if fmu and (embedded or single_file):
+        raise click.UsageError("--fmu excludes --embedded and --single-file")
     if isinstance(model, IndexedModel):
-        refuse({"embedded": embedded, "single_file": single_file, "solver": None if solver == "auto" else solver})
+        refuse(
+            {
+                "embedded": embedded,
+                "single_file": single_file,
+                "fmu": fmu,
+                "solver": None if solver == "auto" else solver,
+            }
+        )
         folder, python = generate_sums(model, output, force=force), ""
+    elif fmu:
+        folder, python = generate_fmu(model, output, solver=solver, force=force), ""
     else:
         folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
         python = "" if embedded else f", or 'import {folder.resolve().name}'"
     tell(f"{model.system.name}: {model.method.title}", system=model.system.name, method=model.method.name)
-    tell(f"wrote {folder}; run the C example with 'make -C {folder} run'{python}", written=[folder])
+    use = "" if fmu else f"; run the C example with 'make -C {folder} run'{python}"
+    tell(f"wrote {folder}{use}", written=[folder])

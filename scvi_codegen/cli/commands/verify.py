@@ -14,9 +14,11 @@ from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, repo
 from scvi_codegen.cli.sums import refuse
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.indexed_package import load_sums
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_model
+from scvi_codegen.models.model_file import read_model_file
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification import Certificate
 from scvi_codegen.verification.indexed import verify_indexed
@@ -72,13 +74,16 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
         model = read_model(name, choices)
         if isinstance(model, IndexedModel):
             refuse({"solver": None if solver == "auto" else solver})
-            return _certificate_of_sums(model)
+            return _certificate_of_sums(model, None)
         return _certificate(model, model.stepper(solver=solver), solver)
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
         raise PackageError(f"{folder} has no {MODEL_FILE} to say what its C code promises: generate it from a model")
-    return _certificate(load_model(folder / MODEL_FILE, choices.sections()), load_package(folder), "auto")
+    model = read_model_file(folder / MODEL_FILE, choices.sections())
+    if isinstance(model, IndexedModel):
+        return _certificate_of_sums(model, load_sums(folder, model))
+    return _certificate(model, load_package(folder), "auto")
 
 
 def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
@@ -96,7 +101,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
     )
 
 
-def _certificate_of_sums(model: IndexedModel) -> Certificate:
+def _certificate_of_sums(model: IndexedModel, stepper: IndexedStepper | None) -> Certificate:
     return verify_indexed(
         model.system,
         model.method,
@@ -107,6 +112,7 @@ def _certificate_of_sums(model: IndexedModel) -> Certificate:
         t=model.t,
         parameters=model.parameters,
         tables=model.tables,
+        stepper=stepper,
     )
 
 

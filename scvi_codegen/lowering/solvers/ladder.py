@@ -17,10 +17,11 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweep import Kept, Sweep
 from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 
-__all__ = ["control_of", "ladder_of"]
+__all__ = ["control_of", "control_of_sweep", "ladder_of"]
 
 RUNGS, REACH = 4, 2
 """Rungs an octave, and how many of them a step may be from the one before for its guess to be continued."""
+MANTISSAS = tuple(2.0 ** (k / RUNGS) for k in range(RUNGS))
 
 
 def control_of(program: Program) -> Control | None:
@@ -28,10 +29,15 @@ def control_of(program: Program) -> Control | None:
     if not program.error_power or program.integrals:
         return None
     return Control(
-        mantissas=tuple(2.0 ** (k / RUNGS) for k in range(RUNGS)),
+        mantissas=MANTISSAS,
         ladder=ladder_of(program.sweep) if program.sweep else None,
         stage_growth=2.0 ** (program.stage_curve.power / RUNGS) if program.stage_curve else 0.0,
     )
+
+
+def control_of_sweep(sweep: Sweep) -> Control:
+    """How steps by a fixed-point iteration alone choose their length."""
+    return Control(mantissas=MANTISSAS, ladder=ladder_of(sweep))
 
 
 def ladder_of(sweep: Sweep) -> Ladder:

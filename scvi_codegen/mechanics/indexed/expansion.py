@@ -93,6 +93,7 @@ def expand_sums(
         "parameters": tuple(map(symbol, [*numbers, *values])),
         "defaults": (*numbers.values(), *values.values()),
         "forces": tuple(Add(*acting.get(q, ())) for q in coordinates) if acting else (),
+        "inputs": system.inputs,
     }
     if momenta:
         return HamiltonianSystem(**same, momenta=momenta, hamiltonian=Add(*summands))

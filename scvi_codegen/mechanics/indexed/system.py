@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Any
 
 import sympy
 from sympy import Expr, S, Symbol
@@ -25,7 +26,8 @@ from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
-from scvi_codegen.kinds import MAPPING, TEXT, TEXTS, of, takes
+from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.mechanics.inputs import input_formulas, with_inputs
 
 __all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
 
@@ -55,6 +57,7 @@ class IndexedSystem:
         tables: arrays of places, ``bonds[B, 2]``, given with each run.
         terms: of the Lagrangian or the Hamiltonian.
         forces: beside it, of coordinates, velocities (momenta of a Hamiltonian) and time.
+        inputs: names of functions of time given as data with each run, each five of the parameters.
     """
 
     name: str
@@ -68,6 +71,7 @@ class IndexedSystem:
     tables: tuple[Array, ...]
     terms: tuple[IndexedTerm, ...]
     forces: tuple[IndexedForce, ...] = ()
+    inputs: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))"
@@ -101,6 +105,7 @@ class IndexedSystem:
         tables=TEXTS,
         forces=MAPPING,
         dissipation=TEXT,
+        inputs=NAMES,
     )
     def from_text(
         cls,
@@ -114,6 +119,7 @@ class IndexedSystem:
         tables: Sequence[str] = (),
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
+        inputs: Sequence[str] = (),
     ) -> IndexedSystem:
         """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
 
@@ -128,6 +134,8 @@ class IndexedSystem:
             tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
             forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` at every place, ``{"q[0]": "cos(t)"}`` at one.
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
+            inputs: names of functions of time that are given as data with each run
+                (:mod:`scvi_codegen.mechanics.inputs`).
 
         Raises:
             SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
@@ -141,13 +149,14 @@ class IndexedSystem:
         arrays = tuple(map(parse_array, coordinates))
         conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
         places = tuple(map(_table, tables))
-        values = {key: number(key, value) for key, value in (parameters or {}).items()}
+        values = with_inputs({key: number(key, value) for key, value in (parameters or {}).items()}, inputs)
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
         velocities = () if conjugate else tuple(Array(array.name + DOT, array.axes) for array in arrays)
         text = lagrangian if hamiltonian is None else hamiltonian
         assert text is not None
-        known = {key: symbol(key) for key in (*scalars, TIME)}
+        known = {key: symbol(key) for key in (*scalars, *inputs, TIME)}
+        driven = input_formulas(inputs, symbol(TIME))
         everything = (*arrays, *conjugate, *velocities, *fields.values())
         acting = [parse_force(*pair, arrays, everything, known, places) for pair in (forces or {}).items()]
         if dissipation is not None:
@@ -162,8 +171,9 @@ class IndexedSystem:
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
             tables=places,
-            terms=parse_indexed(text, everything, known, places),
-            forces=tuple(chain(*acting)),
+            terms=tuple(_with_formulas(term, driven) for term in parse_indexed(text, everything, known, places)),
+            forces=tuple(_with_forces(force, driven) for force in chain(*acting)),
+            inputs=tuple(inputs),
         )
 
     @classmethod
@@ -264,8 +274,8 @@ class IndexedSystem:
     def latex(self) -> str:
         """L or H in LaTeX."""
         arguments = ", ".join(array.name for array in self.state)
-        terms = " + ".join(map(latex_sum, self.terms)).replace("+ -", "-")
-        return rf"{self.function[0]}({arguments}) = {terms}"
+        shown = (latex_sum(_with_formulas(term, self._by_name)) for term in self.terms)
+        return rf"{self.function[0]}({arguments}) = {' + '.join(shown).replace('+ -', '-')}"
 
     @property
     def depends_on_time(self) -> bool:
@@ -275,13 +285,19 @@ class IndexedSystem:
 
     def key(self) -> tuple[str, ...]:
         """All that tells this system from others."""
-        arrays = (self.momenta, self.tables, self.fields)
+        arrays = (self.momenta, self.tables, self.fields, self.inputs)
         return (self.name, str(self), repr((arrays, self.parameters, self.defaults)))
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))
-        forces = f"; forces {'; '.join(map(str, self.forces))}" if self.forces else ""
-        return f"{self.name}: {self.function[0]}({arguments}) = {' + '.join(map(str, self.terms))}{forces}"
+        terms = " + ".join(str(_with_formulas(term, self._by_name)) for term in self.terms)
+        acting = "; ".join(str(_with_forces(force, self._by_name)) for force in self.forces)
+        return f"{self.name}: {self.function[0]}({arguments}) = {terms}{f'; forces {acting}' if acting else ''}"
+
+    @property
+    def _by_name(self) -> dict[Expr, Expr]:
+        """What is shown for the parts of inputs."""
+        return {formula: name for name, formula in input_formulas(self.inputs, self.time).items()}
 
     @property
     def function(self) -> str:
@@ -308,6 +324,16 @@ class IndexedSystem:
         for array in self.coordinates:
             if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                 raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
+
+
+def _with_formulas(term: IndexedTerm, rule: Mapping[Any, Expr]) -> IndexedTerm:
+    """The term with other expressions for some."""
+    return replace(term, formula=term.formula.xreplace(rule)) if rule else term
+
+
+def _with_forces(force: IndexedForce, rule: Mapping[Any, Expr]) -> IndexedForce:
+    targets = tuple((access, formula.xreplace(rule)) for access, formula in force.targets)
+    return replace(force, targets=targets) if rule else force
 
 
 def _table(text: str) -> Array:

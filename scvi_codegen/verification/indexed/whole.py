@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr
 
-from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.formulas.on_arrays import on_arrays
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.formulas.summed import Elements
 from scvi_codegen.formulas.symbols import DOT
-from scvi_codegen.indices import Access, Loop, Place
+from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.indexed_interface import RunArrays
@@ -29,8 +28,6 @@ Numbers = NDArray[np.float64]
 
 EPSILON = 2.0**-52
 ROUNDINGS = 64.0
-MOST_ELEMENTS = 5_000_000
-"""Of the loops of a term, at once in NumPy."""
 SHORT = 2.0**-60
 """Of h: what is left of a step is the rates at its start, and all of it is what rounding cuts off."""
 NUDGE = 2.0**-30
@@ -62,6 +59,10 @@ class WholeStart:
         if moving != name and moving in self.p:
             return self.p[moving] / _masses(self)[moving]
         return {**self.arrays.state, **self.arrays.fields}[name]
+
+    def elements(self, loops: Sequence[Loop]) -> Elements:
+        """All values of the indices of loops."""
+        return Elements(loops, self.arrays.sizes, self.arrays.places)
 
     def run(self, h: float | None = None) -> IndexedRun:
         """From the beginning, with another step."""
@@ -117,14 +118,14 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
     system = start.system
     found = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in system.state}
     for term, slopes in system.kernels:
-        at = _Places(start, term.loops)
+        at = start.elements(term.loops)
         for slot, access in term.slots:
             if slot.name in slopes:
-                np.add.at(found[access.array.name], at.of(access), at.values(slopes[slot.name], term.slots))
+                np.add.at(found[access.array.name], at.of(access), _values(start, at, slopes[slot.name], term.slots))
     for force in system.forces:
-        at = _Places(start, force.loops)
+        at = start.elements(force.loops)
         for access, formula in force.targets:
-            np.add.at(found[access.array.name], at.of(access), at.values(formula, force.slots))
+            np.add.at(found[access.array.name], at.of(access), _values(start, at, formula, force.slots))
     if system.momenta:
         pairs = list(zip(system.coordinates, system.momenta, strict=True))
         return {q.name: -found[p.name] for q, p in pairs}, {q.name: found[q.name] for q, _ in pairs}
@@ -135,8 +136,8 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
 def _masses(start: WholeStart) -> dict[str, Numbers]:
     masses = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in start.system.coordinates}
     for mass in start.system.masses:
-        at = _Places(start, mass.loops)
-        np.add.at(masses[mass.access.array.name], at.of(mass.access), at.values(mass.formula, mass.slots))
+        at = start.elements(mass.loops)
+        np.add.at(masses[mass.access.array.name], at.of(mass.access), _values(start, at, mass.formula, mass.slots))
     return masses
 
 
@@ -144,7 +145,7 @@ def _energies(start: WholeStart) -> Finding:
     system, run = start.system, start.run()
     masses = {} if system.momenta else _masses(start)
     kinetic = sum(float(np.sum(start.p[name] ** 2 / mass)) / 2 for name, mass in masses.items())
-    values = [_Places(start, term.loops).values(term.formula, term.slots) for term in system.potentials]
+    values = [_values(start, start.elements(term.loops), term.formula, term.slots) for term in system.potentials]
     potential = -sum(float(np.sum(each)) for each in values)
     size = kinetic + sum(float(np.sum(np.abs(each))) for each in values)
     wrong = abs(run.energies[0] - kinetic) + abs(run.energies[1] - potential)
@@ -152,48 +153,11 @@ def _energies(start: WholeStart) -> Finding:
     return Finding(wrong / (size or 1.0), ROUNDINGS * EPSILON * float(np.log2(count) + 1), "relative to its terms")
 
 
-class _Places:
-    """All values of the indices of loops, as arrays."""
-
-    def __init__(self, start: WholeStart, loops: Sequence[Loop]) -> None:
-        self.start, self.loops, sizes = start, {loop.index: loop for loop in loops}, start.arrays.sizes
-        pairs = {loop.behind: loop for loop in loops if loop.behind}
-        spans = [(loop, np.arange(loop.first.at(sizes), loop.end.at(sizes))) for loop in loops if not loop.behind]
-        counts = [len(span) * (len(span) - 1) // 2 if loop.index in pairs else len(span) for loop, span in spans]
-        if (total := math.prod(counts)) > MOST_ELEMENTS:
-            raise StateError(f"{total} elements of a sum are more than the {MOST_ELEMENTS} that NumPy adds up")
-        grids = np.meshgrid(*(np.arange(count) for count in counts), indexing="ij")
-        self.index: dict[str, NDArray[np.int64]] = {}
-        for (loop, span), grid in zip(spans, grids, strict=True):
-            if loop.index not in pairs:
-                self.index[loop.index] = span[grid.reshape(-1)]
-                continue
-            first, second = np.triu_indices(len(span), 1)
-            self.index[loop.index], self.index[pairs[loop.index].index] = (
-                span[each[grid.reshape(-1)]] for each in (first, second)
-            )
-
-    def of(self, access: Access) -> tuple[Any, ...]:
-        """Where an access stands."""
-        return tuple(self._place(place) for place in access.places)
-
-    def _place(self, place: Place) -> Any:
-        arrays = self.start.arrays
-        if place.table:
-            return arrays.places[place.table][self.index[place.index], place.column]
-        if not place.index:
-            return place.base.at(arrays.sizes)
-        loop, moved = self.loops[place.index], self.index[place.index] + place.base.number
-        return moved % loop.end.at(arrays.sizes) if loop.periodic else moved
-
-    def values(self, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
-        """Of a formula, at every element."""
-        start = self.start
-        known: dict[Expr, Any] = {slot: start.array(access.array.name)[self.of(access)] for slot, access in slots}
-        known |= dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
-        known[start.system.time] = start.t
-        count = next((len(values) for values in self.index.values()), 1)
-        return np.broadcast_to(on_arrays(formula, known), (count,)) if self.index else on_arrays(formula, known)
+def _values(start: WholeStart, at: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
+    """Of a formula, at every element."""
+    arrays = {access.array.name: start.array(access.array.name) for _, access in slots}
+    numbers: dict[Expr, float] = dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
+    return at.values(formula, slots, arrays, {**numbers, start.system.time: start.t})
 
 
 def _reversal(start: WholeStart) -> Finding:

@@ -1,0 +1,165 @@
+"""A field cut in two: each process has its places, and asks the other for their neighbours and for one sum a sweep.
+
+What a decomposition over MPI would do (docs/decomposition.md), by shared memory of two processes: points of a step of
+Gauss' method with four stages, by sweeps over positions. Both processes have the bits of one, whose states are those of
+the compiled integrator; the time of a sweep is held against the model  c n / P + halo + reduction.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.shared_memory import SharedMemory
+
+import numpy as np
+
+import scvi_codegen as sc
+
+STAGES, MOST, H, STEPS = 4, 50, 0.1, 5
+EDGES, BLOCKS = 2, 16
+"""Of a part; and in how many blocks changes are summed up, so that any number of processes gets the same bits."""
+
+
+def tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, b, c of Gauss' method: integrals of Lagrange's polynomials."""
+    x, w = np.polynomial.legendre.leggauss(STAGES)
+    c, powers = (x + 1) / 2, np.arange(STAGES)
+    a = (c[:, None] ** (powers + 1) / (powers + 1)) @ np.linalg.inv(c[:, None] ** powers)
+    return a, w / 2, c
+
+
+def forces(x: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Of a Fermi-Pasta-Ulam-Tsingou ring at the points (stages, places), with a column of neighbours on either side."""
+    stretch = np.diff(np.concatenate([left, x, right], axis=1), axis=1)
+    pull = stretch + stretch**3 / 4
+    return np.diff(pull, axis=1)
+
+
+@dataclass
+class Part:
+    """The places of a process, and the memory that all have in common.
+
+    Attributes:
+        rank, count: which process of how many.
+        edges: (2, processes, 2, stages) points at the ends of all parts, in turn.
+        sums: (2, blocks) of the squares of changes, in turn.
+        arrived: (processes,) how often each was at a meeting.
+    """
+
+    rank: int
+    count: int
+    edges: np.ndarray
+    sums: np.ndarray
+    arrived: np.ndarray
+
+    def meet(self) -> None:
+        """Waits for all others."""
+        self.arrived[self.rank] += 1
+        while (self.arrived < self.arrived[self.rank]).any():
+            os.sched_yield()
+
+    def neighbours(self, x: np.ndarray, turn: int) -> tuple[np.ndarray, np.ndarray]:
+        """The halo: a message of so many stages to either side, one from either side."""
+        self.edges[turn, self.rank] = x[:, 0], x[:, -1]
+        self.meet()
+        left, right = (self.rank - 1) % self.count, (self.rank + 1) % self.count
+        return self.edges[turn, left, 1][:, None], self.edges[turn, right, 0][:, None]
+
+    def total(self, moved: np.ndarray, turn: int) -> float:
+        """The reduction: the sum of squares over all places, the same everywhere."""
+        own = BLOCKS // self.count
+        for k, block in enumerate(np.split(moved, own, axis=1)):
+            self.sums[turn, self.rank * own + k] = np.sum(block * block)
+        self.meet()
+        return float(self.sums[turn].sum())
+
+
+def run(part: Part, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, int]:
+    """The positions after all steps, and the number of sweeps."""
+    (a, b, c), sweeps, turn = tables(), 0, 0
+    for _ in range(STEPS):
+        straight = q + H * c[:, None] * v
+        x, change = straight, np.inf
+        for _ in range(MOST):
+            f = forces(x, *part.neighbours(x, turn))
+            moved = straight + H * H * (a @ a @ f) - x
+            x, before, change = x + moved, change, part.total(moved, turn)
+            sweeps, turn = sweeps + 1, 1 - turn
+            if change == 0.0 or (change >= before and change < 1e-24 * q.size):
+                break
+        f = forces(x, *part.neighbours(x, turn))
+        turn = 1 - turn
+        q, v = q + H * v + H * H * (b @ a @ f), v + H * (b @ f)
+    return q, sweeps
+
+
+def work(part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.ndarray) -> None:
+    """What a process does."""
+    places = slice(part.rank * len(q) // part.count, (part.rank + 1) * len(q) // part.count)
+    part.meet()
+    began = time.perf_counter()
+    end[places], sweeps = run(part, q[places], v[places])
+    numbers[part.rank] = time.perf_counter() - began, sweeps
+
+
+def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float, int]:
+    """Positions after all steps on so many processes, seconds a sweep, sweeps."""
+    sizes = {"edges": (2, count, EDGES, STAGES), "sums": (2, BLOCKS), "end": q.shape, "numbers": (count, 2)}
+    shared = {name: SharedMemory(create=True, size=8 * int(np.prod(shape))) for name, shape in sizes.items()}
+    meetings = SharedMemory(create=True, size=8 * count)
+    arrays = {name: np.ndarray(sizes[name], buffer=memory.buf) for name, memory in shared.items()}
+    arrived = np.ndarray(count, dtype=np.int64, buffer=meetings.buf)
+    arrived[:] = 0
+
+    parts = [Part(rank, count, arrays["edges"], arrays["sums"], arrived) for rank in range(count)]
+    given = [(part, q, v, arrays["end"], arrays["numbers"]) for part in parts]
+    processes = [get_context("fork").Process(target=work, args=each) for each in given]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    end, (seconds, sweeps) = arrays["end"].copy(), arrays["numbers"].max(axis=0)
+    del arrays, arrived, parts, given, processes
+    for memory in (*shared.values(), meetings):
+        memory.close()
+        memory.unlink()
+    return end, seconds / sweeps, int(sweeps)
+
+
+def best(count: int, size: int) -> tuple[np.ndarray, float]:
+    """The end, and the least of three times of a sweep."""
+    phase = 2 * np.pi * np.arange(size) / size
+    found = [on_processes(count, np.sin(phase), np.cos(3 * phase)) for _ in range(3)]
+    return found[0][0], min(seconds for _, seconds, _ in found)
+
+
+def main() -> None:
+    """Bits, states, and times beside those of the model."""
+    ring = sc.IndexedSystem.from_text(
+        name="ring",
+        coordinates=["q[N]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/16)",
+    )
+    size = 16_000
+    phase = 2 * np.pi * np.arange(size) / size
+    exact = sc.compile_indexed(ring, "gauss:4").integrate(np.sin(phase), velocity=np.cos(3 * phase), h=H, steps=STEPS)
+    one, two = (best(count, size)[0] for count in (1, 2))
+    print("two processes have the bits of one:", bool((one == two).all()))
+    print("and the states of the compiled integrator:", bool(np.abs(two - exact.q["q"][-1]).max() < 1e-14))
+
+    sizes = (1600, 16_000, 64_000)
+    times = {count: np.array([best(count, size)[1] for size in sizes]) for count in (1, 2)}
+    slope = (times[1][-1] - times[1][0]) / (sizes[-1] - sizes[0])
+    alone = times[1][0] - slope * sizes[0]
+    meeting = max(0.0, times[2][0] - alone - slope * sizes[0] / 2)
+    print(f"c = {1e9 * slope:.0f} ns a place and sweep; a halo and a reduction: {1e6 * meeting:.0f} us")
+    for size, measured in zip(sizes, times[2], strict=True):
+        model = alone + slope * size / 2 + meeting
+        print(f"{size} places on two: {1e3 * measured:.3f} ms a sweep, by the model {1e3 * model:.3f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""A model as an FMU: co-simulation by FMI 3.0, for Modelica tools, Simulink, FMPy and whatever else imports these.
+
+    pendulum.fmu   modelDescription.xml          variables, the step, what it can do
+                   binaries/x86_64-linux/..      the library, compiled here
+                   sources/                      the integrator and FMI's functions, C99, for any other machine
+                   resources/model.toml          what it was made from
+
+The name of the file, without its suffix, begins every C name and is the model identifier.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import sys
+import uuid
+import zipfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import IO
+
+from scvi_codegen.compiler import generate_source
+from scvi_codegen.errors import ModelFileError, PackageError
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.kinds import PATH, SWITCH, TEXT, TEXTS, takes
+from scvi_codegen.mechanics.inputs import PARTS
+from scvi_codegen.models.fmu_description import build_description, model_description
+from scvi_codegen.models.model import Model
+from scvi_codegen.models.package import MODEL, example_of, model_text, prefix_of
+from scvi_codegen.native.building import PORTABLE_FLAGS, load
+from scvi_codegen.rendering.fmu import with_fmu
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.rendering.text import ExampleRun
+from scvi_codegen.version import __version__
+
+__all__ = ["generate_fmu"]
+
+DESCRIPTION = "modelDescription.xml"
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Of every file in the archive: equal models give equal bytes."""
+PROCESSORS = {"amd64": "x86_64", "arm64": "aarch64", "i686": "x86", "i386": "x86"}
+SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
+
+
+@takes(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, force=SWITCH)
+def generate_fmu(
+    model: Model,
+    path: str | os.PathLike[str],
+    *,
+    solver: str = "auto",
+    flags: tuple[str, ...] = PORTABLE_FLAGS,
+    force: bool = False,
+) -> Path:
+    """Write a model as an FMU 3.0 for co-simulation: a library for this machine, and the sources for others.
+
+    Positions, velocities, momenta and the energy are outputs; parameters may be set, also on the way; inputs of the
+    system are continuous inputs, held from one communication point to the next. It steps by the model's step, which
+    divides the communication step, or by the equal parts of that which come next below.
+
+    Args:
+        model: system, method, initial state, and the step.
+        path: where to, ``<name>.fmu``; the name begins the C names.
+        solver: of the stage equations, as for ``compile_stepper``.
+        flags: for the C compiler; by default those with which every processor of the kind computes the same bits.
+        force: overwrite a file that is no FMU.
+
+    Returns:
+        The path.
+
+    Raises:
+        ModelFileError: for a model whose steps choose their length, or go backward, or are of transformed time.
+        PackageError: if the name does not serve, or the file cannot be written or is no FMU.
+        MethodError: for a solver that the method does not have.
+        BuildError: without a C compiler.
+    """
+    target = Path(path)
+    if target.suffix != ".fmu":
+        raise PackageError(f"the name of an FMU ends with .fmu, as in {target.name or 'model'}.fmu")
+    prefix = prefix_of(target.with_suffix(""))
+    files = _files(model, prefix, solver, flags)
+    if not force:
+        _refuse_to_lose(target)
+    try:
+        write_atomically(target, lambda file: _write(files, file))
+    except OSError as error:
+        raise PackageError(f"{target} cannot be written: {error.strerror or error}") from error
+    return target
+
+
+def _files(model: Model, prefix: str, solver: str, flags: tuple[str, ...]) -> dict[str, bytes]:
+    """What stands in the archive, by name."""
+    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
+    by_velocity = model.velocity is not None
+    start = _start(model)
+    places = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
+    token = _token(source.to_json(), interface, start)
+    source = with_fmu(source, interface, start, by_velocity=by_velocity, places=places, token=token)
+    described = model_text(model)
+    folder, suffix = _platform()
+    texts = {
+        DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),
+        **{f"sources/{name}": text for name, text in source.files.items()},
+        "sources/buildDescription.xml": build_description(prefix, [f"{each.prefix}.c" for each in source.sources]),
+        **({} if described is None else {"resources/model.toml": described}),
+    }
+    library = load(source, flags=flags).path.read_bytes()
+    return {name: text.encode() for name, text in texts.items()} | {f"binaries/{folder}/{prefix}{suffix}": library}
+
+
+def _start(model: Model) -> ExampleRun:
+    """The initial state as it was given, by velocities or by momenta, and the step."""
+    if model.h is None or model.paced:
+        raise ModelFileError("an FMU has steps of one length, in time: give a step h (--step, [run] step), no monitor")
+    if model.h < 0:
+        raise ModelFileError(f"an FMU goes forward in time: its step is positive, not {model.h:g}")
+    start = example_of(replace(model, inputs={}), controlled=False)
+    return start if model.velocity is None else replace(start, p=model.velocity)
+
+
+def _token(text: str, interface: Interface, start: ExampleRun) -> str:
+    """Made from all that the library and its description are made from."""
+    made_from = "\0".join([__version__, text, interface.to_json(), repr(start)])
+    return f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
+
+
+def _platform() -> tuple[str, str]:
+    """The folder of libraries for this machine, and how they end."""
+    processor = platform.machine().lower()
+    system, suffix = SYSTEMS.get(sys.platform, (re.sub(r"\W", "", sys.platform), ".so"))
+    return f"{PROCESSORS.get(processor, processor)}-{system}", suffix
+
+
+def _refuse_to_lose(target: Path) -> None:
+    """Raise :class:`PackageError` if something stands there that is no FMU."""
+    if target.exists() and not (zipfile.is_zipfile(target) and DESCRIPTION in zipfile.ZipFile(target).namelist()):
+        raise PackageError(f"{target} is no FMU: choose another name, or overwrite it with --force (force=True)")
+
+
+def _write(files: Mapping[str, bytes], file: IO[bytes]) -> None:
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in files.items():
+            entry = zipfile.ZipInfo(name, EPOCH)
+            entry.external_attr = 0o100644 << 16
+            archive.writestr(entry, content, zipfile.ZIP_DEFLATED)

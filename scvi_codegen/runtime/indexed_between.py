@@ -1,0 +1,96 @@
+"""States between those kept of a run over arrays: steps of the method itself from the kept state before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.dense_output import whole_steps, within
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.indexed_interface import Numbers
+from scvi_codegen.runtime.indexed_problem import IndexedProblem
+from scvi_codegen.runtime.indexed_run import IndexedRun
+
+__all__ = ["Departure", "states_between"]
+
+State = Mapping[str, Numbers]
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """How a run goes on from a kept state: of what, by which steps.
+
+    Attributes:
+        problem: with the parameters from there on.
+        h: of steps of one length.
+        goal: of others.
+        options: of the solver.
+    """
+
+    problem: IndexedProblem
+    h: float
+    goal: Goal | None
+    options: SolverOptions | None
+
+    @classmethod
+    def of(cls, run: IndexedRun) -> Departure:
+        """That of a run as it stands."""
+        return cls(run.problem, run.h, run.goal, run.options)
+
+    def begin(self, t: float, q: State, p: State, *, h: float | None = None, t_end: float | None = None) -> IndexedRun:
+        """A run from a state, by steps of h, or to a time by others."""
+        goal = replace(self.goal, t_end=t_end) if self.goal and t_end is not None else None
+        length = 0.0 if goal else self.h if h is None else h
+        return IndexedRun(self.problem, q, (p, "momenta"), h=length, t=t, goal=goal, options=self.options)
+
+
+def states_between(
+    departures: tuple[Departure, ...], t: Numbers, q: State, p: State, times: Numbers
+) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+    """Positions and momenta at (n,) times within (k,) kept ones, by name; raises as :meth:`IndexedTrajectory.at`."""
+    flat = within(times.ravel(), t[0], t[-1])
+    forward = math.copysign(1.0, t[-1] - t[0])
+    left = np.searchsorted(forward * t, forward * flat, side="right") - 1
+    found: list[tuple[dict[str, Numbers], dict[str, Numbers]]] = [({}, {})] * len(flat)
+    for k in np.unique(left):
+        start = ({name: each[k] for name, each in q.items()}, {name: each[k] for name, each in p.items()})
+        numbers = np.flatnonzero(left == k)
+        wanted = numbers[np.argsort(forward * flat[numbers], kind="stable")]
+        for number, state in zip(wanted, _behind(departures[k], float(t[k]), start, flat[wanted]), strict=True):
+            found[number] = state
+    return _shaped([state for state, _ in found], q, times.shape), _shaped(
+        [state for _, state in found], p, times.shape
+    )
+
+
+def _shaped(states: Sequence[State], kept: State, shape: tuple[int, ...]) -> dict[str, Numbers]:
+    """Arrays of states by name, of the shape of the times."""
+    return {
+        name: np.array([state[name] for state in states]).reshape(*shape, *values.shape[1:])
+        for name, values in kept.items()
+    }
+
+
+def _behind(
+    departure: Departure, t: float, start: tuple[State, State], times: NDArray[np.float64]
+) -> Iterator[tuple[dict[str, Numbers], dict[str, Numbers]]]:
+    """States at times in the order of the run: so many whole steps, and a part of one; or steps to each."""
+    if departure.goal is not None:
+        for time in times:
+            run = departure.begin(t, *start, t_end=float(time))
+            while not run.arrived:
+                run.advance(1)
+            yield run.q, run.p
+        return
+    run = departure.begin(t, *start)
+    for time, whole in zip(times, whole_steps(times - t, np.full(len(times), departure.h)), strict=True):
+        run.advance(int(whole) - run.steps)
+        rest, on_grid = float(time) - run.t, abs(float(time) - run.t) <= 4.0 * np.spacing(max(abs(t), abs(run.t)))
+        part = run if on_grid else departure.begin(run.t, run.q, run.p, h=rest)
+        part.advance(0 if on_grid else 1)
+        yield part.q, part.p

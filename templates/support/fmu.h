@@ -1,0 +1,192 @@
+/* Instances of an FMU and the modes in which they are. Before it: the integrator's header, that of FMI, and NAME,
+ * STATUS, WORKSPACE, TOKEN, STEP, M, PARAMETERS, BY_VELOCITY, and the values at the start. */
+
+enum { LONGEST_MESSAGE = 240 };
+
+typedef NAME(run) run_memory;
+typedef NAME(report) run_report;
+
+/* References of variables: t, positions, velocities, momenta, the energy, parameters. */
+enum {
+  TIME = 0,
+  POSITIONS = 1,
+  VELOCITIES = POSITIONS + M,
+  MOMENTA = VELOCITIES + M,
+  ENERGY = MOMENTA + M,
+  FIRST_PARAMETER = ENERGY + 1,
+  REFERENCES = FIRST_PARAMETER + PARAMETERS,
+  MOVING = BY_VELOCITY ? VELOCITIES : MOMENTA /* given at the start */
+};
+
+typedef enum {
+  INSTANTIATED,
+  INITIALIZATION_MODE,
+  STEP_MODE,
+  TERMINATED
+} fmu_mode;
+
+/* All that changes: copy it to keep the state of an instance, copy it back to go on from there, bit for bit. */
+typedef struct {
+  char token[sizeof TOKEN]; /* of the FMU that it belongs to */
+  fmu_mode mode;
+  bool behind; /* whether what follows from other values is not up to date */
+  double values[REFERENCES];
+  NAME(run)
+  run;
+} fmu_state;
+
+typedef struct {
+  fmu_state now;
+  NAME(run)
+  before; /* the last step, to go back to */
+  fmi3InstanceEnvironment environment;
+  fmi3LogMessageCallback log;
+  bool logs_discards;
+  double workspace[WORKSPACE];
+} fmu;
+
+/* Says why a call fails, where somebody listens; gives its status. */
+static fmi3Status failed(const fmu *one, fmi3Status status, const char *format, ...)
+{
+  char message[LONGEST_MESSAGE];
+  va_list arguments;
+  if (!one || !one->log || (status == fmi3Discard && !one->logs_discards))
+    return status;
+  va_start(arguments, format);
+  vsnprintf(message, sizeof message, format, arguments);
+  va_end(arguments);
+  one->log(one->environment, status, status == fmi3Discard ? "logStatusDiscard" : "logStatusError", message);
+  return status;
+}
+
+static fmi3Status not_now(const fmu *one, const char *call)
+{
+  return failed(one, fmi3Error, "%s is not allowed in this mode", call);
+}
+
+/* The answers of the integrator in words. */
+static const char *reason(int status)
+{
+  switch (status) {
+  case STATUS(NOT_CONVERGED):
+    return "the iteration did not converge: take shorter steps";
+  case STATUS(SINGULAR):
+    return "a matrix has no inverse";
+  case STATUS(NOT_FINITE):
+    return "an infinity or a NaN turned up";
+  default:
+    return "its equations were solved by what is no motion: take shorter steps";
+  }
+}
+
+static void set_start(fmu_state *now)
+{
+  memset(now, 0, sizeof *now);
+  memcpy(now->token, TOKEN, sizeof TOKEN);
+  now->mode = INSTANTIATED;
+  now->behind = true;
+  now->values[TIME] = START_TIME;
+  memcpy(now->values + POSITIONS, START_POSITIONS, sizeof(double) * M);
+  memcpy(now->values + MOVING, START_MOVING, sizeof(double) * M);
+  memcpy(now->values + FIRST_PARAMETER, START_PARAMETERS, sizeof(double) * PARAMETERS);
+}
+
+/* What follows from other values: momenta where velocities are given, else velocities; the energy. */
+static fmi3Status follow(fmu *one, fmi3Status otherwise)
+{
+  double *x = one->now.values;
+  const double *parameters = x + FIRST_PARAMETER;
+  int status;
+  if (!one->now.behind)
+    return fmi3OK;
+  if (BY_VELOCITY && one->now.mode < STEP_MODE)
+    status = NAME(momentum)(x[TIME], x + POSITIONS, x + VELOCITIES, parameters, x + MOMENTA, one->workspace);
+  else
+    status = NAME(velocity)(x[TIME], x + POSITIONS, x + MOMENTA, parameters, x + VELOCITIES, one->workspace);
+  if (status == STATUS(OK))
+    status = NAME(energy)(x[TIME], x + POSITIONS, x + MOMENTA, parameters, x + ENERGY, one->workspace);
+  if (status != STATUS(OK))
+    return failed(one, otherwise, "velocities, momenta or energy at t = %g: %s", x[TIME], reason(status));
+  one->now.behind = false;
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3String FMI(GetVersion)(void)
+{
+  return "3.0";
+}
+
+FMI_EXPORT fmi3Instance FMI(InstantiateCoSimulation)(fmi3String name, fmi3String token, fmi3String resources,
+    fmi3Boolean visible, fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference *required,
+    size_t count, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3Callback update)
+{
+  fmu *one = calloc(1, sizeof *one);
+  const char *wrong = NULL;
+  (void)name, (void)resources, (void)visible, (void)early, (void)required, (void)update;
+  if (!one)
+    return NULL;
+  one->environment = environment;
+  one->log = log;
+  one->logs_discards = logging;
+  set_start(&one->now);
+  if (!token || strcmp(token, TOKEN) != 0)
+    wrong = "the instantiation token is that of another FMU";
+  else if (events || count > 0)
+    wrong = "this FMU has no event mode and no intermediate variables";
+  if (!wrong)
+    return one;
+  failed(one, fmi3Error, "%s", wrong);
+  free(one);
+  return NULL;
+}
+
+FMI_EXPORT void FMI(FreeInstance)(fmi3Instance instance)
+{
+  free(instance);
+}
+
+FMI_EXPORT fmi3Status FMI(SetDebugLogging)(fmi3Instance instance, fmi3Boolean logging, size_t count,
+    const fmi3String *categories)
+{
+  fmu *one = instance;
+  bool named = count == 0;
+  for (size_t k = 0; k < count; k++) {
+    const bool discards = strcmp(categories[k], "logStatusDiscard") == 0;
+    if (!discards && strcmp(categories[k], "logStatusError") != 0)
+      return failed(one, fmi3Error, "there is no log category %.80s", categories[k]);
+    named = named || discards;
+  }
+  one->logs_discards = named ? logging : one->logs_discards;
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(EnterInitializationMode)(fmi3Instance instance, fmi3Boolean tolerant, fmi3Float64 tolerance,
+    fmi3Float64 start, fmi3Boolean stops, fmi3Float64 stop)
+{
+  fmu *one = instance;
+  (void)tolerant, (void)tolerance, (void)stops, (void)stop;
+  if (one->now.mode != INSTANTIATED)
+    return not_now(one, "fmi3EnterInitializationMode");
+  if (0 * start != 0)
+    return failed(one, fmi3Error, "the start time is not finite");
+  one->now.values[TIME] = start;
+  one->now.behind = true;
+  one->now.mode = INITIALIZATION_MODE;
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(Terminate)(fmi3Instance instance)
+{
+  fmu *one = instance;
+  if (one->now.mode != STEP_MODE)
+    return not_now(one, "fmi3Terminate");
+  one->now.mode = TERMINATED;
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(Reset)(fmi3Instance instance)
+{
+  fmu *one = instance;
+  set_start(&one->now);
+  return fmi3OK;
+}

@@ -1,0 +1,59 @@
+/* States of an FMU, kept, set, and as bytes. Before it: fmu.h. */
+
+/* The same state in memory of the importer's, made if there is none. */
+static fmi3Status keep_state(const fmu *one, const void *state, fmi3FMUState *kept)
+{
+  *kept = *kept ? *kept : malloc(sizeof(fmu_state));
+  if (!*kept)
+    return failed(one, fmi3Error, "there is no memory for a state");
+  memcpy(*kept, state, sizeof(fmu_state));
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(GetFMUState)(fmi3Instance instance, fmi3FMUState *state)
+{
+  const fmu *one = instance;
+  return keep_state(one, &one->now, state);
+}
+
+FMI_EXPORT fmi3Status FMI(SetFMUState)(fmi3Instance instance, fmi3FMUState state)
+{
+  fmu *one = instance;
+  if (!state)
+    return failed(one, fmi3Error, "no state is given");
+  memcpy(&one->now, state, sizeof one->now);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(FreeFMUState)(fmi3Instance instance, fmi3FMUState *state)
+{
+  (void)instance;
+  if (state) {
+    free(*state);
+    *state = NULL;
+  }
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(SerializedFMUStateSize)(fmi3Instance instance, fmi3FMUState state, size_t *size)
+{
+  (void)instance, (void)state;
+  *size = sizeof(fmu_state);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(SerializeFMUState)(fmi3Instance instance, fmi3FMUState state, fmi3Byte *bytes, size_t size)
+{
+  if (!state || size != sizeof(fmu_state))
+    return failed(instance, fmi3Error, "a state has %lu bytes", (unsigned long)sizeof(fmu_state));
+  memcpy(bytes, state, size);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(DeserializeFMUState)(fmi3Instance instance, const fmi3Byte *bytes, size_t size,
+    fmi3FMUState *state)
+{
+  if (size != sizeof(fmu_state) || memcmp(bytes, TOKEN, sizeof TOKEN) != 0)
+    return failed(instance, fmi3Error, "these bytes are no state of this FMU");
+  return keep_state(instance, bytes, state);
+}

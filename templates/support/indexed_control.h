@@ -1,0 +1,38 @@
+/* Runs of any number of coordinates to a time, by steps that choose their length. Before it: trials.h. */
+
+static void take_trial(run_memory *run, trial *now)
+{
+  accept(run, now->n, now->error, now->guess);
+  if (now->last) {
+    now->at.t = now->t_end;
+    now->at.t_low = 0.0;
+    run->guess = 0;
+  } else {
+    add_compensated(&now->at.t, &now->at.t_low, run->h, 0.0);
+    choose_length(run, now);
+  }
+  run->t = now->at.t;
+  run->t_low = now->at.t_low;
+  run->step++;
+}
+
+int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double tolerance, long long steps,
+    const solver_options *options, solver_report *report)
+{
+  solver_options standard = NAME(default_options)();
+  solver_report unread;
+  trial now = {.given = given, .n = NAME(coordinates)(given), .t_end = t_end, .at = {run->t, run->t_low}};
+  begin_trials(run, &now, tolerance, &standard);
+  run->direction = t_end < run->t ? -1 : 1;
+  options = options ? options : &standard;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  while (report->steps < steps && run->t != t_end) {
+    const int status = find_step(run, &now, options, report);
+    if (status != OK)
+      return status;
+    take_trial(run, &now);
+    report->steps++;
+  }
+  return OK;
+}

@@ -1,0 +1,99 @@
+/* Newton's iteration for the points of a step of any number of coordinates. Before it: indexed_newton.h, gmres.h. */
+
+#define REFRESHED 1e-6 /* the inverses are made again while points move by more than 1e-3 of the state */
+
+/* The parts of work behind those of sweeps. */
+static linear_system linear_of(const run_memory *run, const problem *given, const parts_of_work *parts, long long n)
+{
+  const long long count = GROUPS * n;
+  lanes *work = (lanes *)run->work + SWEEP_VECTORS * count;
+  const linear_system of = {.run = run,
+      .given = given,
+      .by = lengths_of(run->h),
+      .n = n,
+      .count = count,
+      .X = parts->X,
+      .residual = work,
+      .correction = work + count,
+      .product = work + 2 * count,
+      .forces = work + 3 * count,
+      .inverse = work + 4 * count,
+      .basis = work + (4 + POINTS) * count};
+  return of;
+}
+
+/* What a sweep would change at points X with forces F; returned is the size of the coordinates, squared. */
+static double find_residual(linear_system *of, const lanes *X, const lanes *F)
+{
+  const run_memory *run = of->run;
+  const long long n = of->n;
+  double size = 0.0;
+  for (long long i = 0; i < n; i++) {
+    double low, of_one;
+    const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes sum = given_by_all(PRODUCT, g, &F[i], n) + given_by_all(PRODUCT_LOW, g, &F[i], n);
+      const lanes rest = run->carry_q[i] + DRIFT[g] * low + DRIFT_LOW[g] * drift;
+      of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (unit * sum + rest);
+    }
+    of_one = fabs(run->q[i]) + fabs(drift) + fabs(at_point(&X[i], n, KEPT - 1) - run->q[i]);
+    size += of_one * of_one;
+  }
+  return size;
+}
+
+/* The points as former steps are continued, or at rest, whichever a sweep would change less: the forces of a stiff
+ * motion are no curve that could be continued. */
+static void start_nearer(linear_system *of, const parts_of_work *parts)
+{
+  const run_memory *run = of->run;
+  double continued, at_rest;
+  find_residual(of, parts->X, parts->F);
+  continued = inner_product(of->residual, of->residual, of->count);
+  for (int g = 0; g < GROUPS; g++)
+    for (long long i = 0; i < of->n; i++)
+      of->correction[g * of->n + i] = lanes_of(run->q[i]);
+  forces_at_points(run, of->given, of->correction, of->forces, of->n);
+  find_residual(of, of->correction, of->forces);
+  at_rest = inner_product(of->residual, of->residual, of->count);
+  if (continued <= at_rest)
+    return;
+  memcpy(parts->X, of->correction, sizeof(lanes) * (size_t)of->count);
+  memcpy(parts->F, of->forces, sizeof(lanes) * (size_t)of->count);
+}
+
+/* Until the points rest. The tables continue so many steps; then `guess` is how many are best continued into the next,
+ * and `error` what the curve leaves unresolved. */
+static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
+    long long *guess, double *error, const solver_options *options, solver_report *report)
+{
+  const parts_of_work parts = divide(run, n);
+  linear_system of = linear_of(run, given, &parts, n);
+  double largest = first_positions(run, &parts, &of.by, n, tables, *guess), first = 0.0, last = INFINITY;
+  int status = 0;
+  forces_at_points(run, given, parts.X, parts.F, n);
+  start_nearer(&of, &parts);
+  for (int k = 0; status == 0; k++) {
+    const double size = find_residual(&of, parts.X, parts.F);
+    double change;
+    if (k == 0 || last > REFRESHED)
+      find_inverses(&of);
+    find_correction(&of, report);
+    for (long long i = 0; i < of.count; i++)
+      parts.X[i] += of.correction[i];
+    forces_at_points(run, given, parts.X, parts.F, n);
+    change = inner_product(of.correction, of.correction, of.count);
+    change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
+    status = sweep_status(change, last, options, k);
+    first = k == 0 ? change : first;
+    last = change;
+    report->iterations++;
+  }
+  report->change = sqrt(last);
+  if (status < 0)
+    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  if (largest <= DBL_MIN)
+    largest = largest_at_end(parts.X, n);
+  *guess = steps_to_continue(*guess, first);
+  return examine(run, parts.F, &of.by, n, largest, error) ? OK : NOT_FINITE;
+}

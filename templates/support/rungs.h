@@ -1,0 +1,67 @@
+/* Lengths of steps that choose their own, roots of 2 to the power of a rung: how long one is, and how its error tells
+ * that of the next. Before it: MANTISSA; GROWTH, what a rung up multiplies the error of a curve by; ERROR_POWER. After
+ * it: a trial of a step, trials.h. */
+enum {
+  OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
+  MOST_UP = 4 * OCTAVE, /* rungs, while the first step is looked for */
+  MOST_DOWN = 2 * OCTAVE /* after a step that failed */
+};
+
+#define USED_PART REAL(0.5) /* of the error allowed, what a longer step may be expected to use */
+#define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
+#define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
+#define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
+#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
+#define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: less is rounding */
+#define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
+
+/* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
+ * `few`, two below `fewer`. */
+typedef struct {
+  real most, few, fewer;
+  real decay; /* from a coefficient of a curve to the next, where its error is just allowed */
+} error_limits;
+
+static error_limits limits_of(real tolerance)
+{
+  const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
+  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
+      MATH(exp2)(MATH(log2)(most) / (OCTAVE * MATH(log2)(GROWTH) - 2))};
+  return limits;
+}
+
+static real length_of(long long rung)
+{
+  const long long octave = rung >= 0 ? rung / OCTAVE : -((OCTAVE - 1 - rung) / OCTAVE);
+  return MATH(ldexp)(MANTISSA[rung - octave * OCTAVE], (int)octave);
+}
+
+/* The longest rung that is not longer than h > 0. */
+static long long rung_below(real h)
+{
+  int exponent;
+  long long rung;
+  MATH(frexp)(h, &exponent);
+  for (rung = (long long)exponent * OCTAVE; length_of(rung) > h; rung--)
+    ;
+  return rung;
+}
+
+/* By how many rungs the next step is longer. The error is expected to go on growing as it did; where it fell, much of
+ * that may have been luck. */
+static int next_change(real error, real before, const error_limits *limits)
+{
+  const real expected = before > 0 && error > before ? error * smaller(error / before, GROWTH * GROWTH)
+                                                     : larger(error, before / (GROWTH * GROWTH));
+  if (expected > limits->most)
+    return expected > limits->most * GROWTH ? -2 : -1;
+  return expected < limits->fewer ? 2 : expected < limits->few;
+}
+
+/* The length of the step at a rung, or the rest of the way where that is hardly longer, which then is the last. */
+static real next_length(long long rung, real rest, int *last)
+{
+  const real length = length_of(rung);
+  *last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);
+  return *last ? rest : MATH(copysign)(length, rest);
+}

@@ -1,0 +1,86 @@
+/* Trials of a step, until one is as long as its error allows. Before it: rungs.h; the type trial with at.t, at.t_low,
+ * t_end, limits, error, guess and last, and try_step, which fills the last three; SHORT_STEPS_FAIL, whether rounding
+ * alone may make a step fail; HOT. After it: what makes the step that was found the state. */
+
+/* By how many rungs the first step may be longer at once. */
+static int rungs_up(const trial *now)
+{
+  real error = now->error;
+  int up = 0;
+  if (error < now->limits.fewer)
+    for (; up < MOST_UP && error * GROWTH <= now->limits.most; up++)
+      error *= GROWTH;
+  return up;
+}
+
+/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail, and
+ * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. */
+static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  const real span = MATH(fabs)(now->t_end - now->at.t);
+  int found = 0, up = 1;
+  run->rung = rung_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
+  try_step(run, now, 0, options, report);
+  while (!now->last && up > 0) {
+    const int failed = !(now->error < INFINITY);
+    found = found || !failed;
+    up = failed && (SHORT_STEPS_FAIL || !found) ? MOST_UP : rungs_up(now);
+    run->rung += up;
+    if (up > 0)
+      try_step(run, now, 0, options, report);
+  }
+}
+
+/* Shortens the step after a trial that failed, or whose error was too large; 0 if it is as good as nothing. */
+static int shorten(run_memory *run, const trial *now)
+{
+  real error = now->error;
+  int down = 0;
+  for (; down < MOST_DOWN && !(error <= now->limits.most); down++)
+    error /= GROWTH;
+  run->rung -= down > 1 ? down : 2;
+  run->guess = 0;
+  run->rejected++;
+  return length_of(run->rung) > VANISHING * (MATH(fabs)(now->at.t) + REAL_EPSILON * MATH(fabs)(now->t_end - now->at.t));
+}
+
+/* The step that the run is at, tried shorter and shorter until its error is allowed or it vanishes. */
+HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  const real least = LITTLE * now->limits.fewer;
+  if (run->error_before > 0)
+    try_step(run, now, least, options, report);
+  else
+    try_first_step(run, now, options, report);
+  while (!(now->error <= now->limits.most * GROWTH)) {
+    if (!shorten(run, now))
+      return STATUS(VANISHED);
+    try_step(run, now, least, options, report);
+  }
+  now->error = larger(now->error, least);
+  return OK;
+}
+
+/* Chooses the length of the next step. */
+static inline void choose_length(run_memory *run, const trial *now)
+{
+  const int change = next_change(now->error, run->error_before, &now->limits);
+  run->guess = now->guess;
+  run->change_before = run->change;
+  run->change = change;
+  run->rung += change;
+  run->error_before = now->error;
+  for (int k = change; k > 0; k--)
+    run->error_before *= GROWTH;
+  for (int k = change; k < 0; k++)
+    run->error_before /= GROWTH;
+}
+
+/* What steps are chosen by: the error allowed to each, which their equations are then solved for. */
+static void begin_trials(run_memory *run, trial *now, real tolerance, solver_options *standard)
+{
+  now->limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR);
+  standard->tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);
+  if ((real)run->direction * (now->t_end - run->t) < 0)
+    run->guess = 0;
+}

@@ -1,0 +1,19 @@
+/* Changes of slopes as XLA calls them. Before it: xla_flow.h, flow_second.h. */
+
+/* x (.., GIVEN), slopes (.., count, kept states, FLOW_STATE) and changes (.., count, GIVEN), to results like these. */
+XLA_FFI_Error *NAME(xla_bend)(XLA_FFI_CallFrame *frame)
+{
+  flow_way way;
+  solver_report report;
+  const XLA_FFI_Buffer *x, *slopes, *changes, *found;
+  int status;
+  if (tells_version(frame))
+    return NULL;
+  x = frame->args.args[0];
+  slopes = frame->args.args[1];
+  changes = frame->args.args[2];
+  found = frame->rets.rets[0];
+  way = way_of(frame, (int)slopes->dims[x->rank - 1]);
+  status = bend_rows(&way, rows_of(x), x->data, slopes->data, changes->data, found->data, &report);
+  return status == OK ? NULL : failure(frame, status, &report);
+}

@@ -1,0 +1,127 @@
+"""A flow in PyTorch: against runs and leapfrog written in it; its transformations, and what it refuses."""
+
+from functools import cache
+
+import pytest
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS
+
+from scvi_codegen import SVI, MethodError, StateError, StepFailedError, compile_stepper, problem, torch_flow
+
+torch = pytest.importorskip("torch", reason="needs the extra 'torch'")
+
+STEPS = 12
+X = [0.4, 0.1, -0.2, 0.3, 0.05]
+"""q, p and h of Henon and Heiles."""
+
+
+@cache
+def galaxy():
+    return compile_stepper(problem("henon-heiles").system, "stoermer-verlet", flags=QUICK_FLAGS)
+
+
+@cache
+def kepler():
+    return compile_stepper(problem("kepler").system, SVI(3), flags=QUICK_FLAGS)
+
+
+def numbers(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def by_c(x, every=None):
+    q, p = torch_flow(galaxy(), steps=STEPS, every=every)(x[..., :2], x[..., 2:4], h=x[..., 4])
+    return torch.cat([q, p], dim=-1)
+
+
+def leapfrog(x):
+    """The end, which PyTorch differentiates itself."""
+    q, p, h = x[:2], x[2:4], x[4]
+
+    def force(q):
+        return -torch.stack([q[0] + 2 * q[0] * q[1], q[1] + q[0] ** 2 - q[1] ** 2])
+
+    for _ in range(STEPS):
+        p = p + h / 2 * force(q)
+        q = q + h * p
+        p = p + h / 2 * force(q)
+    return torch.cat([q, p])
+
+
+def test_values_are_those_of_runs():
+    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=0.05, steps=40, every=8, parameters={"mu": 1.1})
+    flow = torch_flow(kepler(), steps=40, every=8)
+    q, p = flow(numbers([0.5, 0.0]), numbers([0.0, 1.7]), h=0.05, parameters={"mu": 1.1})
+    assert_allclose(q.numpy(), run.q, atol=1e-13)
+    assert_allclose(p.numpy(), run.p, atol=1e-13)
+
+
+@pytest.mark.parametrize("derivative", ["jacrev", "jacfwd"])
+def test_derivatives_are_those_of_leapfrog(derivative):
+    of = getattr(torch.func, derivative)
+    assert_allclose(of(by_c)(numbers(X)), of(leapfrog)(numbers(X)), atol=1e-12)
+
+
+def test_second_derivatives_are_those_of_leapfrog():
+    """Forward and back over a gradient, and back over forward."""
+
+    def along(flow):
+        return lambda x: (flow(x)[0] ** 2 * flow(x)[3] + torch.sin(flow(x)[2])).sum()
+
+    expected = torch.func.hessian(along(leapfrog))(numbers(X))
+    for outer, inner in (("jacfwd", "jacrev"), ("jacrev", "jacrev"), ("jacrev", "jacfwd")):
+        found = getattr(torch.func, outer)(getattr(torch.func, inner)(along(by_c)))(numbers(X))
+        assert_allclose(found, expected, atol=1e-10)
+    beside = torch.func.vmap(torch.func.hessian(along(by_c)))(torch.stack([1.01 * numbers(X), numbers(X)]))
+    assert_allclose(beside[1], expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("every", [None, 4])
+def test_gradcheck_passes(every):
+    """PyTorch's own, by differences, back and forward, of batches, and of gradients."""
+    x = torch.stack([numbers(X), 0.9 * numbers(X)]).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: by_c(x, every), x, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(lambda x: by_c(x, every), x)
+
+
+def test_parameters_are_learned():
+    """The strength of a center, from where a motion leads."""
+    flow = torch_flow(kepler(), steps=20)
+    q, p = numbers([0.5, 0.0]), numbers([0.0, 1.7])
+    wanted = flow(q, p, h=0.05, parameters={"mu": 1.1})[0]
+    mu = numbers(1.0).requires_grad_()
+    optimiser = torch.optim.LBFGS([mu], line_search_fn="strong_wolfe")
+
+    def loss():
+        optimiser.zero_grad()
+        off = ((flow(q, p, h=0.05, parameters={"mu": mu})[0] - wanted) ** 2).sum()
+        off.backward()
+        return off
+
+    for _ in range(5):
+        optimiser.step(loss)
+    assert mu.item() == pytest.approx(1.1, rel=1e-5)
+
+
+def test_many_motions_have_shapes_that_fit():
+    flow = torch_flow(kepler(), steps=5, every=1)
+    q, p = flow(numbers([[[0.5, 0.0]], [[0.6, 0.0]]]), numbers([[0.0, 1.7]] * 3), h=0.05)
+    assert q.shape == p.shape == (2, 3, 6, 2)
+    slope = torch.func.vmap(
+        torch.func.jacrev(lambda mu: flow(numbers([0.5, 0.0]), numbers([0.0, 1.7]), h=0.05, parameters={"mu": mu})[0])
+    )
+    assert slope(numbers([0.9, 1.0])).shape == (2, 6, 2)
+
+
+def test_what_there_is_not_is_refused():
+    flow, q, p = torch_flow(kepler(), steps=5), numbers([0.5, 0.0]), numbers([0.0, 1.6])
+    with pytest.raises(MethodError, match="no second derivatives forward of forward"):
+        torch.func.jacfwd(torch.func.jacfwd(lambda q: flow(q, p, h=0.05)[0].sum()))(q)
+    with pytest.raises(StateError, match=r"give torch\.float64"):
+        flow(q.float(), p, h=0.05)
+    with pytest.raises(StateError, match=r"q must have shape \(\.\., 2\), not \(3,\)"):
+        flow(numbers([0.0, 1.0, 2.0]), p, h=0.05)
+    with pytest.raises(StateError, match="leading axes"):
+        flow(torch.ones(3, 2, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64), h=0.05)
+    with pytest.raises(StepFailedError):
+        flow(numbers([0.0, 0.0]), p, h=0.05)

@@ -1,0 +1,371 @@
+"""FMUs: what describes them, and what they compute through FMI's functions, bit for bit what the stepper computes."""
+
+import re
+import subprocess
+import zipfile
+from ctypes import byref, c_bool, c_char_p, c_double, c_size_t, c_uint32, c_void_p
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from fmu import DISCARD, ERROR, OK, Fmu, Slave
+from numpy.testing import assert_allclose
+from style import check_style
+
+from scvi_codegen import (
+    SVI,
+    Gauss,
+    LagrangianSystem,
+    Model,
+    ModelFileError,
+    PackageError,
+    StoermerVerlet,
+    compile_stepper,
+    generate_fmu,
+    problem,
+    reparametrise,
+)
+from scvi_codegen.cli import main
+from scvi_codegen.native.building import PORTABLE_FLAGS
+
+H = 0.1
+STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c".split()  # noqa: SIM905
+NEVER_CALLED = (
+    "EnterEventMode",
+    "GetContinuousStates",
+    "GetDirectionalDerivative",
+    "SetClock",
+    "ActivateModelPartition",
+)
+
+
+def pushed(**given):
+    """A pushed pendulum with friction, some of whose mass is data, too."""
+    system = LagrangianSystem.from_text(
+        name='pushed pendulum <&> "friends"',
+        coordinates=["q"],
+        lagrangian="(m + w)*q_dot**2/2 + cos(q)",
+        parameters={"c": 0.2, "m": 1.5},
+        forces={"q": "u - c*q_dot"},
+        inputs=["w", "u"],
+    )
+    return Model(system=system, method=SVI(4), q=(0.3,), h=H, t=0.5, span=2.3, **(given or {"velocity": (0.5,)}))
+
+
+def rod():
+    """A mass on a rod, in Cartesian coordinates."""
+    system = LagrangianSystem.from_text(
+        name="rod",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["x**2 + y**2 = 1"],
+    )
+    return Model(system=system, method=SVI(2, "gauss-lobatto:3"), q=(1.0, 0.0), velocity=(0.0, 0.2), h=H, steps=10)
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fmu")
+    return Fmu(generate_fmu(pushed(), folder / "pushed.fmu"), folder / "unpacked")
+
+
+def stepper_of(model):
+    return compile_stepper(model.system, model.method, flags=PORTABLE_FLAGS)
+
+
+MODELS = {
+    "velocities": lambda: replace(Model.from_problem(problem("kepler"), SVI(4)), t=-3.0),
+    "momenta": lambda: Model.from_problem(problem("point-vortices"), Gauss(2)),
+    "explicit": lambda: Model.from_problem(problem("henon-heiles"), StoermerVerlet()),
+    "constraints": rod,
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_states_are_those_of_the_stepper_bit_for_bit(name, tmp_path):
+    model = MODELS[name]()
+    one, h = Slave(Fmu(generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.h
+    assert one.start(model.t) == OK, one.said
+    stepper = stepper_of(model)
+    run = stepper.integrate(model.q, model.momenta(stepper), h=h, steps=30, t=model.t)
+    names = ["t", *stepper.coordinates, *(f"{name}_dot" for name in stepper.coordinates), *stepper.interface.momenta]
+    found = [one.get(*names, "energy")]
+    for k in range(10):
+        assert one.step(model.t + 3 * k * h, 3 * h) == OK
+        found.append(one.get(*names, "energy"))
+        assert one.last == found[-1][0]
+    expected = np.column_stack([run.t, run.q, run.velocity, run.p, run.energy()])[::3]
+    assert_allclose(np.array(found), expected, rtol=0, atol=0)
+
+
+def test_inputs_are_held_and_parameters_may_change_on_the_way(fmu):
+    model, one = pushed(), Slave(fmu)
+    assert one.start(0.5, u=0.25, w=0.1) == OK
+    run = stepper_of(model).start(model.q, velocity=model.velocity, h=H, t=0.5, parameters={"w_0": 0.1, "u_0": 0.25})
+    for k in range(8):
+        u, w = -1.5 * one.get("q")[0], 0.1 + 0.01 * k
+        assert one.set(u=u, w=w) == OK
+        run.hold(u=u, w=w)
+        assert one.step(0.5 + 2 * k * H, 2 * H) == OK
+        run.skip(2)
+        assert one.get("q", "p_q") == [*run.q, *run.p]
+    before = one.get("energy")
+    assert one.set(m=2.5) == OK
+    assert one.get("energy") < before  # the same momentum of a larger mass
+    assert one.get("q_dot") == [run.p[0] / (2.5 + w)]
+
+
+def test_communication_steps_of_any_length_are_equal_parts(fmu):
+    one, stepper = Slave(fmu), stepper_of(pushed())
+    assert one.start(0.5) == OK
+    assert one.step(0.5, 0.25) == OK
+    p = stepper.momentum([0.3], [0.5], 0.5)
+    run = stepper.integrate([0.3], p, h=0.25 / 3, steps=3, t=0.5, parameters={"w_0": 0.0, "u_0": 0.0})
+    assert [*one.get("t"), *one.get("q")] == [run.t[-1], *run.q[-1]]
+    assert one.step(0.75, 1e-3) == OK
+    assert_allclose(one.get("t"), 0.751, rtol=1e-15)
+
+
+def test_a_million_communication_points_of_rounded_times_are_met(fmu):
+    """An importer adds its step to its time; both drift apart by rounding, and no error comes of it."""
+    one, t = Slave(fmu), 0.5
+    assert one.start(t) == OK
+    for _ in range(3000):
+        assert one.step(t, 0.3) == OK
+        t += 0.3
+        assert abs(one.last - t) < 1e-9 * H + 1e-15 * t
+    assert one.call("Terminate") == OK
+    assert one.step(t, 0.3) == ERROR
+
+
+def test_a_state_that_is_kept_goes_on_bit_for_bit_also_from_bytes(fmu):
+    one, other = Slave(fmu), Slave(fmu)
+    assert one.start(0.5) == one.step(0.5, 3 * H) == OK
+    state = one.kept()
+    data = one.as_bytes(state)
+    assert one.set(u=1.0) == one.step(0.8, 2 * H) == OK
+    ends = [one.get("t", "q", "p_q", "energy")]
+    for again, given in ((one, state), (other, c_void_p())):
+        if again is other:
+            assert other.from_bytes(data, given) == OK
+        assert again.call("SetFMUState", given) == OK
+        assert again.get("u") == [0.0]
+        assert again.set(u=1.0) == again.step(0.8, 2 * H) == OK
+        ends.append(again.get("t", "q", "p_q", "energy"))
+        assert again.call("FreeFMUState", byref(given)) == OK
+        assert given.value is None
+    assert ends[0] == ends[1] == ends[2]
+    assert other.from_bytes(data[:-1], c_void_p()) == ERROR
+    assert other.from_bytes(b"x" + data[1:], c_void_p()) == ERROR
+
+
+def test_a_step_that_fails_is_discarded_and_nothing_has_changed(fmu):
+    one = Slave(fmu)
+    assert one.start(0.5) == one.step(0.5, H) == OK
+    before = one.get("t", "q", "p_q")
+    assert one.set(u=float("nan")) == OK
+    kept = one.as_bytes(one.kept())
+    assert one.step(0.6, 2.5 * H) == DISCARD
+    assert one.as_bytes(one.kept()) == kept
+    assert one.said[-1][:2] == (DISCARD, b"logStatusDiscard")
+    assert "NaN" in one.said[-1][2]
+    assert (one.last, one.get("t", "q", "p_q")) == (before[0], before)
+    assert one.set(u=0.0) == one.step(0.6, H) == OK
+    assert one.call("Reset") == OK
+    assert one.start(0.5) == one.step(0.5, H) == OK
+    assert one.get("t", "q", "p_q") == before
+
+
+def test_calls_that_are_not_allowed_are_errors_that_say_why(fmu):
+    one = Slave(fmu)
+    assert one.step(0.5, H) == one.call("ExitInitializationMode") == one.call("Terminate") == ERROR
+    assert one.set(q=0.1, q_dot=0.0) == one.start(0.5) == OK
+    assert (
+        one.call("EnterInitializationMode", c_bool(False), c_double(0), c_double(0), c_bool(False), c_double(0))
+        == ERROR
+    )
+    for name in ("q", "q_dot", "p_q", "energy", "t"):
+        assert one.set(**{name: 1.0}) == ERROR
+    for point, size in ((0.7, H), (0.5, 0.0), (0.5, -H), (0.5, float("nan")), (float("nan"), H), (0.5, 1e300)):
+        assert one.step(point, size) == ERROR
+    hidden = int(fmu.variables["w"]["valueReference"]) + 1
+    for reference in (hidden, 9999, 2**32 - 1):
+        values = (c_double * 1)()
+        assert one.call("GetFloat64", (c_uint32 * 1)(reference), c_size_t(1), values, c_size_t(1)) == ERROR
+    assert one.call("GetFloat64", (c_uint32 * 1)(1), c_size_t(1), (c_double * 2)(), c_size_t(2)) == ERROR
+    assert one.call("SetFMUState", c_void_p()) == ERROR
+    assert all(status == ERROR and category == b"logStatusError" for status, category, _ in one.said)
+    assert len({message for *_, message in one.said}) > 10
+    for name in NEVER_CALLED:
+        assert one.call(name, *[c_void_p()] * 8) == ERROR
+        assert f"fmi3{name}" in one.said[-1][2]
+    assert one.call("GetBoolean", None, c_size_t(0), None, c_size_t(0)) == OK
+    one.call("FreeInstance")
+
+
+def test_an_instance_that_cannot_be_is_none(fmu):
+    for given in ({"token": b"another"}, {"events": True}):
+        one = Slave(fmu, **given)
+        assert one.one.value is None
+        assert one.said[-1][0] == ERROR
+
+
+def test_discards_are_logged_where_that_is_wanted(fmu):
+    one = Slave(fmu, logging=False)
+    assert one.start(0.5, u=float("inf")) == OK
+    assert one.step(0.5, H) == DISCARD
+    assert one.said == []
+    names = (c_char_p * 1)(b"logStatusDiscard")
+    assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), names) == OK
+    assert one.step(0.5, H) == DISCARD
+    assert len(one.said) == 1
+    assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), (c_char_p * 1)(b"all")) == ERROR
+
+
+def test_initial_states_far_off_their_constraints_are_refused(tmp_path):
+    fmu = Fmu(generate_fmu(rod(), tmp_path / "rod.fmu"), tmp_path / "unpacked")
+    near, far = Slave(fmu), Slave(fmu)
+    assert near.start(0.0, x=1.001) == OK
+    assert_allclose(np.hypot(*near.get("x", "y")), 1.0, rtol=1e-15)
+    assert far.start(0.0, x=1.5) == ERROR
+    assert "off the constraints" in far.said[-1][2]
+
+
+def test_the_description_has_what_the_standard_asks_for(fmu):
+    root = fmu.description
+    assert [part.tag for part in root] == [
+        *("CoSimulation", "LogCategories", "DefaultExperiment", "ModelVariables", "ModelStructure"),
+    ]
+    assert root.get("modelName") == 'pushed pendulum <&> "friends"'
+    assert (root.get("fmiVersion"), root.find("CoSimulation").get("modelIdentifier")) == ("3.0", "pushed")
+    assert root.find("CoSimulation").get("fixedInternalStepSize") == repr(H)
+    assert root.find("DefaultExperiment").attrib == {"startTime": "0.5", "stopTime": "2.8", "stepSize": "0.1"}
+    assert list(fmu.variables) == ["t", "q", "q_dot", "p_q", "energy", "c", "m", "w", "u"]
+    references = [one["valueReference"] for one in fmu.variables.values()]
+    assert len(set(references)) == len(references)
+    kinds = {name: (one["causality"], one["variability"], one.get("initial")) for name, one in fmu.variables.items()}
+    assert kinds["t"] == ("independent", "continuous", None)
+    assert kinds["q"] == kinds["q_dot"] == ("output", "continuous", "exact")
+    assert kinds["p_q"] == kinds["energy"] == ("output", "continuous", "calculated")
+    assert (kinds["c"], kinds["u"]) == (("parameter", "tunable", None), ("input", "continuous", None))
+    starts = {name: one["start"] for name, one in fmu.variables.items() if "start" in one}
+    assert starts == {"q": "0.3", "q_dot": "0.5", "c": "0.2", "m": "1.5", "w": "0.0", "u": "0.0"}
+    outputs, unknown = ([one.get("valueReference") for one in root.iter(kind)] for kind in ("Output", "InitialUnknown"))
+    assert outputs == references[1:5]
+    assert unknown == references[3:5]
+
+
+def test_a_model_given_by_momenta_has_these_at_the_start(tmp_path):
+    fmu = Fmu(generate_fmu(pushed(p=(0.4,)), tmp_path / "by_momenta.fmu"), tmp_path / "unpacked")
+    assert (fmu.variables["p_q"]["start"], fmu.variables["q_dot"]["initial"]) == ("0.4", "calculated")
+    one = Slave(fmu)
+    assert one.set(q_dot=1.0) == ERROR
+    assert one.start(0.5, p_q=3.0) == OK
+    assert one.get("q_dot") == [2.0]
+
+
+def test_names_are_told_apart(tmp_path):
+    system = LagrangianSystem.from_text(
+        name="names",
+        coordinates=["q"],
+        lagrangian="energy*q_dot**2/2 - p_q*q**2/2",
+        parameters={"energy": 1.0, "p_q": 2.0, "energy_": 0.0},
+    )
+    model = Model(system=system, method="svi:2", q=(1.0,), velocity=(0.0,), h=0.1, steps=1)
+    names = list(Fmu(generate_fmu(model, tmp_path / "names.fmu"), tmp_path / "unpacked").variables)
+    assert len(set(names)) == len(names) == 8
+
+
+def test_the_archive_is_the_same_each_time_and_has_all_that_compiles(tmp_path):
+    first, second = (generate_fmu(pushed(), tmp_path / part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
+    assert first.read_bytes() == second.read_bytes()
+    folder = tmp_path / "unpacked"
+    zipfile.ZipFile(first).extractall(folder)
+    build = ElementTree.parse(folder / "sources" / "buildDescription.xml").getroot()
+    names = [one.get("name") for one in build.iter("SourceFile")]
+    assert names == ["push.c", "push_fmu.c"]
+    for name in names:
+        subprocess.run(["cc", *STRICT, name, "-o", f"{name}.o"], cwd=folder / "sources", check=True)
+    linked = ["cc", *STRICT, "-DFMI3_FUNCTION_PREFIX=push_", "push_fmu.c", "-o", "prefixed.o"]
+    subprocess.run(linked, cwd=folder / "sources", check=True)
+    assert b"push_fmi3DoStep" in (folder / "sources" / "prefixed.o").read_bytes()
+    for name in ("push_fmu.c", "push_fmu.h"):
+        check_style((folder / "sources" / name).read_text())
+    assert (
+        "h = 0.1" in (folder / "resources" / "model.toml").read_text()
+        or "step = 0.1" in (folder / "resources" / "model.toml").read_text()
+    )
+
+
+def _folders(root, *names):
+    for name in names:
+        (root / name).mkdir()
+        yield name
+
+
+def test_all_functions_of_the_standard_are_there(fmu):
+    [library] = (fmu.folder / "binaries").glob("*/*")
+    exported = set(re.findall(rb"fmi3[A-Z]\w+", library.read_bytes()))
+    types = "Float32 Float64 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 Boolean String Binary Clock"
+    wanted = {f"fmi3{way}{kind}".encode() for way in ("Get", "Set") for kind in types.split()}
+    assert wanted <= exported
+    assert len(exported) == 75
+
+
+def test_models_and_names_that_do_not_serve_are_refused(tmp_path):
+    model = pushed()
+    for wrong, words in (
+        (replace(model, h=None, tolerance=1e-6), "steps of one length"),
+        (replace(model, h=-0.1), "forward"),
+        (replace(Model.from_problem(problem("kepler"), SVI(4)), monitor="distance"), "monitor"),
+    ):
+        with pytest.raises(ModelFileError, match=words):
+            generate_fmu(wrong, tmp_path / "push.fmu")
+    clocked = reparametrise(problem("kepler").system, "distance")
+    entry = problem("kepler")
+    with pytest.raises(ModelFileError, match="monitor"):
+        generate_fmu(replace(model, system=clocked, q=entry.q, velocity=entry.velocity, t=0.0), tmp_path / "push.fmu")
+    for name in ("pendulum", "Pendulum.fmu", "while.fmu"):
+        with pytest.raises(PackageError):
+            generate_fmu(model, tmp_path / name)
+    (tmp_path / "mine.fmu").write_text("mine")
+    with pytest.raises(PackageError, match="is no FMU"):
+        generate_fmu(model, tmp_path / "mine.fmu")
+    assert (tmp_path / "mine.fmu").read_text() == "mine"
+    for _ in range(2):
+        assert zipfile.is_zipfile(generate_fmu(model, tmp_path / "mine.fmu", force=True))
+    with pytest.raises(PackageError, match="cannot be written"):
+        generate_fmu(model, tmp_path / "missing" / "push.fmu")
+
+
+def test_the_command_line_writes_one(tmp_path):
+    target = tmp_path / "kepler.fmu"
+    result = CliRunner().invoke(main, ["generate", "kepler", "--method", "svi:2", "--fmu", "-o", str(target)])
+    assert result.exit_code == 0, result.output
+    assert zipfile.is_zipfile(target)
+    refused = CliRunner().invoke(main, ["generate", "kepler", "--fmu", "--single-file", "-o", str(target)])
+    assert (refused.exit_code, "--fmu excludes" in refused.output) == (2, True)
+
+
+class TestByFMPy:
+    """The same through an importer of others."""
+
+    def test_it_finds_no_fault_and_the_schema_holds(self, fmu, tmp_path):
+        validation = pytest.importorskip("fmpy.validation", reason="FMPy is not installed")
+        path = generate_fmu(pushed(), tmp_path / "pushed.fmu")
+        assert validation.validate_fmu(str(path)) == []
+
+    def test_it_simulates_as_the_stepper_does(self, tmp_path):
+        fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")
+        model = pushed()
+        path = generate_fmu(model, tmp_path / "pushed.fmu")
+        signals = np.array([(0.5, 0.25), (9.9, 0.25)], dtype=[("time", float), ("u", float)])
+        found = fmpy.simulate_fmu(str(path), start_values={"c": 0.3}, input=signals, output=["q", "p_q"])
+        stepper = stepper_of(model)
+        run = stepper.integrate(
+            model.q, velocity=model.velocity, h=H, steps=23, t=0.5, parameters={"c": 0.3, "u_0": 0.25, "w_0": 0.0}
+        )
+        assert_allclose(found["q"], run.q[:, 0], rtol=1e-14)
+        assert_allclose(found["p_q"], run.p[:, 0], rtol=1e-14)

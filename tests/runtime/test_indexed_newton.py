@@ -1,0 +1,104 @@
+"""Newton's iteration for sums over indices: where sweeps fail it ends where that of the system written out does."""
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError, StepFailedError
+
+RANDOM = np.random.default_rng(1)
+ROUNDING = 2.0**-52
+
+
+def field(strength):
+    """A lattice of stiff places, with a force that depends on time, and one on the neighbours."""
+    return sc.IndexedSystem.from_text(
+        name="field",
+        coordinates=["q[N]"],
+        parameters={"w": strength, "m[N]": 1},
+        lagrangian="sum(i in N, m[i]*q_dot[i]**2/2 - w*q[i]**2/2 - q[i]**4/4)"
+        "- sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        forces={"q[i]": "-sin(q[i])/3", "q[0]": "cos(t)"},
+    )
+
+
+def molecules():
+    """Stiff bonds between soft ones, in the plane, by a table."""
+    return sc.IndexedSystem.from_text(
+        name="molecules",
+        coordinates=["r[N, 2]"],
+        parameters={"k[B]": 1, "length[B]": 1},
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2) - sum(b in B, k[b]/2"
+        "*(sqrt(sum(a in 2, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2)) - length[b])**2)",
+    )
+
+
+@pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:8", "gauss:3"])
+@pytest.mark.parametrize(("strength", "h"), [(1.0, 0.1), (400.0, 0.5), (1e4, 0.5)])
+def test_steps_are_those_of_newtons_iteration_of_the_system_written_out(method, strength, h):
+    system, masses = field(strength), np.linspace(1.0, 2.0, 5)
+    own = sc.compile_indexed(system, method, solver="newton")
+    small = sc.expand_sums(system, {"N": 5}, parameters={"m": masses})
+    other = sc.compile_stepper(small, method, solver="newton")
+    q, v = RANDOM.normal(size=(2, 5))
+    for _ in range(5):
+        run = own.start(q, velocity=v, h=h, parameters={"m": masses})
+        run.advance(1)
+        end, momenta = other.step(q, masses * v, h)
+        size = max(np.abs(end).max(), np.abs(q).max(), np.abs(h * v).max())
+        stiffness = 1.0 + h * h * strength  # by which the forces at the points enlarge the rounding of these
+        assert np.abs(run.q["q"] - end).max() < 16 * ROUNDING * stiffness * size
+        assert np.abs(h * (run.p["q"] - momenta)).max() < 64 * ROUNDING * stiffness * size
+        q, v = run.q["q"], run.velocity["q"]
+
+
+def test_stiff_bonds_at_rest_do_not_shorten_the_steps():
+    count, stiff = 40, 1e6
+    chain = np.array([(i, i + 1) for i in range(count - 1)])
+    k = np.where(np.arange(count - 1) % 2 == 0, stiff, 1.0)
+    start = np.stack([np.arange(count), np.zeros(count)], axis=1)
+    velocity = np.stack([np.zeros(count), np.repeat(np.sin(np.arange(count // 2) / 3.0), 2) / 10], axis=1)
+    data = {"tables": {"bonds": chain}, "parameters": {"k": k}}
+    newton = sc.compile_indexed(molecules(), "svi:4", solver="newton")
+    sweeps = sc.compile_indexed(molecules(), "svi:4")
+    with pytest.raises(StepFailedError, match="solver='newton'"):
+        sweeps.integrate(start, velocity=velocity, h=0.05, steps=1, **data)
+    run = newton.integrate(start, velocity=velocity, h=0.05, steps=20, **data)
+    exact = sweeps.integrate(start, velocity=velocity, h=0.001, steps=1000, every=1000, **data)
+    assert np.abs(run.q["r"][-1] - exact.q["r"][-1]).max() < 1e-6
+    assert run.energy_error() < 1e-9
+    assert run.iterations < 6 * run.steps
+    assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-9
+
+
+def test_steps_choose_their_length_with_it():
+    system = field(100.0)
+    q, v = RANDOM.normal(size=(2, 6))
+    own, other = (sc.compile_indexed(system, "svi:6", solver=solver) for solver in ("newton", "fixed-point"))
+    ends = [each.integrate(q, velocity=v, t_end=1.0, tolerance=1e-10).q["q"][-1] for each in (own, other)]
+    assert np.abs(ends[0] - ends[1]).max() < 1e-7
+
+
+def test_a_step_that_comes_to_no_rest_fails():
+    system = sc.IndexedSystem.from_text(
+        name="long waves",
+        coordinates=["q[N]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - 1e12*sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))",
+    )
+    stepper, q = sc.compile_indexed(system, "svi:4", solver="newton"), RANDOM.normal(size=3000)
+    run = stepper.start(q, h=1.0)
+    with pytest.raises(StepFailedError, match="GMRES"):
+        run.advance(1)
+    assert (run.q["q"] == q).all()
+
+
+def test_what_has_no_newton():
+    damped = sc.IndexedSystem.from_text(
+        name="damped", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)", forces={"q[i]": "-q_dot[i]"}
+    )
+    for system, method in ((field(1.0), "stoermer-verlet"), (damped, "svi:4")):
+        with pytest.raises(MethodError, match="leave out solver"):
+            sc.compile_indexed(system, method, solver="newton").integrate(np.zeros(3), h=0.1, steps=1)
+    with pytest.raises(MethodError, match="fixed-point or newton"):
+        sc.compile_indexed(field(1.0), "svi:4", solver="krylov")

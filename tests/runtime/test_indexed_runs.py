@@ -1,0 +1,210 @@
+"""Runs of sums over indices beside those written out: controlled steps, events, inputs, states between."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import EventError, MethodError, StateError
+
+N = 6
+RANDOM = np.random.default_rng(1)
+Q, V = RANDOM.normal(size=N), RANDOM.normal(size=N)
+T = np.linspace(0.0, 5.0, 8)
+DATA = {"F": (T, np.sin(T), "cubic")}
+
+
+def written(system):
+    return sc.compile_stepper(sc.expand_sums(system, {"N": N}), "svi:6")
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return sc.IndexedSystem.from_text(
+        name="FPUT ring",
+        coordinates=["q[N]"],
+        parameters={"beta": 0.25},
+        lagrangian="sum(i in N, q_dot[i]**2/2)- sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
+    )
+
+
+@pytest.fixture(scope="module")
+def steppers(ring):
+    return sc.compile_indexed(ring, "svi:6"), written(ring)
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return sc.IndexedSystem.from_text(
+        name="driven",
+        coordinates=["q[N]"],
+        parameters={"c": 0.1},
+        inputs=["F"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2) - q[0]**2/2",
+        forces={"q[i]": "-c*q_dot[i]", "q[N-1]": "F"},
+    )
+
+
+class TestControlledSteps:
+    def test_round_off_is_the_default(self, steppers):
+        own, other = (each.integrate(Q, velocity=V, t_end=10.0) for each in steppers)
+        assert own.t[-1] == 10.0
+        assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13
+        assert own.steps < 1.2 * other.steps
+        assert own.energy_error() < 1e-15
+
+    @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
+    def test_the_error_is_that_allowed(self, steppers, tolerance):
+        stepper, other = steppers
+        run = stepper.integrate(Q, velocity=V, t_end=10.0, tolerance=tolerance)
+        exact = other.integrate(Q, velocity=V, t_end=10.0).q[-1]
+        assert run.step_error <= 2.0 ** (14 / 4) * tolerance  # what a rung too many of order 12 does
+        error = np.abs(run.q["q"][-1] - exact).max() / np.abs(exact).max()
+        assert error < 10.0 * run.steps * tolerance
+        assert error > 1e-3 * tolerance  # no more work than was asked for
+
+    def test_back_and_with_a_goal_of_its_own(self, steppers):
+        stepper, _ = steppers
+        there = stepper.integrate(Q, velocity=V, t_end=3.0)
+        back = stepper.integrate(there.q["q"][-1], there.p["q"][-1], t=3.0, t_end=0.0)
+        assert np.abs(back.q["q"][-1] - Q).max() < 1e-13
+
+    def test_of_hamiltonians(self):
+        system = sc.IndexedSystem.from_text(
+            name="field",
+            coordinates=["q[N]"],
+            momenta=["p[N]"],
+            hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
+        )
+        run = sc.compile_indexed(system, "gauss:4").integrate(Q, V, t_end=3.0, tolerance=1e-10)
+        other = sc.compile_stepper(sc.expand_sums(system, {"N": N}), "gauss:4").integrate(Q, V, t_end=3.0)
+        assert np.abs(run.q["q"][-1] - other.q[-1]).max() < 1e-8
+
+    def test_runs_are_saved_and_steppers_pickled(self, steppers):
+        stepper = pickle.loads(pickle.dumps(steppers[0]))
+        goal = {"t_end": 4.0, "tolerance": 1e-8}
+        run = stepper.start(Q, velocity=V, **goal)
+        run.advance(3)
+        again = stepper.restore(run.save(), **goal)
+        for each in (run, again):
+            each.advance(1000)
+        assert run.t == again.t == 4.0
+        assert run.steps == again.steps
+        assert (run.q["q"] == again.q["q"]).all()
+
+    def test_what_is_refused(self, steppers, ring):
+        stepper, _ = steppers
+        with pytest.raises(MethodError, match="no steps that choose their length"):
+            sc.compile_indexed(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
+        for given, message in (
+            ({}, "give one of them"),
+            ({"h": 0.1}, "need their number"),
+            ({"steps": 3}, "need their length"),
+            ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give one of them"),
+            ({"h": 0.1, "steps": 3, "tolerance": 1e-3}, "a tolerance is for"),
+            ({"t_end": 1.0, "tolerance": 2.0}, "between 0 and 1"),
+        ):
+            with pytest.raises(StateError, match=message):
+                stepper.integrate(Q, **given)
+
+
+class TestStatesBetween:
+    TIMES = np.array([[0.33, 1.27], [5.0, 0.0]])
+
+    def test_by_steps_of_one_length(self, steppers):
+        own, other = (each.integrate(Q, velocity=V, h=0.1, steps=50, every=5) for each in steppers)
+        (q, p), (q_expected, p_expected) = own.at(self.TIMES), other.at(self.TIMES)
+        assert q["q"].shape == (2, 2, N)
+        assert np.abs(q["q"] - q_expected).max() < 1e-14
+        assert np.abs(p["q"] - p_expected).max() < 1e-14
+
+    def test_by_steps_of_their_own(self, steppers):
+        own, other = (each.integrate(Q, velocity=V, t_end=5.0, every=10) for each in steppers)
+        assert np.abs(own.at(self.TIMES)[0]["q"] - other.at(self.TIMES)[0]).max() < 1e-13
+
+    def test_what_was_not_kept_is_not_there(self, steppers):
+        run = steppers[0].integrate(Q, h=0.1, steps=4, observe=lambda run: run.energy)
+        with pytest.raises(StateError, match="leave out observe"):
+            run.at(0.15)
+        with pytest.raises(StateError, match="outside of the states"):
+            steppers[0].integrate(Q, h=0.1, steps=4).at(0.5)
+
+
+class TestEvents:
+    OWN = ("q[0]", sc.Event("sum(i in N, q[i]**2) - 4", direction=1), sc.Event("q_dot[N-1] + p_q[0]", terminal=3))
+    WRITTEN = (
+        "q_0",
+        sc.Event("+".join(f"q_{i}**2" for i in range(N)) + "-4", direction=1),
+        sc.Event(f"q_{N - 1}_dot + p_q_0", terminal=3),
+    )
+
+    def test_they_are_those_of_the_system_written_out(self, steppers):
+        stepper, other = steppers
+        run = stepper.integrate(Q, velocity=V, h=0.1, steps=500, every=5, events=self.OWN)
+        expected = other.integrate(Q, velocity=V, h=0.1, steps=500, every=5, events=self.WRITTEN)
+        assert [len(each) for each in run.events] == [len(each) for each in expected.events]
+        for own, known in zip(run.events, expected.events, strict=True):
+            assert np.abs(own.t - known.t).max(initial=0.0) < 1e-14
+            assert np.abs(own.q["q"] - known.q).max(initial=0.0) < 1e-14 if len(own) else not len(known)
+        assert abs(run.t[-1] - expected.t[-1]) < 1e-14
+        assert len(run.t) == len(expected.t)
+
+    def test_the_new_sign_is_there(self, steppers):
+        run = steppers[0].integrate(Q, velocity=V, t_end=6.0, tolerance=1e-9, events="q[1] - q[2]")
+        assert len(run.events[0]) > 1
+        signs = np.sign(run.events[0].q["q"][:, 1] - run.events[0].q["q"][:, 2])
+        assert (signs[1:] * signs[:-1] <= 0).all()
+
+    def test_a_run_goes_on_behind_a_terminal_one(self, steppers):
+        stepper, _ = steppers
+        first = stepper.integrate(Q, velocity=V, h=0.1, steps=100, events=sc.Event("q[1] - q[2]", terminal=True))
+        again = stepper.integrate(
+            first.q["q"][-1], first.p["q"][-1], t=first.t[-1], h=0.1, steps=20, events="q[1] - q[2]"
+        )
+        assert (again.events[0].t > first.t[-1] + 0.1).all()
+
+    def test_what_is_no_event(self, steppers):
+        stepper, _ = steppers
+        for function, message in (
+            ("x[0]", "no array"),
+            ("q[N]", "q\\[N\\] is behind the last|N is"),
+            ("q[9]", "goes from 9 to 9"),
+            ("1/(q[0] - q[0])", "not finite|division|infinit"),
+        ):
+            with pytest.raises(EventError, match=message):
+                stepper.integrate(Q, h=0.1, steps=1, events=function)
+
+
+class TestInputs:
+    @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 4.9}, {"t_end": 4.9}, {"h": 0.1, "steps": 33}])
+    def test_runs_are_those_of_the_system_written_out(self, driven, way):
+        own, other = (
+            each.drive(Q, velocity=V, inputs=DATA, every=4, **way)
+            for each in (sc.compile_indexed(driven, "svi:6"), written(driven))
+        )
+        assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13
+        assert np.abs(own.at(3.2)[0]["q"] - other.at(3.2)[0]).max() < 1e-13
+
+    def test_they_are_held_between_samples(self, driven):
+        stepper, other = sc.compile_indexed(driven, "svi:6"), written(driven)
+        runs = (stepper.start(Q, velocity=V, h=0.1), other.start(Q, velocity=V, h=0.1))
+        for force in (1.0, -2.0):
+            for run in runs:
+                run.hold(F=force)
+            runs[0].advance(5)
+            runs[1].skip(5)
+        assert np.abs(runs[0].q["q"] - runs[1].q).max() < 1e-14
+        with pytest.raises(StateError, match="'G' is no input"):
+            runs[0].hold(G=1.0)
+
+    def test_they_are_missed(self, driven):
+        stepper = sc.compile_indexed(driven, "svi:6")
+        with pytest.raises(StateError, match="the input F is not given"):
+            stepper.integrate(Q, h=0.1, steps=1)
+        with pytest.raises(StateError, match="is given from t = 0 to 5"):
+            stepper.drive(Q, inputs=DATA, h=0.1, t_end=6.0)
+
+    def test_they_are_shown_by_name(self, driven):
+        assert "F on q[N-1]" in str(driven)
+        assert driven.depends_on_time
