@@ -310,6 +310,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #define STAGE_POWER 1.5 /* of what is left unresolved, in the error of the end */
 static const double STAGE_HIGHEST[5] = {0.0, -1.0, 1.0, 0.0, 0.0};
+static const double STAGE_NEXT[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_BEND[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_OTHER_BEND[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 
@@ -403,8 +404,10 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #define KEPT_VELOCITIES 0
 #define KEPT_UNIT(i) (step->h)
 #define RESOLVED 1.0
+#define NEXT_RESOLVED 1.0
 #define ERROR_POWER 1.5
 static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
+static const lanes NEXT[GROUPS] = {1.0, 0.0};
 
 #include "support/curve_error.h"
 #include "support/sweep_or_stage_error.h"

@@ -224,6 +224,7 @@ def generate_source(
     embedded: Embedded | None = None,
     amalgamate: bool = False,
     controlled: bool = False,
+    monitor: str | Expr | None = None,
 ) -> tuple[Source, Interface]:
     """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`.
 
@@ -232,6 +233,7 @@ def generate_source(
             iteration alone, which takes half of the stack that lanes take where there are no vector registers.
         amalgamate: whether support headers stand in the source, not beside it; for a microcontroller they always do.
         controlled: with steps that choose their length, where the curve of a step tells its error.
+        monitor: with steps of tau instead, dt = g dtau, by the reversible controller.
 
     Raises:
         MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
@@ -241,9 +243,9 @@ def generate_source(
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
-    control = control_of(program) if controlled else None
+    control = density_of(system, monitor) if monitor is not None else control_of(program) if controlled else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
-    interface = describe(program, system, method)
+    interface = describe(program, system, method, monitor=monitor)
     found = with_events(source, interface, functions) if functions else source
     return (found.amalgamated() if amalgamate else found), interface
 

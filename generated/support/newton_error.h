@@ -3,5 +3,5 @@ static real largest_error(const run_memory *run, const step_data *step, const so
     real *workspace)
 {
   (void)data, (void)workspace;
-  return stage_error(step, run->memory, dq, ALL, run->error);
+  return stage_error(step, run->memory, dq, ALL, DECAY, run->error);
 }

@@ -2,13 +2,14 @@
  * stage_error.h; their powers make the errors of one those of the other. */
 static SELDOM double fallback_error(const run_memory *run, const step_data *step, const double *dq, double *workspace)
 {
-  return larger(run->error, pow(stage_error(step, newton_in(workspace).z, dq, ALL, 0.0), STAGE_POWER / ERROR_POWER));
+  const double error = stage_error(step, newton_in(workspace).z, dq, ALL, DECAY, 0.0);
+  return larger(run->error, pow(error, STAGE_POWER / ERROR_POWER));
 }
 
 static double largest_error(const run_memory *run, const step_data *step, const solver_data *data, const double *dq,
     double *workspace)
 {
   if (run->guess > 0)
-    return curve_error(step, data, run->memory, dq, ALL, run->error);
+    return curve_error(step, data, run->memory, dq, ALL, now_and_then(run), run->error);
   return fallback_error(run, step, dq, workspace);
 }

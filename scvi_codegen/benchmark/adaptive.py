@@ -34,6 +34,7 @@ from scvi_codegen.benchmark.report import CaseResult
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["adaptive_reference", "kepler_ends", "run_adaptive"]
@@ -47,6 +48,7 @@ TRANSFORMED = (0.4, 0.3, 0.2, 0.15, 0.1)
 LAST = 10**15
 
 
+@unwarned()
 def run_adaptive(name: str, plan: Plan, say: Say) -> CaseResult:
     """One trajectory after the other: this project in all its modes, heyoka, and IAS15 where bodies gravitate."""
     chosen = adaptive_case(name)

@@ -44,8 +44,8 @@ Field = Callable[[Extended], Extended]
 
 STAGES = 16
 MOST_SWEEPS = 100
-STALLED = 1e-16
-"""Relative changes below are round-off once they no longer shrink."""
+STALLED, ROUNDED = 1e-16, 1e-14
+"""Relative changes below are round-off once they hardly shrink, or, near collisions, no longer."""
 
 DIGITS = 50
 
@@ -202,7 +202,7 @@ def _stages(field: Field, x: Extended, h: np.longdouble, a: Table, guess: Extend
         new = field(x + h * (_product((a[0],), slopes) + low))
         change = float(scale * np.max(np.abs(new - slopes)))
         slopes = new
-        if change == 0.0 or (change < STALLED and change >= 0.3 * last):
+        if change == 0.0 or (change < STALLED and change >= 0.3 * last) or (change < ROUNDED and change >= last):
             return slopes
         last = change
     raise StateError(f"the reference did not converge with steps of {float(h):g} (last change {change:.1e})")

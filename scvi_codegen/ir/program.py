@@ -55,12 +55,14 @@ class StageCurve:
     """Of the unknowns of a coordinate, what its curve bends and what it leaves unresolved; tables of (B,) numbers.
 
     Attributes:
-        highest: h times this sum is what the highest Legendre coefficient of the accelerations moves it by.
+        highest, next: h times this sum is what the highest Legendre coefficient of the accelerations moves it by, and
+            the one below, if there is one.
         bends: h times the absolute sums of these is what the curve bends it by.
         power: of h in the square of the one over the other.
     """
 
     highest: tuple[Number, ...]
+    next: tuple[Number, ...]
     bends: tuple[tuple[Number, ...], tuple[Number, ...]]
     power: int
 

@@ -42,12 +42,14 @@ class GuessTables:
 
     Attributes:
         abscissae: where the kept values stand on a step, without padding.
-        degree, highest: (lanes,) what gives the highest Legendre coefficient of the curve through them.
+        degree, highest, next: (lanes,) what gives the highest Legendre coefficient of the curve through them, and the
+            one below; that is zeros where there is none.
     """
 
     abscissae: tuple[Number, ...]
     degree: int
     highest: tuple[Number, ...]
+    next: tuple[Number, ...]
     last_alone: NumberTable
     last: NumberTable
     before: NumberTable

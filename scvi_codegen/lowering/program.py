@@ -146,29 +146,36 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
     held = any(block.name == END_VELOCITY for block in stages.blocks)
     if isinstance(shape, Velocities) and len({*shape.blocks}) + held > 1 and _moves(stages, shape):
-        degree = len(shape.blocks) - 1 + held
-        highest = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one) if held else ()
-        highest = tuple((4 * degree - 2) * x for x in highest or legendre_functional(shape.blocks, degree))
-        highest += (mp.zero,) * (count - len(highest))
+        degree, (first, tops) = len(shape.blocks) - 1 + held, (0, _highest_of(shape, held))
         bends = [(0, degree), (0, (degree + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
         power = 2 * degree
     elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):
         c, size = shape.tableau.c, len(shape.tableau.c)
-        highest = (mp.zero, *legendre_functional(c, size - 1), *(mp.zero,) * (count - 1 - size))
+        first, tops = 1, [legendre_functional(c, k) for k in (size - 1, size - 2)]
         rows = [tuple(mp.mpf(b == only) for b in range(count)) for only in (1, size)]
         power = 2 * size
     else:
         return None
-    return StageCurve(highest=lower_vector(highest), bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
+    before, behind = (mp.zero,) * first, (mp.zero,) * (count - first - len(tops[0]))
+    highest, below = (lower_vector((*before, *top, *behind)) for top in tops)
+    return StageCurve(highest=highest, next=below, bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
+
+
+def _highest_of(shape: Velocities, held: bool) -> list[Vector]:
+    """The highest coefficient of the accelerations that velocities tell, and the one below; 0 beside ends that are known."""
+    degree = len(shape.blocks) - 1
+    if held:
+        line = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one)
+        return [tuple((4 * degree + 2) * x for x in line), (mp.zero,) * len(line)]
+    lines = {k: legendre_functional(shape.blocks, k) for k in (degree, degree - 1)}
+    return [tuple(max(4 * k - 2, 0) * x for x in line) for k, line in lines.items()]
 
 
 def _moves(stages: StageSystem, shape: Velocities) -> bool:
-    """Whether the velocities, the first blocks, are all that moves positions, and momenta are no unknowns."""
+    """Whether the velocities, the first blocks, are all that moves positions."""
     own = len(shape.blocks)
-    return own == len({*shape.blocks}) and all(
-        block.moves == (b < own) and not block.momentum for b, block in enumerate(stages.blocks)
-    )
+    return own == len({*shape.blocks}) and all(block.moves == (b < own) for b, block in enumerate(stages.blocks))
 
 
 def _distinct(points: Vector) -> bool:

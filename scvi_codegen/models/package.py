@@ -179,6 +179,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
         prefix=prefix,
         embedded=embedded,
         controlled=not embedded or model.h is None,
+        monitor=model.monitor,
     )
     if single_file:
         source = source.amalgamated()
@@ -201,12 +202,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     from scvi_codegen.rendering.text import ExampleRun
 
     clock = model.system.clock
-    if model.monitor is not None:
-        raise ModelFileError(
-            "generated folders have no reversible controller: take the symplectic one (--controller), or steps that "
-            "choose their length by their error (--tolerance) without a monitor"
-        )
-    if model.h is None and clock:
+    if model.h is None and (clock or model.monitor is not None):
         raise ModelFileError(
             "give a step of tau (--step, [run] step): without compiling none can be found for a tolerance"
         )
@@ -218,16 +214,16 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     if clock and model.ends_at_time:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
     else:
-        steps = OUTPUTS if model.h is None else max(1, model.step_count)
+        steps = OUTPUTS if model.h is None or model.monitor is not None else max(1, model.step_count)
     every = max(1, steps // OUTPUTS)
     return ExampleRun(
         q=model.q,
         p=momenta,
         parameters=parameters,
         t=model.t,
-        h=model.h,
+        h=model.h if model.monitor is None else None,
         span=model.covered,
-        tolerance=COMPARED if model.tolerance is None else model.tolerance,
+        tolerance=_chosen_by(model),
         controlled=controlled,
         every=every,
         outputs=steps // every,
@@ -235,6 +231,13 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         inputs=inputs,
         end=model.end if inputs else 0.0,
     )
+
+
+def _chosen_by(model: Model) -> float:
+    """What steps choose their length by: a tolerance, or tau."""
+    if model.monitor is not None and model.h is not None:
+        return abs(model.h)
+    return COMPARED if model.tolerance is None else model.tolerance
 
 
 def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
@@ -301,6 +304,17 @@ int status = ${prefix}_advance_to(&run, t_end, tolerance, most_steps, most_steps
 """
 
 
+DENSITY = """By steps of `tau` in a time with dt = g dtau, g = ${monitor}, the same forward and backward, to `t_end`:
+
+```c
+static ${prefix}_run run;
+${prefix}_start(&run, t, 0.0, q0, p0);
+int status = ${prefix}_advance_to(&run, t_end, tau, most_steps, most_steps, parameters, NULL, &t, q, p,
+    &iterations, &report, workspace); /* there, if run.t == t_end: the state is in run.q and run.p */
+```
+"""
+
+
 INPUTS = """
 Inputs ($inputs) are tables, `${prefix}_input` each. Steps end at their breakpoints; until `t_end`:
 
@@ -314,12 +328,13 @@ for (long long steps; (steps = ${prefix}_next_steps(&run, t_end, h, inputs, para
 def _further(text: str, interface: Interface) -> str:
     """A part of the description that not every folder has."""
     inputs = ", ".join(f"`{name}`" for name in interface.inputs)
-    return Template(text).substitute(prefix=interface.prefix, inputs=inputs)
+    return Template(text).substitute(prefix=interface.prefix, inputs=inputs, monitor=interface.monitor)
 
 
 def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None, controlled: bool) -> str:
     defaults = zip(interface.parameters, interface.defaults, strict=True)
     listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
+    advance, to_end = (DENSITY, "h=tau, t_end=t_end") if interface.monitor else (CONTROL, "t_end=t_end")
     return (
         Template(_template("README_embedded.md" if embedded else "README.md"))
         .substitute(
@@ -331,8 +346,8 @@ def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None
             coordinates=", ".join(f"`{name}`" for name in interface.coordinates),
             parameters=(f"Parameters, with default values: {listed}." if listed else "There are no parameters.")
             + Template(CLOCK if interface.energy_parameter else "").substitute(energy=interface.energy_parameter),
-            control=_further(CONTROL * controlled + INPUTS * bool(interface.inputs), interface),
-            integrate=f"\ntrajectory = {interface.prefix}.stepper.integrate(q0, p0, t_end=t_end)" if controlled else "",
+            control=_further(advance * controlled + INPUTS * bool(interface.inputs), interface),
+            integrate=f"\ntrajectory = {interface.prefix}.stepper.integrate(q0, p0, {to_end})" if controlled else "",
             origin="`model.toml` is what it was generated from." if with_model else "",
         )
         .rstrip("\n")

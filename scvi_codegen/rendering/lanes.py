@@ -72,7 +72,7 @@ class SweepText:
         mass: the constant masses, if there are such.
         damping: the rate of a damping that lanes have, each its own.
         support: headers from the tables on.
-        error_defines, highest: macro and value, and the table, that the error of a curve is found with.
+        error_defines, highest, next: macro and value, and the tables, that the error of a curve is found with.
     """
 
     lanes: int
@@ -87,6 +87,7 @@ class SweepText:
     support: tuple[str, ...]
     error_defines: Mapping[str, str]
     highest: str
+    next: str
 
     @property
     def inverse_roots(self) -> bool:
@@ -132,6 +133,7 @@ def sweep_text(
         support=(*meaning.before, "contraction", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),
         highest=_groups("HIGHEST", sweep.guess.highest),
+        next=_groups("NEXT", sweep.guess.next),
     )
 
 
@@ -144,6 +146,7 @@ def _kept(sweep: Sweep) -> dict[str, str]:
         "KEPT_VELOCITIES": str(int(velocities)),
         "KEPT_UNIT(i)": "(data->square * data->inverse_mass[i])" if forces else "(step->h)",
         "RESOLVED": f"{4 * degree - 2 if velocities else 1}.0",
+        "NEXT_RESOLVED": f"{max(4 * degree - 6, 0) if velocities else 1}.0",
     }
 
 

@@ -75,7 +75,7 @@ class ExampleRun:
     Attributes:
         h: of steps of one length, ``None`` where they choose theirs.
         span: of time.
-        tolerance: of steps that choose their length.
+        tolerance: of steps that choose their length; with a monitor in place of it tau.
         controlled: whether the integrator has these.
         to_end: whether it goes on to the end of the span, in steps of tau whose number is not known before.
         inputs: of a system that has any, if they are given; ``parameters`` has their values at the start.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.changes_in_lanes import MOTIONS, in_lanes
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
@@ -26,11 +28,16 @@ from scvi_codegen.runtime.ensemble_trajectory import OK
 from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.spreading import Changes, ahead
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.workers import Heed, run_each
 
 __all__ = ["DeviationsEnsemble"]
+
+ASKED: Final = 64
+"""Motions, of which one is asked for the error of its steps."""
 
 
 class DeviationsEnsemble:
@@ -82,7 +89,22 @@ class DeviationsEnsemble:
                 progress=lambda done: told(before + done),
                 threads=threads,
             )
+        self._warn_of_long_steps()
         return Deviations.of(self.t[:: self.every], self.found, self.status)
+
+    def _warn_of_long_steps(self) -> None:
+        """Of one motion in so many, which is run once more by itself: steps in lanes tell no error."""
+        steps, runs = len(self.t) - 1, {}
+        for j in range(0, len(self.q), ASKED):
+            start = self.q[j], self.p[j]
+            memory = Memory.started(
+                self.stepper, *start, h=self.h, t=self.t[0], parameters=self.parameters[j], options=self.options
+            )
+            with suppress(StepFailedError):
+                runs[j] = record(memory, steps, every=steps)
+        worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
+        if worst is not None:
+            warn_of_long_steps(runs[worst], remedy=f" (motion {worst} of {len(self.q)})")
 
     def _lanes(self) -> Binding | None:
         """The compiled text with changes beside the motions, if there is one."""

@@ -182,7 +182,8 @@ class Ensembles(ConstrainedStates):
 
         Returns:
             :class:`Deviations` of (n, K, k): ``found.megno()[-1]`` are K numbers. A motion that fails is not a number
-            from there on, or from up to a thousand steps before, and says why in ``status``.
+            from there on, or from up to a thousand steps before, and says why in ``status``. An
+            :class:`~scvi_codegen.AccuracyWarning` says when steps are too long, as one motion in 64 finds.
 
         Raises:
             MethodError: in transformed time, and where a monitor chooses the steps.

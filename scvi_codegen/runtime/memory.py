@@ -38,6 +38,7 @@ class Memory:
     Attributes:
         stepper: the compiled integrator.
         goal: where steps that choose their length lead, ``None`` for steps of h.
+        longest: the most time between states that were kept, so far.
 
     A step of a system with inputs waits until each of them was given (:meth:`hold`, or its parameters).
     """
@@ -52,7 +53,7 @@ class Memory:
         awaited: tuple[str, ...] = (),
     ) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
-        self.goal, self._awaited = goal, awaited
+        self.goal, self._awaited, self.longest = goal, awaited, 0.0
 
     @classmethod
     def started(

@@ -20,6 +20,7 @@ from scvi_codegen.runtime.dense_output import lengths_at, states_and_steps_at, t
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import SLICE_SECONDS, record, trajectory_of
+from scvi_codegen.runtime.stalling import Watch
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Observation", "observed_until"]
@@ -72,10 +73,14 @@ class Observation:
         self._keep(record(self.run, 0), first=True)
         most = max(1, NUMBERS // self.run.stepper.dimension)
         portion, done = min(FIRST_STEPS, most), 0
+        watch = Watch(self.run.stepper, self.end if goal is None else goal.t_end if goal.tau else None)
         while done < most_steps and not self.run.arrived and not stop():
             size, began = int(min(portion, most_steps - done)), time.perf_counter()
+            before = self.run.t, self.run.steps
             try:
                 self._portion(size)
+                if failure := watch.halt(before[0], self.run.t, self.run.steps - before[1], self.run.steps):
+                    raise failure
             except StepFailedError as failure:
                 failure.trajectory = self.trajectory()
                 raise

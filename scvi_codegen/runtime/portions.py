@@ -16,6 +16,7 @@ from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.stalling import Watch, lost_level
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -67,7 +68,12 @@ def record_states(
             progress(done)
         elapsed = max(time.perf_counter() - began, 1e-6)
         portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
-    return trajectory_of(memory, t, q, p, iterations, tau=_tau(memory, first, every, len(t)))
+    found = trajectory_of(memory, t, q, p, iterations, tau=_tau(memory, first, every, len(t)))
+    memory.longest = float(np.abs(np.diff(found.t)).max(initial=memory.longest))
+    if found.tau is not None and (failure := lost_level(found, memory.longest)):
+        failure.trajectory = found
+        raise failure
+    return found
 
 
 def _tau(memory: Memory, first: int, every: int, count: int) -> Array | None:
@@ -89,14 +95,18 @@ def record_until(
     every = checked_count(every, "every", least=1)
     pieces = [_Piece.of(memory)]
     done, portion = 0, 256 * every
+    watch = Watch(memory.stepper, memory.goal.t_end if memory.goal and memory.goal.tau else None)
     while not memory.arrived and (steps is None or done < steps):
-        size, began = portion if steps is None else min(portion, steps - done), time.perf_counter()
+        size, began, before = portion if steps is None else min(portion, steps - done), time.perf_counter(), memory.t
         piece = _Piece.empty(memory, size // every + 2)
         status, report = memory.advance(size, every, *piece)
         pieces.append(piece.first(report.stored))
         done += report.steps
         if status:
             raise step_failure(status, report, step=memory.steps, h=memory.h, kept=_joined(memory, pieces, every))
+        if failure := watch.halt(before, memory.t, report.steps, memory.steps):
+            failure.trajectory = _joined(memory, pieces, every)
+            raise failure
         if progress is not None:
             progress(done)
         elapsed = max(time.perf_counter() - began, 1e-6)

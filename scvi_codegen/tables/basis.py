@@ -160,7 +160,12 @@ def cardinal_integrals(points: Iterable[Number], at: Iterable[Number], start: Nu
 
 
 def legendre_functional(points: Vector, degree: int) -> Vector:
-    """From values at the points in [0, 1] to the coefficient of P_degree(2x - 1) of the polynomial through them."""
+    """From values at the points in [0, 1] to the coefficient of P_degree(2x - 1) of the polynomial through them.
+
+    Zeros for a degree below 0.
+    """
+    if degree < 0:
+        return (mp.zero,) * len(points)
     rule = gauss_legendre((len(points) + degree) // 2 + 1)
     values = cardinal_values(points, rule.abscissae)
     weights = [

@@ -11,11 +11,11 @@ static inline real smaller(real a, real b)
 /* Increments, and what their curve leaves unresolved, if more than `least`; infinity where there are none. Afresh:
  * without a guess, which only a step as long as the one before has. */
 static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess, real *dq,
-    real *dp, real least, const solver_options *options, solver_report *report)
+    real *dp, real decay, real least, const solver_options *options, solver_report *report)
 {
   *guess = !afresh && run->change == 0 && run->guess > 0;
   if (solve(step, data, run->memory, guess, dq, dp, options, report, step->scratch + SCRATCH) != OK)
     return INFINITY;
   *guess = 1;
-  return stage_error(step, run->memory, dq, EACH, least);
+  return stage_error(step, run->memory, dq, EACH, decay, least);
 }

@@ -5,7 +5,7 @@
 /* Increments, and what their curve leaves unresolved, if more than `least`; infinity where there are none. Afresh:
  * without a guess. */
 static inline double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess,
-    double *dq, double *dp, double least, const solver_options *options, solver_report *report)
+    double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
 {
   struct guess_tables tables;
   int status;
@@ -15,5 +15,5 @@ static inline double attempt(run_memory *run, step_data *step, const solver_data
   step->tables = NULL;
   if (status != OK)
     return INFINITY;
-  return curve_error(step, data, run->memory, dq, EACH, least);
+  return curve_error(step, data, run->memory, dq, EACH, decay, least);
 }

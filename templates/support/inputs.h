@@ -28,7 +28,7 @@ static real breakpoint_before(const input_data *input, real t, real end, real sl
 
 real NAME(next_breakpoint)(const run_memory *run, real t_end, real h, input_data *inputs, real *parameters)
 {
-  const real slack = (real)NO_STEP * MATH(fabs)(h);
+  const real slack = (real)NO_STEP * MATH(fmin)(MATH(fabs)(h), MATH(fabs)(t_end - run->t));
   real end = t_end;
   for (int i = 0; i < INPUTS; i++) {
     inputs[i].piece = piece_at(inputs + i, run->t);
@@ -48,7 +48,8 @@ long long NAME(next_steps)(run_memory *run, real t_end, real h, input_data *inpu
 {
   const real left = NAME(next_breakpoint)(run, t_end, h, inputs, parameters) - run->t;
   const real whole = MATH(floor)(left / h + (real)NO_STEP), length = whole >= 1 ? h : left;
-  if (left / h <= (real)NO_STEP)
+  const real shorter = run->step > 0 ? MATH(fmin)(MATH(fabs)(h), MATH(fabs)(run->h)) : 0;
+  if (!(left / h > 0) || MATH(fabs)(left) <= (real)NO_STEP * shorter)
     return 0;
   run->guess = run->h == length ? run->guess : 0;
   run->h = length;

@@ -16,7 +16,7 @@ static SELDOM int lent_step(const step_data *step, double *dq, double *dp, const
   *error = NAN;
 #ifdef STAGE_POWER
   if (status == OK)
-    *error = pow(stage_error(&own, newton_in(workspace + SCRATCH).z, dq, ALL, 0.0), STAGE_POWER);
+    *error = pow(stage_error(&own, newton_in(workspace + SCRATCH).z, dq, ALL, DECAY, 0.0), STAGE_POWER);
 #endif
   free(workspace);
   return status;

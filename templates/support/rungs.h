@@ -19,12 +19,14 @@ enum {
  * `few`, two below `fewer`. */
 typedef struct {
   real most, few, fewer;
+  real decay; /* from a coefficient of a curve to the next, where its error is just allowed */
 } error_limits;
 
 static error_limits limits_of(real tolerance)
 {
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
-  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH)};
+  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
+      MATH(exp2)(MATH(log2)(most) / (OCTAVE * MATH(log2)(GROWTH) - 2))};
   return limits;
 }
 

@@ -7,7 +7,7 @@
 static SELDOM int strays(const step_data *step, const real *z, const real *dq, long long iterations)
 {
 #ifdef STAGE_POWER
-  return iterations > NEARLY_LINEAR && !(MATH(pow)(stage_error(step, z, dq, ALL, 0), STAGE_POWER) <= MOST_ERROR);
+  return iterations > NEARLY_LINEAR && !(MATH(pow)(stage_error(step, z, dq, ALL, DECAY, 0), STAGE_POWER) <= MOST_ERROR);
 #else
   (void)step, (void)z, (void)dq, (void)iterations;
   return 0;

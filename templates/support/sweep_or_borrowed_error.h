@@ -9,6 +9,6 @@ static double largest_error(const run_memory *run, const step_data *step, const 
     double *workspace)
 {
   if (run->guess > 0)
-    return curve_error(step, data, run->memory, dq, ALL, run->error);
+    return curve_error(step, data, run->memory, dq, ALL, now_and_then(run), run->error);
   return fallback_error(run, workspace);
 }

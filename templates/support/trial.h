@@ -21,5 +21,6 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
     now->step.h = h;
     prepare(&now->step, &now->data);
   }
-  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, least, options, report);
+  now->error = attempt(run, &now->step, &now->data, now->last, &now->guess, now->dq, now->dp, now->limits.decay, least,
+      options, report);
 }

@@ -92,3 +92,10 @@ def test_steps_in_the_picture_follow_the_motion(tmp_path):
     pytest.importorskip("matplotlib")
     plot_step_lengths(tmp_path / "steps.svg")
     assert (tmp_path / "steps.svg").stat().st_size > 1000
+
+
+@pytest.mark.full
+def test_the_reference_of_the_pythagorean_problem_passes_its_encounters():
+    chosen = adaptive_case("pythagorean")
+    one = replace(chosen, q=chosen.q[:1], velocity=chosen.velocity[:1])
+    assert adaptive.adaptive_reference(one).accuracy < 1e-4

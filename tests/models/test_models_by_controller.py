@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError, StateError, SystemDefinitionError
 from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
-from scvi_codegen.models.package import generate_package
+from scvi_codegen.models.package import generate_package, load_package
 from scvi_codegen.runtime.longest_step import RUNGS, longest_step
 
 SHAKEN = """
@@ -174,7 +176,6 @@ def test_inputs_are_met_at_their_breakpoints() -> None:
         ("run FILE --advise 1e-9", "give --tolerance in place of --advise"),
         ("run FILE --ensemble grid.toml", "--ensemble does not go with it"),
         ("run FILE --controller symplectic", "depends on time"),
-        ("generate FILE -o by_controller", "generated folders have no reversible controller"),
     ],
 )
 def test_what_does_not_go_with_it_is_said(shaken: Path, words: str, said: str) -> None:
@@ -185,10 +186,29 @@ def test_a_model_says_what_it_is_not(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     with pytest.raises(ModelFileError, match="reversible controller"):
         _ = model.step_count
-    with pytest.raises(ModelFileError, match="no reversible controller"):
-        generate_package(model, tmp_path / "none")
+    with pytest.raises(ModelFileError, match="give a step of tau"):
+        generate_package(replace(model, h=None, tolerance=1e-9), tmp_path / "none")
     stretched = sc.reparametrise(sc.problem("kepler").system, "frequency")
     with pytest.raises(ModelFileError, match="not transformed"):
         sc.Model(system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, monitor="frequency")
     with pytest.raises(ModelFileError, match="controller is symplectic or reversible"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))
+
+
+@pytest.mark.parametrize(("solver", "embedded"), [("auto", None), ("newton", None), ("auto", "single")])
+def test_a_folder_has_it_in_c_and_in_python(shaken: Path, tmp_path: Path, solver: str, embedded: str | None) -> None:
+    model = sc.load_model(shaken)
+    folder = generate_package(model, tmp_path / "by_controller", solver=solver, embedded=embedded)
+    flags = "CFLAGS=-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
+    done = subprocess.run(["make", "-s", "-C", folder, "run", flags], capture_output=True, text=True, check=True)
+    *lines, last = done.stdout.splitlines()
+    states = np.array([[float(word) for word in line.split()] for line in lines if not line.startswith("#")])
+    exact = sc.compile_stepper(model.system, sc.SVI(8)).integrate(model.q, states[0, 3:5], t_end=model.covered)
+    assert states[-1, 0] == pytest.approx(model.covered)
+    assert np.abs(states[-1, 1:3] - exact.q[-1]).max() < (1e-2 if embedded else 1e-6)
+    assert 20 < int(last.split()[1]) < 10**5
+    assert "tau" in (folder / "README.md").read_text()
+    if embedded is None:
+        run = load_package(folder).integrate(model.q, states[0, 3:5], h=model.h, t_end=model.covered)
+        assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-6
+        assert sc.load_model(folder / "model.toml") == model

@@ -96,6 +96,23 @@ def test_stretches_of_c_are_those_of_python(model, seed):
     assert (theirs.t, theirs.q, theirs.p) == (ours.t, ours.q, ours.p)
 
 
+def test_a_step_much_longer_than_the_way_is_cut_there(model):
+    stepper = compile_stepper(model.system, model.method)
+    given = {"u": ([0.0, 0.4, 1.0], [0.1, 0.2, 0.3]), "w": ([0.0, 1.0], [0.0, 0.0])}
+    inputs = checked_inputs(stepper, given)
+    run = stepper.start([0.3], [0.1], h=1e11)
+    table, kept = _tables(stepper, inputs)
+    values = np.array(stepper.defaults)
+    taken = []
+    while stepper.binding.function("next_steps")(run._memory, 0.9, 1e11, table, stepper.binding.pointer(values)) == 1:
+        taken.append(run.h)
+        run.change(parameters=values)
+        run.skip(1)
+    assert_allclose(taken, [0.4, 0.5])
+    assert run.t == 0.9
+    assert len(kept) == 4
+
+
 def _tables(stepper, inputs):
     """The same data as C takes them, and what must not be forgotten before C has used them."""
     table, kept = stepper.binding.new(f"input[{len(inputs)}]"), []

@@ -1,6 +1,7 @@
 """Indicators of chaos: against closed forms, variational equations by DOP853, published values, promises."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from scvi_codegen import (
     SVI,
+    AccuracyWarning,
     Event,
     Gauss,
     HamiltonianSystem,
@@ -371,3 +373,13 @@ def test_what_is_refused(galaxy):
         run.deviations(2).gali(3)
     with pytest.raises(StateError, match="no multiple of every=3"):
         galaxy.deviations_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, every=3)
+
+
+def test_steps_too_long_are_said_of_an_ensemble():
+    kepler = compile_stepper(problem("kepler").system, SVI(4))
+    starts = [[1.0, 0.0], [0.1, 0.0]], [[0.0, 1.0], [0.0, 19.0**0.5]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kepler.deviations_ensemble(*starts, h=0.005, steps=200)
+    with pytest.warns(AccuracyWarning, match=r"too long.*\(motion 0 of 2\)"):
+        kepler.deviations_ensemble(starts[0][::-1], starts[1][::-1], h=0.05, steps=200)

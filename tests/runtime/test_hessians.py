@@ -146,7 +146,9 @@ def test_what_has_no_hessian(stepper):
 
 
 def test_of_damped_systems_there_are_first_derivatives_alone():
-    run = compile_stepper(damped_pendulum(), "svi:2").integrate([1.0], [0.0], h=0.1, steps=3)
+    system = damped_pendulum()
+    state = [1.0] * system.dimension, [0.0] * system.dimension
+    run = compile_stepper(system, "svi:2").integrate(*state, h=0.1, steps=3)
     assert run.tangent([1.0, 0.0]).shape == (4, 2)
     with pytest.raises(MethodError, match="of systems with damping there are first derivatives alone"):
         run.hessian_product(np.ones((4, 2)), np.ones((2, 1)))

@@ -56,6 +56,7 @@ def guess_tables(
         abscissae=lower_vector(abscissae),
         degree=highest,
         highest=pad_vector(legendre_functional(abscissae, highest), lanes),
+        next=pad_vector(legendre_functional(abscissae, highest - 1), lanes),
         last_alone=last_alone,
         last=last,
         before=before,

@@ -1,0 +1,42 @@
+"""Monitors that come to 0: refused in bounded work, and never gone round."""
+
+from __future__ import annotations
+
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import StepFailedError
+
+OSCILLATOR = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+KEPLER = sc.problem("kepler").system
+NEAR = [1.99999, 0.0], [0.0, (1e-5 / 1.99999) ** 0.5]
+
+
+@pytest.mark.parametrize("monitor", ["x", "x**2"])
+def test_no_step_of_tau_leads_beyond_a_rate_of_nothing(monitor):
+    stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, monitor), sc.SVI(4))
+    with pytest.raises(StepFailedError, match="comes to 0") as failure:
+        stretched.integrate([1.0], [0.0], h=0.1, t_end=4.0)
+    assert failure.value.status == "stalled"
+    assert failure.value.t == pytest.approx(1.5708, abs=1e-3)
+    assert 100 < len(failure.value.trajectory) < 10**6
+
+
+def test_nor_under_the_reversible_controller():
+    controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), monitor="x**2")
+    with pytest.raises(StepFailedError, match="comes to 0") as failure:
+        controlled.integrate([1.0], [0.0], h=0.1, t_end=4.0)
+    assert failure.value.status == "stalled"
+
+
+def test_solve_motion_says_so():
+    motion = sc.solve_motion(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], monitor="x**2", method="svi:4")
+    assert not motion.success
+    assert "comes to 0" in motion.message
+
+
+@pytest.mark.parametrize("monitor", ["frequency", "q1**2 + q2**2"])
+def test_close_encounters_are_none(monitor):
+    stretched = sc.compile_stepper(sc.reparametrise(KEPLER, monitor), sc.SVI(8))
+    run = stretched.integrate(*NEAR, h=0.1, t_end=7.0)
+    assert run.t[-1] == 7.0

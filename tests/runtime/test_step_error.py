@@ -1,0 +1,65 @@
+"""The estimate of a step's error beside the error: also where a coefficient of the curve passes through zero."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+CATALOGUE = {name: sc.problem(name).system for name in ("planar-pendulum", "henon-heiles", "double-pendulum")}
+OSCILLATORS = {
+    "harmonic": "x_dot**2/2 - x**2/2",
+    "quartic": "x_dot**2/2 - x**4/4",
+    "of two wells": "x_dot**2/2 + x**2/2 - x**4/4",
+    "quick": "sqrt(1 + x_dot**2) - x**2/2",
+}
+SYSTEMS = CATALOGUE | {
+    name: sc.LagrangianSystem.from_text(name=name, coordinates=["x"], lagrangian=lagrangian)
+    for name, lagrangian in OSCILLATORS.items()
+}
+PHASES = 60
+
+
+def achieved_and_estimated(system, method, solver="auto"):
+    """(2, PHASES) of single steps from states along a motion: |q - exact| relative as the estimate is, and that."""
+    stepper, exact = sc.compile_stepper(system, method, solver=solver), sc.compile_stepper(system, sc.SVI(12))
+    m = stepper.dimension
+    q = np.linspace(0.3, 0.2, m)
+    start = q, exact.momentum(q, np.linspace(0.2, 0.4, m))
+    h = np.median(np.diff(stepper.integrate(*start, t_end=10.0, tolerance=1e-9).t))
+    states = exact.integrate(*start, h=h / 3, steps=PHASES)
+    found = []
+    for q, p in zip(states.q[:-1], states.p[:-1], strict=True):
+        run = stepper.integrate(q, p, h=h, steps=1)
+        end = exact.integrate(q, p, h=h / 4, steps=4).q[-1]
+        size = np.abs(q) + np.abs(end - q)
+        found.append((np.abs(run.q[-1] - end).max() / (size.max() + np.abs(q).min()), run.step_error))
+    return np.array(found).T
+
+
+def check_all_phases(system, method, solver="auto"):
+    achieved, estimated = achieved_and_estimated(system, method, solver)
+    resolved = achieved > 1e-14
+    assert resolved.sum() > 10
+    assert np.all(achieved[resolved] < 5.0 * estimated[resolved])
+
+
+@pytest.mark.parametrize("method", [sc.SVI(4), sc.SVI(6)])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_no_phase_of_a_motion_hides_its_error(name, method):
+    check_all_phases(SYSTEMS[name], method)
+
+
+def test_where_momenta_are_unknowns_newtons_iteration_estimates_as_sweeps_do():
+    vortices = sc.problem("point-vortices")
+    steppers = [sc.compile_stepper(vortices.system, sc.SVI(4), solver=each) for each in ("auto", "newton")]
+    errors = [each.integrate(vortices.q, vortices.p, h=0.1, steps=1).step_error for each in steppers]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+    with pytest.warns(sc.AccuracyWarning, match="too long"):
+        assert steppers[0].integrate(vortices.q, vortices.p, h=0.5, steps=50).step_error > 1e-3  # sweeps fail there
+
+
+@pytest.mark.parametrize("method", [sc.SVI(4), sc.SCVI(3), sc.Gauss(4)])
+def test_nor_of_a_step_by_newtons_iteration(method):
+    check_all_phases(SYSTEMS["quartic"], method, "newton")
