@@ -16,10 +16,8 @@ OF_TESTS = tuple(f"tests/{name}" for name in ("oracles", "tools", "faults"))
 
 
 def copied(folder: Path) -> Path:
-    """The copy, in a folder that also gets its cache, with what is compiled already: faults make texts of their own."""
-    copy, known = folder / "checkout", os.environ.get("SCVI_CODEGEN_CACHE")
-    if known:
-        shutil.copytree(known, folder / "cache", ignore=shutil.ignore_patterns(".*", "texts"), dirs_exist_ok=True)
+    """The copy, in a folder that also gets its cache."""
+    copy = folder / "checkout"
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache"))
     return copy
 

@@ -63,7 +63,11 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
     "templates/support/events": ("runtime/test_events.py",),
     "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
-    "templates/support/control": ("runtime/test_controlled_steps.py", "lowering/test_ladder.py"),
+    "templates/support/control": (
+        "runtime/test_controlled_steps.py",
+        "lowering/test_ladder.py",
+        "results/test_controlled_recording.py",
+    ),
     "templates/support/legendre": ("runtime/test_given_velocities.py", "runtime/test_stepper.py"),
     "templates/support/clock": ("runtime/test_clock.py", "mechanics/test_transformed_time.py"),
     "templates/support/newton": (
