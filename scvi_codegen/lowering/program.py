@@ -163,7 +163,7 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
 
 
 def _highest_of(shape: Velocities, held: bool) -> list[Vector]:
-    """The highest coefficient of the accelerations that velocities tell, and the one below; 0 beside ends that are known."""
+    """The highest coefficient of the accelerations that velocities tell, and the one below; 0 beside a known end."""
     degree = len(shape.blocks) - 1
     if held:
         line = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one)
