@@ -42,7 +42,7 @@ class Steps(Protocol):
     def step_error_t(self) -> float: ...
 
 
-class Ends(Protocol):
+class EnergyAtEnds(Protocol):
     """What a trajectory tells of its states, the first and the last among them."""
 
     @property
@@ -83,7 +83,7 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
     )
 
 
-def warn_of_lost_energy(trajectory: Ends) -> None:
+def warn_of_lost_energy(trajectory: EnergyAtEnds) -> None:
     """An :class:`AccuracyWarning` where steps chose their length and the energy that the motion conserves is another.
 
     Each step was as accurate as wanted; past a near collision, say, the motion magnifies what is left. The size of an

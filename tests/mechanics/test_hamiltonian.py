@@ -18,9 +18,9 @@ from scvi_codegen.mechanics.hamiltonian import (
     hamiltonian_of,
     lagrangian_of,
     lagrangian_twin,
-    positive_parameters,
 )
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import positive_parameters
 from scvi_codegen.methods import (
     SCVI,
     SVI,

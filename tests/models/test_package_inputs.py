@@ -99,7 +99,7 @@ def test_stretches_of_c_are_those_of_python(model, seed):
 def test_a_step_much_longer_than_the_way_is_cut_there(model):
     stepper = compile_stepper(model.system, model.method)
     given = {"u": ([0.0, 0.4, 1.0], [0.1, 0.2, 0.3]), "w": ([0.0, 1.0], [0.0, 0.0])}
-    inputs = checked_inputs(stepper, given)
+    inputs = checked_inputs(stepper.interface, given)
     run = stepper.start([0.3], [0.1], h=1e11)
     table, kept = _tables(stepper, inputs)
     values = np.array(stepper.defaults)
