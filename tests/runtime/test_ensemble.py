@@ -498,10 +498,10 @@ class TestCommandLine:
 
     def test_an_interruption_keeps_what_was_done(self, monkeypatch: pytest.MonkeyPatch):
         @contextmanager
-        def once_all_have_begun(steps: int) -> Iterator[Callable[[int], None]]:
+        def once_some_have_begun(steps: int) -> Iterator[Callable[[int], None]]:
             yield lambda count: signal.raise_signal(signal.SIGINT) if count else None
 
-        monkeypatch.setattr("scvi_codegen.cli.ensembles.progress_bar", once_all_have_begun)
+        monkeypatch.setattr("scvi_codegen.cli.ensembles.progress_bar", once_some_have_begun)
         result = self.invoke(
             "kepler --degree 4 --step 0.05 --steps 10000000000 --every 1000000000 --ensemble grid.toml -o runs.npz"
         )
@@ -510,7 +510,7 @@ class TestCommandLine:
         assert "the states computed were kept: runs.npz" in result.stderr
         with np.load("runs.npz") as file:
             assert set(file["status"]) == {"interrupted"}
-            assert file["steps"].min() > 0
+            assert file["steps"].max() > 0
 
 
 def test_a_stepper_from_a_pickle_has_its_lanes(kepler: Stepper):
