@@ -27,7 +27,8 @@ from scvi_codegen.lowering.solvers.ladder import control_of_sweep
 from scvi_codegen.lowering.solvers.separable import separable_sweep
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import IndexedSystem, MassTerm
+from scvi_codegen.mechanics.indexed.masses import MassTerm
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
-import sympy
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
@@ -28,18 +27,9 @@ from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, velocity_slots
 
-__all__ = ["INDEXED", "IndexedSystem", "MassTerm"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MassTerm:
-    """A mass, added up over loops: m of ``formula * v**2/2`` at the coordinate ``access``."""
-
-    loops: tuple[Loop, ...]
-    access: Access
-    formula: Expr
-    slots: tuple[tuple[Symbol, Access], ...]
+__all__ = ["INDEXED", "IndexedSystem"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +71,7 @@ class IndexedSystem:
         for term in self.terms:
             if problem := unsupported_part(term.formula):
                 raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
-            _check_form(term, self._velocities, self.time)
+            check_form(term, self._velocities, self.time)
         for force in self.forces:
             for access, formula in force.targets:
                 if problem := unsupported_part(formula):
@@ -243,14 +233,14 @@ class IndexedSystem:
     @property
     def masses(self) -> tuple[MassTerm, ...]:
         """Second derivatives of L by velocities; none of a Hamiltonian."""
-        return tuple(chain(*(_masses(term, self._velocities) for term in self.terms)))
+        return tuple(chain(*(masses_of(term, self._velocities) for term in self.terms)))
 
     @property
     def potentials(self) -> tuple[IndexedTerm, ...]:
         """Terms of L without velocities, -V; those of -H."""
         found = []
         for term in self.terms:
-            at_rest = term.formula.xreplace(dict.fromkeys(_velocity_slots(term, self._velocities), S.Zero))
+            at_rest = term.formula.xreplace(dict.fromkeys(velocity_slots(term, self._velocities), S.Zero))
             at_rest = -at_rest if self.momenta else at_rest
             if at_rest.free_symbols & {slot for slot, access in term.slots if access.array in self.state}:
                 slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
@@ -383,37 +373,6 @@ def _friction(
             )
         found.append(IndexedForce(loops=term.loops, slots=term.slots, targets=targets))
     return tuple(found)
-
-
-def _masses(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
-    """Those of the velocities of a term."""
-    known, found = dict(term.slots), []
-    for v in _velocity_slots(term, velocities):
-        mass = term.formula.diff(v, 2)
-        slots = tuple(pair for pair in term.slots if pair[0] in mass.free_symbols)
-        access = replace(known[v], array=velocities[known[v].array.name])
-        found.append(MassTerm(loops=term.loops, access=access, formula=mass, slots=slots))
-    return tuple(found)
-
-
-def _velocity_slots(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
-    return tuple(slot for slot, access in term.slots if access.array.name in velocities)
-
-
-def _check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol) -> None:
-    """Raise :class:`SystemDefinitionError` unless velocities occur as m v**2/2 with a constant m."""
-    coordinates = set(velocities.values())
-    varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
-    slots = _velocity_slots(term, velocities)
-    slopes = gradient(term.formula, slots)
-    for place, v in enumerate(slots):
-        slope = slopes.get(place, S.Zero)
-        mass = slope.diff(v)
-        if mass.free_symbols & (varies | {time}) or sympy.expand(slope - mass * v) != 0:
-            raise SystemDefinitionError(
-                f"in '{term}' the derivative by {v} is {slope}: a Lagrangian of sums over indices has velocities as "
-                "m*v**2/2 alone, with a constant mass m"
-            )
 
 
 INDEXED = of("an IndexedSystem", IndexedSystem)

@@ -1,0 +1,58 @@
+"""Masses of sums over indices: velocities occur as m v**2/2, m constant but possibly different from place to place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import sympy
+from sympy import Expr, S, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.indices import Access, Array, Loop
+
+__all__ = ["MassTerm", "check_form", "masses_of", "velocity_slots"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MassTerm:
+    """A mass, added up over loops: m of ``formula * v**2/2`` at the coordinate ``access``."""
+
+    loops: tuple[Loop, ...]
+    access: Access
+    formula: Expr
+    slots: tuple[tuple[Symbol, Access], ...]
+
+
+def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
+    """Those of the velocities of a term."""
+    known, found = dict(term.slots), []
+    for v in velocity_slots(term, velocities):
+        mass = term.formula.diff(v, 2)
+        slots = tuple(pair for pair in term.slots if pair[0] in mass.free_symbols)
+        access = replace(known[v], array=velocities[known[v].array.name])
+        found.append(MassTerm(loops=term.loops, access=access, formula=mass, slots=slots))
+    return tuple(found)
+
+
+def velocity_slots(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
+    """The slots of a term that hold velocities."""
+    return tuple(slot for slot, access in term.slots if access.array.name in velocities)
+
+
+def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol) -> None:
+    """Raise :class:`SystemDefinitionError` unless velocities occur as m v**2/2 with a constant m."""
+    coordinates = set(velocities.values())
+    varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
+    slots = velocity_slots(term, velocities)
+    slopes = gradient(term.formula, slots)
+    for place, v in enumerate(slots):
+        slope = slopes.get(place, S.Zero)
+        mass = slope.diff(v)
+        if mass.free_symbols & (varies | {time}) or sympy.expand(slope - mass * v) != 0:
+            raise SystemDefinitionError(
+                f"in '{term}' the derivative by {v} is {slope}: a Lagrangian of sums over indices has velocities as "
+                "m*v**2/2 alone, with a constant mass m"
+            )
