@@ -177,11 +177,11 @@ C_TEXT = (
     ("q1 by h at its start alone", "vortices/svi", "end_position", r"END_POSITION\[b\] \* z\[i \* B \+ b\]", "0"),
     ("momenta held", "double/scvi", "push_step", r"momentum_rows\(at, 0\);", ""),
     ("rows exchanged no more on the way back", "linkage/lobatto-svi", "lower_wide", r"if \(back\)", "if (0)"),
-    ("slopes by momenta lost on the way back", "double/gauss", "pull_step", r"momentum_rows\(at, 1\);", ""),
+    ("slopes by momenta lost on the way back", "double/gauss", "pull_on", r"momentum_rows\(at, 1\);", ""),
     (
         "time that does not pass on the way back",
         "driven/svi",
-        "pull_step",
+        "pull_on",
         r"flow\(1, at->v \+ GIVEN_H - 1",
         "flow(0, at->v",
     ),
