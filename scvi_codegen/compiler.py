@@ -175,7 +175,10 @@ class _Texts:
         return render(self.program(fallback=True), fallback="lent") if self.borrows else None
 
     def tangent(self, *, second: bool = False) -> Source | None:
-        """With derivatives of steps by all they start from, the second ones, too; none in transformed time."""
+        """With derivatives of steps by all they start from, the second ones, too.
+
+        None in transformed time; of damped systems no second ones.
+        """
         if self.system.integrands or (second and self.system.damping):
             return None
         found = self.program(fallback=True)

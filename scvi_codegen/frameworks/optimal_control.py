@@ -74,9 +74,8 @@ def optimal_control(
         degree: of inputs within a step, 0 (held) to 3.
         t: the time at the start.
         parameters: values by name, others keeping their defaults.
-        guess: a number, or values at equal times from start to end, by name of a coordinate or an input; also for
-            ``"duration"``. Coordinates are else guessed between their conditions, inputs 0, the duration halfway. A
-            :attr:`ControlledMotion.guess` is one, with other steps, too.
+        guess: a number, or values at equal times from start to end, by name of a coordinate, an input or "duration"; by
+            default between conditions, 0 and halfway. A :attr:`ControlledMotion.guess` is one, with other steps, too.
         options: of ``casadi.nlpsol``, as ``{"ipopt.max_iter": 500}``.
 
     Raises:

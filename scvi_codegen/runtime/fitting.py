@@ -153,8 +153,6 @@ def fit(
         StateError: on wrong shapes, names or numbers.
         StepFailedError: if a step of the first guess fails.
     """
-    from scipy.optimize import least_squares  # here: slow to import
-
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )
@@ -164,22 +162,32 @@ def fit(
     chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
     if bounds and len(chain.parts) > 1:
         raise StateError("bounds are those of a fit in one segment: leave one of the two out")
-    limits = [np.append(own, np.full(len(x) - len(own), free)) for own, free in model.bounded(bounds or {})]
+    chain, x, held, evaluations = _solved(model, chain, x, bounds or {})
+    fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
+    if told := _told_by_steps(chain, fitted, x, ~held):
+        warnings.warn(told, AccuracyWarning, stacklevel=3)
+    return fitted
+
+
+def _solved(
+    model: _Model, chain: Chain, x: Array, bounds: Mapping[str, tuple[float, float]]
+) -> tuple[Chain, Array, NDArray[np.bool_], int]:
+    """The segments as they join, the unknowns, which of them a bound holds, and how many motions that took."""
+    from scipy.optimize import least_squares  # here: slow to import
+
+    limits = [np.append(own, np.full(len(x) - len(own), free)) for own, free in model.bounded(bounds)]
     several = len(chain.parts) > 1
     if several:
         chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
     found = least_squares(chain.residuals, x, jac=chain.slopes, bounds=limits, x_scale="jac")
     if not found.success:
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
-    x, evaluations, held = found.x, found.nfev, found.active_mask != 0
+    held = found.active_mask != 0
     _check_told(model.names, found.jac, held)
-    if several:
-        x, more = joined(chain, x)
-        evaluations, chain = evaluations + more, replace(chain, jump=TIGHT)
-    fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
-    if told := _told_by_steps(chain, fitted, x, ~held):
-        warnings.warn(told, AccuracyWarning, stacklevel=3)
-    return fitted
+    if not several:
+        return chain, found.x, held, found.nfev
+    x, more = joined(chain, found.x)
+    return replace(chain, jump=TIGHT), x, held, found.nfev + more
 
 
 @dataclass(eq=False)

@@ -1,8 +1,8 @@
 """How many iterations runs take, beside how many they took when each was looked at: what is slower is wrong somewhere.
 
-Steps are the same whatever leads to them: kept factors that never serve, guesses from the wrong steps, sweeps that stop
-a little later than they may. The numbers are the same with and without optimisation, and for all processors tried; a
-few more or less are rounding. Where a change makes them smaller, the new ones belong here.
+Steps are the same whatever leads to them: kept factors that never serve, guesses from the wrong steps, sweeps that
+stop a little later than they may. The numbers are the same with and without optimisation; a few more or less are
+rounding. Where a change makes them smaller, the new ones belong here.
 """
 
 from __future__ import annotations
