@@ -90,6 +90,10 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
         change += moved * moved;
       }
     take_change(&now, total_change(change), options, k, report);
+    if (stirs(&now, options, k))
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++)
+          z[n][i] += STIR * r[n][i];
   }
   status = outcome(&now, report);
   if (status != OK)

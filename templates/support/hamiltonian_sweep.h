@@ -72,12 +72,17 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     }
     for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++) {
-        const lanes moved = (value[n][i] - z[n][i]) * velocity_size[i];
+        const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
         const lanes pushed = (momentum[n][i] - before[n][i]) * momentum_size[i];
         change += moved * moved + pushed * pushed;
         z[n][i] = value[n][i];
+        value[n][i] = correction;
       }
     take_change(&now, total_change(change), options, k, report);
+    if (stirs(&now, options, k))
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++)
+          z[n][i] += STIR * value[n][i];
   }
   status = outcome(&now, report);
   if (status != OK)

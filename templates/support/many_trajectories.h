@@ -74,6 +74,15 @@ static inline void take_change(progress *now, lanes change, const solver_options
   report->sweeps++;
 }
 
+/* Single trajectories whose sweeps shrink no longer are left to the sweeps of one. */
+static inline int stirs(const progress *now, const solver_options *options, int k)
+{
+  (void)now, (void)options, (void)k;
+  return 0;
+}
+
+#define STIR 0.0
+
 static inline int outcome(const progress *now, const solver_report *report)
 {
   (void)now, (void)report;

@@ -14,7 +14,8 @@ static int rungs_up(const trial *now)
 }
 
 /* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail, and
- * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. */
+ * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. Or all that
+ * such a step shows is rounding, which looks like a large error: none counts before the first that is small enough. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
@@ -23,8 +24,8 @@ static void try_first_step(run_memory *run, trial *now, const solver_options *op
   try_step(run, now, 0, options, report);
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY);
-    found = found || !failed;
-    up = failed && (SHORT_STEPS_FAIL || !found) ? MOST_UP : rungs_up(now);
+    found = found || now->error <= now->limits.most;
+    up = !found || (failed && SHORT_STEPS_FAIL) ? MOST_UP : rungs_up(now);
     run->rung += up;
     if (up > 0)
       try_step(run, now, 0, options, report);

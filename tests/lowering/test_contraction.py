@@ -9,6 +9,7 @@ from samples import QUICK_FLAGS
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, SpectralCollocation
 from scvi_codegen.models.problems import problem
 
@@ -42,3 +43,17 @@ def test_long_steps_of_an_oscillator_alone_and_in_an_ensemble(method):
         many = stepper.integrate_ensemble([Q] * 8, [P] * 8, h=h, steps=STEPS)
         for found in (run.q[-1, 0], many.q[-1, 0, 0]):
             assert abs(found - float(q[0])) < 2 * STEPS * ROUNDING
+
+
+def test_slow_sweeps_are_not_taken_for_rounding():
+    """Near its limit the iteration of a coupled system stops shrinking for a while, at 1e-9 of the state."""
+    heavy = LagrangianSystem.from_text(
+        name="heavy", coordinates=["x"], lagrangian="x_dot**2*(1 + x**2/100)/2 - x**2/2", parameters={}
+    )
+    method = SVI(8)
+    sweeps, newton = (
+        compile_stepper(heavy, method, solver=solver, flags=QUICK_FLAGS) for solver in ("fixed-point", "newton")
+    )
+    for h in (3.98, 4.1, 4.18, 4.6, 4.64):
+        found = np.concatenate(sweeps.step([1.0], [0.3], h))
+        assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)

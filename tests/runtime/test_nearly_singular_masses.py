@@ -1,0 +1,92 @@
+"""Nearly singular masses: rounding alone changes velocities by 1e-12 and more, and motions are done all the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+
+LIGHT, SPAN = 1e-4, 5.0
+
+
+@pytest.fixture(scope="module")
+def cart():
+    """A pendulum on a cart of a ten-thousandth of its mass, which is flung aside whenever the bob passes below."""
+    return sc.LagrangianSystem.from_text(
+        name="light cart",
+        coordinates=["x", "th"],
+        lagrangian="(M + m)*x_dot**2/2 + m*l*x_dot*th_dot*cos(th) + m*l**2*th_dot**2/2 + m*g*l*cos(th)",
+        parameters={"M": LIGHT, "m": 1.0, "l": 1.0, "g": 9.81},
+    )
+
+
+@pytest.fixture(scope="module")
+def stepper(cart):
+    return sc.compile_stepper(cart, sc.SVI(8))
+
+
+def angle_alone():
+    """The angle at the end: the momentum along x is 0, which leaves one coordinate and its equation."""
+
+    def slope(t, state):
+        angle, rate = state
+        part = 1.0 / (1.0 + LIGHT)
+        mass = 1.0 - part * np.cos(angle) ** 2
+        return rate, -np.sin(angle) * (9.81 + part * np.cos(angle) * rate**2) / mass
+
+    return solve_ivp(slope, (0.0, SPAN), (1.0, 0.0), method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
+
+
+@pytest.mark.parametrize("method", ["svi:8", "scvi:4"])
+@pytest.mark.parametrize("tolerance", [None, 1e-9])
+def test_a_light_cart_is_flung_aside(cart, method, tolerance):
+    run = sc.compile_stepper(cart, method).integrate([0, 1], velocity=[0, 0], t_end=SPAN, tolerance=tolerance)
+    allowed = 1e-9 if tolerance is None else 1e-5
+    assert run.q[-1, 1] == pytest.approx(angle_alone(), abs=allowed)
+    np.testing.assert_allclose(run.q[:, 0], (np.sin(1.0) - np.sin(run.q[:, 1])) / (1 + LIGHT), atol=allowed)
+
+
+def test_a_light_cart_by_its_hamiltonian(cart):
+    run = sc.compile_stepper(sc.hamiltonian_of(cart), "gauss:8").integrate([0, 1], [0, 0], t_end=SPAN)
+    assert run.q[-1, 1] == pytest.approx(angle_alone(), abs=1e-9)
+    assert run.rejected < 100
+
+
+def test_it_takes_no_more_steps_than_tolerances_ask_for(stepper):
+    """Rounding that were taken for unresolved motion would end in steps of 1e-17."""
+    exact, loose = (stepper.integrate([0, 1], velocity=[0, 0], t_end=SPAN, tolerance=x) for x in (None, 1e-9))
+    assert exact.steps < 3 * loose.steps
+    assert exact.rejected < 50
+
+
+def test_many_are_the_same_as_each_alone(stepper):
+    angles = 1.0 + 0.01 * np.arange(9)
+    start = np.column_stack([0.0 * angles, angles])
+    runs = stepper.integrate_ensemble(start, velocity=0.0 * start, t_end=SPAN)
+    assert list(runs.status) == ["ok"] * 9
+    alone = stepper.integrate(start[4], velocity=[0, 0], t_end=SPAN)
+    assert runs.q[len(alone.t) - 1, 4] == pytest.approx(alone.q[-1], abs=1e-9)
+
+
+def test_the_first_step_of_a_sleeping_top_is_no_speck():
+    """At phi = psi = 0 the shortest steps show nothing but rounding, as a part of hardly any motion."""
+    top = sc.LagrangianSystem.from_text(
+        name="sleeping top",
+        coordinates=["phi", "theta", "psi"],
+        lagrangian="A*(theta_dot**2 + phi_dot**2*sin(theta)**2)/2"
+        " + C*(psi_dot + phi_dot*cos(theta))**2/2 - g*cos(theta)",
+        parameters={"A": 1.0, "C": 0.4, "g": 1.5},
+    )
+    run = sc.compile_stepper(top, sc.SVI(8)).integrate([0, 0.05, 0], velocity=[0.1, 0.3, 8.0], t_end=3.0)
+    assert run.steps < 200
+    assert np.ptp(run.energy()) < 1e-13 * run.energy()[0]
+
+
+def test_a_velocity_is_found_where_its_correction_creeps(stepper):
+    """Newton's corrections once shrank the misfit by a rounding each, fifty times."""
+    angle, momentum = -0.08847748482283903, 0.2659119176236544
+    rate = momentum / (1.0 - np.cos(angle) ** 2 / (1.0 + LIGHT))
+    velocity = stepper.velocity([0.9297401032571581, angle], [0.0, momentum])
+    assert velocity == pytest.approx([-np.cos(angle) / (1.0 + LIGHT) * rate, rate], rel=1e-10)
