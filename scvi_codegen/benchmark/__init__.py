@@ -27,8 +27,8 @@ the best formulation we know of, which are named; no step or tolerance chosen wi
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,7 @@ from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.sums import run_growth, run_sums
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
+from scvi_codegen.files.atomic import write_atomically
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
@@ -119,25 +120,34 @@ def benchmark(
     *,
     json_path: str | None = None,
     plot_path: str | None = None,
+    resume: bool = False,
     say: Say = lambda text: None,
+    show: Say = lambda text: None,
 ) -> Report:
     """Measure sections one after the other; one that fails says so, Ctrl-C ends it with what was measured.
 
     Args:
         names: of the sections, by default all; ``kepler`` is ``kepler:0.2`` and ``kepler:0.5``.
         plan: how to measure.
-        json_path, plot_path: files to write; beside the picture of adaptive cases another, NAME-steps, of the length
-            of a step along an orbit.
+        json_path, plot_path: files to write, the first after each section; beside the picture of adaptive cases
+            another, NAME-steps, of the length of a step along an orbit.
+        resume: take the sections that ``json_path`` has, and did not fail, from there.
         say: told what is being done.
+        show: given the text of the report, a section as soon as it is measured.
+
+    Raises:
+        StateError: for an unknown section; if ``json_path`` is no report of this version to resume.
     """
     sections = tuple(section for name in names for section in _sections(name))
     if plot_path is not None:
         from scvi_codegen.pictures.canvas import check_plot_path
 
         check_plot_path(plot_path)
-    report = _measured(sections or tuple(SECTIONS), plan or Plan(), say)
-    if json_path is not None:
-        Path(json_path).write_text(json.dumps(report.data(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    known = _known(json_path) if resume and json_path is not None else {}
+    for report in _reports(sections or tuple(SECTIONS), known, plan or Plan(), say, show):
+        if json_path is not None:
+            text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
+            write_atomically(json_path, lambda file, text=text: file.write(text.encode()))
     if plot_path is not None and report.cases:
         from scvi_codegen.benchmark.picture import plot_curves
 
@@ -159,14 +169,40 @@ def _sections(name: str) -> tuple[str, ...]:
     return found
 
 
-def _measured(names: Sequence[str], plan: Plan, say: Say) -> Report:
-    description = machine()
-    results: list[CaseResult | ResultTable] = []
+Result = CaseResult | ResultTable
+FAILED = "failed: "
+
+
+def _known(json_path: str) -> dict[str, Result]:
+    """The sections that a report on the disk has, by name; none if there is no such file."""
+    path = Path(json_path)
+    if not path.exists():
+        return {}
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        found: list[Result] = [
+            *map(CaseResult.from_data, data["cases"]),
+            *(ResultTable.from_data(each) for each in data["tables"] if not each["title"].startswith(FAILED)),
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StateError(f"{json_path} is no report that could be resumed: {type(error).__name__}: {error}") from None
+    return {each.name: each for each in found}
+
+
+def _reports(names: Sequence[str], known: Mapping[str, Result], plan: Plan, say: Say, show: Say) -> Iterator[Report]:
+    """All that is known so far, after each section; its text is shown as it grows."""
+    report = Report(machine=machine(), results=())
+    show(header_lines(report.machine))
     for name in names:
         try:
-            results.append(SECTIONS[name](plan, say))
+            result = known[name] if name in known else SECTIONS[name](plan, say)
         except KeyboardInterrupt:
-            return Report(machine=description, results=tuple(results), interrupted=name)
+            yield replace(report, interrupted=name)
+            break
         except ScviCodegenError as error:
-            results.append(ResultTable(name=name, title=f"failed: {error}", columns={}, rows=()))
-    return Report(machine=description, results=tuple(results))
+            result = ResultTable(name=name, title=f"{FAILED}{error}", columns={}, rows=())
+        report = replace(report, results=(*report.results, result))
+        show(f"\n{result.text()}")
+        yield report
+    if report.cases:
+        show(f"\n{LEGEND}")

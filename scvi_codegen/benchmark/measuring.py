@@ -20,7 +20,10 @@ from scvi_codegen.benchmark.curves import Point
 from scvi_codegen.benchmark.references import Reference, rms_error
 from scvi_codegen.errors import ScviCodegenError
 
-__all__ = ["Measurement", "measure"]
+__all__ = ["PEER_ERRORS", "Measurement", "measure"]
+
+PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
+"""What a peer of an unknown version, or without its compiler, may raise; it is told, and the others go on."""
 
 PATIENCE = 1.0
 """Seconds for a round over all states beyond which a contender is timed once only."""
@@ -113,7 +116,7 @@ def measure(
 def _attempt(record: _Record) -> None:
     try:
         record.round()
-    except (ArithmeticError, RuntimeError, ValueError, ScviCodegenError) as error:
+    except (*PEER_ERRORS, ScviCodegenError) as error:
         record.failure = f"{type(error).__name__}: {error}"
 
 

@@ -13,7 +13,7 @@ from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
 from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
-from scvi_codegen.benchmark.measuring import measure
+from scvi_codegen.benchmark.measuring import PEER_ERRORS, measure
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult
@@ -25,9 +25,6 @@ ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 """Names of the cases that are run as ensembles."""
 
 TRAJECTORIES = 64
-PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
-"""What a peer of an unknown version, or without its compiler, may raise; it is skipped by name."""
-
 Makers = dict[str, Callable[[], Iterable[Contender]]]
 """By the name of the peer."""
 

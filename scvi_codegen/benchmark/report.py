@@ -43,6 +43,21 @@ class CaseResult:
         """A block of the report for the terminal."""
         return _block(self)
 
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> CaseResult:
+        """What :meth:`data` gave; numbers that it had as null are none."""
+        found = [
+            {key: math.nan if value is None else value for key, value in each.items()} for each in data["measurements"]
+        ]
+        return cls(
+            name=data["name"],
+            span=data["span"],
+            dimension=data["dimension"],
+            accuracy=data["reference_accuracy"],
+            measurements=tuple(Measurement(**entries) for entries in found),
+            skipped=data["skipped"],
+        )
+
     def data(self) -> dict[str, Any]:
         """Everything, as data that ``json.dump`` takes; numbers that do not exist are null."""
         return {
@@ -123,6 +138,7 @@ def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:
 
 
 HEADER = ["", "setting", "time", "error", "compile", "default", "best", "peer", "at error", "options"]
+_FAILED = ["failed", *("-" for _ in HEADER[2:-1]), ""]
 LEGEND = """Times are processor times of stepping one trajectory to the end, medians; of an ensemble, the whole over the
 number of trajectories. Errors are those of q at the end, relative, in root mean square over the initial states. The
 setting shown is the fastest that reaches the error named. Ratios are times of others over that of the method, at equal
@@ -140,7 +156,8 @@ def header_lines(description: Mapping[str, Any]) -> str:
 
 def _block(result: CaseResult) -> str:
     title = f"{result.name}, T = {result.span:g}, m = {result.dimension} (reference accurate to {result.accuracy:.0e})"
-    text = lines_of([HEADER, *(_cells(row) for row in rows(result))])
+    good = {row.method: _cells(row) for row in rows(result)}
+    text = lines_of([HEADER, *(good.get(method, [method, *_FAILED]) for method in result.methods())])
     failures = [f"{found.method} {found.setting}: {found.failure}" for found in result.measurements if found.failure]
     notes = [f"skipped {name}: {why}" for name, why in result.skipped.items()]
     return "\n  ".join([title, *text, *failures, *notes])

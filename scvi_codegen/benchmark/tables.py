@@ -34,10 +34,21 @@ class ResultTable:
         cells = [[_cell(row.get(name), form) for name, form in self.columns.items()] for row in self.rows]
         return "\n  ".join([f"{self.name}: {self.title}", *lines_of([header, *cells]), *self.remarks])
 
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> ResultTable:
+        """What :meth:`data` gave."""
+        return cls(**{**data, "rows": tuple(data["rows"]), "remarks": tuple(data["remarks"])})
+
     def data(self) -> dict[str, Any]:
         """The same for JSON."""
         rows = [finite(dict(row)) for row in self.rows]
-        return {"name": self.name, "title": self.title, "rows": rows, "remarks": list(self.remarks)}
+        return {
+            "name": self.name,
+            "title": self.title,
+            "columns": dict(self.columns),
+            "rows": rows,
+            "remarks": list(self.remarks),
+        }
 
 
 def lines_of(cells: list[list[str]]) -> list[str]:

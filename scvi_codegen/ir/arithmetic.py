@@ -7,7 +7,8 @@ and complete enough that no separate search for common subexpressions is needed:
   so 3 mu r^-5 x and 3 mu r^-5 y share all but the last factor;
 * a sum is normalised to content 1 and a positive first term, so a - b, b - a and 2 a - 2 b are one node;
 * every negative power of x is built from 1/x and every half-integer power from sqrt(x); x^(-k/2) for k = 1, 3, 5, 7,
-  frequent in mechanics, are functions of their own, for which vectors have something faster.
+  frequent in mechanics, are functions of their own, for which vectors have something faster; odd quarters are these
+  times x^(1/4) or x^(-1/4), a root of a root.
 
 Nothing here changes a value: constants are exact and rounded when they are printed.
 ``tests/lowering/test_lowering.py`` reads kernels back and compares.
@@ -46,7 +47,7 @@ FUNCTIONS = {
 }
 
 
-INVERSE_ROOTS = {-k: f"inverse_root_{k}" for k in (1, 3, 5, 7)}
+INVERSE_ROOTS = {k: f"inverse_root_{k}" for k in (1, 3, 5, 7)}
 
 
 LARGEST_UNROLLED_POWER = 64
@@ -160,20 +161,25 @@ class _Graph:
         return self.node(("neg", (product,))) if negative else product
 
     def _power(self, base: sympy.Expr, exponent: sympy.Expr) -> int:
-        doubled = 2 * exponent
-        if not (doubled.is_Integer and abs(doubled) <= 2 * LARGEST_UNROLLED_POWER):
+        quarters = 4 * exponent
+        if not (quarters.is_Integer and abs(quarters) <= 4 * LARGEST_UNROLLED_POWER):
             return self.node(("pow", (self.read(base), self.read(exponent))))
-        x = self.read(base)
-        whole = int(doubled // 2)
-        if doubled in INVERSE_ROOTS:
-            return self.node((INVERSE_ROOTS[doubled], (x,)))
-        if not doubled % 2:
-            return self._whole(x, whole) if whole > 0 else self._whole(self._inverse(x), -whole)
-        root = self.node(("sqrt", (x,)))
-        if whole == 0:
+        x, halves = self.read(base), int(quarters / 2)
+        if quarters == 2 * halves:
+            return self._by_roots(x, halves)
+        quarter = self.node(("sqrt", (self._by_roots(x, 1 if quarters > 0 else -1),)))
+        return self.node(("*", (self._by_roots(x, halves), quarter))) if halves else quarter
+
+    def _by_roots(self, x: int, halves: int) -> int:
+        """x^(halves / 2), halves not 0."""
+        if -halves in INVERSE_ROOTS:
+            return self.node((INVERSE_ROOTS[-halves], (x,)))
+        whole, half = divmod(halves, 2)
+        root = self.node(("sqrt", (x,))) if half else None
+        if whole == 0 and root is not None:
             return root
         power = self._whole(x, whole) if whole > 0 else self._whole(self._inverse(x), -whole)
-        return self.node(("*", (power, root)))
+        return power if root is None else self.node(("*", (power, root)))
 
     def _inverse(self, x: int) -> int:
         return self.node(("/", (self.node(Constant(Fraction(1))), x)))

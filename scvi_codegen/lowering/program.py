@@ -7,7 +7,8 @@ and complete enough that no separate search for common subexpressions is needed:
   so 3 mu r^-5 x and 3 mu r^-5 y share all but the last factor;
 * a sum is normalised to content 1 and a positive first term, so a - b, b - a and 2 a - 2 b are one node;
 * every negative power of x is built from 1/x and every half-integer power from sqrt(x); x^(-k/2) for k = 1, 3, 5, 7,
-  frequent in mechanics, are functions of their own, for which vectors have something faster.
+  frequent in mechanics, are functions of their own, for which vectors have something faster; odd quarters are these
+  times x^(1/4) or x^(-1/4), a root of a root.
 
 Nothing here changes a value but by rounding; ``tests/test_lowering.py`` reads kernels back and compares.
 """

@@ -47,15 +47,26 @@ static long long rung_below(real h)
   return rung;
 }
 
-/* By how many rungs the next step is longer. The error is expected to go on growing as it did; where it fell, much of
- * that may have been luck. */
+/* The error of a curve, had its step been so many rungs longer. */
+static inline real error_at(real error, int rungs)
+{
+  for (; rungs > 0; rungs--)
+    error *= GROWTH;
+  for (; rungs < 0; rungs++)
+    error /= GROWTH;
+  return error;
+}
+
+/* By how many rungs the next step is longer, or shorter, an octave at most. The error is expected to go on growing as it
+ * did; where it fell, much of that may have been luck. */
 static int next_change(real error, real before, const error_limits *limits)
 {
-  const real expected = before > 0 && error > before ? error * smaller(error / before, GROWTH * GROWTH)
-                                                     : larger(error, before / (GROWTH * GROWTH));
-  if (expected > limits->most)
-    return expected > limits->most * GROWTH ? -2 : -1;
-  return expected < limits->fewer ? 2 : expected < limits->few;
+  const real expected =
+      before > 0 && error > before ? error * (error / before) : larger(error, before / (GROWTH * GROWTH));
+  int change = expected < limits->fewer ? 2 : expected < limits->few;
+  while (change > -OCTAVE && error_at(expected, change) > limits->most)
+    change--;
+  return change;
 }
 
 /* The length of the step at a rung, or the rest of the way where that is hardly longer, which then is the last. */

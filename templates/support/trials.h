@@ -35,11 +35,11 @@ static void try_first_step(run_memory *run, trial *now, const solver_options *op
 /* Shortens the step after a trial that failed, or whose error was too large; 0 if it is as good as nothing. */
 static int shorten(run_memory *run, const trial *now)
 {
-  real error = now->error;
-  int down = 0;
-  for (; down < MOST_DOWN && !(error <= now->limits.most); down++)
-    error /= GROWTH;
-  run->rung -= down > 1 ? down : 2;
+  int down = 2;
+  while (down < MOST_DOWN && !(error_at(now->error, -down) <= now->limits.most))
+    down++;
+  run->rung -= down;
+  run->error_before = error_at(run->error_before, -down);
   run->guess = 0;
   run->rejected++;
   return length_of(run->rung) > VANISHING * (MATH(fabs)(now->at.t) + REAL_EPSILON * MATH(fabs)(now->t_end - now->at.t));
@@ -70,11 +70,7 @@ static inline void choose_length(run_memory *run, const trial *now)
   run->change_before = run->change;
   run->change = change;
   run->rung += change;
-  run->error_before = now->error;
-  for (int k = change; k > 0; k--)
-    run->error_before *= GROWTH;
-  for (int k = change; k < 0; k++)
-    run->error_before /= GROWTH;
+  run->error_before = error_at(now->error, change);
 }
 
 /* What steps are chosen by: the error allowed to each, which their equations are then solved for. */

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -258,6 +259,16 @@ class TestReport:
         text = self.result.text()
         assert "skipped jitcode: not installed" in text
         assert "broken h=1: ArithmeticError: no" in text
+        (line,) = (line.split() for line in text.splitlines() if line.startswith("  broken  "))
+        assert line[:3] == ["broken", "failed", "-"]
+
+    def test_what_was_written_is_read_again(self):
+        table = ResultTable(name="t", title="x", columns={"a": ".1f"}, rows=({"a": 1.0}, {"a": None}), remarks=("so",))
+        for result in (self.result, table):
+            data = json.loads(json.dumps(result.data()))
+            again = type(result).from_data(data)
+            assert again.text() == result.text()
+            assert again.data() == data
 
     def test_json_schema(self):
         table = ResultTable(
@@ -352,11 +363,33 @@ class TestCommand:
         sections = {"one": lambda plan, say: done, "bad": fail, "two": interrupt, "three": interrupt}
         monkeypatch.setattr(bench, "SECTIONS", sections)
         path = tmp_path / "out.json"
-        found = bench.benchmark(json_path=str(path))
+        shown = []
+        found = bench.benchmark(json_path=str(path), show=shown.append)
+        assert [text.strip().splitlines()[0] for text in shown[1:]] == ["done: kept", "bad: failed: no"]
         assert (found.results[0], found.interrupted) == (done, "two")
         assert "bad: failed: no" in found.text()
         assert json.loads(path.read_text())["interrupted"] == "two"
         assert "done: kept" in found.text()
+
+    def test_each_section_is_written_when_measured_and_not_measured_again(self, tmp_path, monkeypatch):
+        path, measured = tmp_path / "out.json", []
+
+        def section(name, plan, say):
+            on_disk = json.loads(path.read_text())["tables"] if path.exists() else []
+            measured.append((name, [each["name"] for each in on_disk]))
+            if name == "two" and len(measured) == 2:
+                raise StateError("not yet")
+            return ResultTable(name=name, title="x", columns={"a": ""}, rows=({"a": name},))
+
+        monkeypatch.setattr(bench, "SECTIONS", {name: partial(section, name) for name in ("one", "two", "three")})
+        bench.benchmark(json_path=str(path))
+        assert measured == [("one", []), ("two", ["one"]), ("three", ["one", "two"])]
+        again = bench.benchmark(json_path=str(path), resume=True)
+        assert [name for name, _ in measured[3:]] == ["two"]
+        assert [result.name for result in again.results] == ["one", "two", "three"]
+        path.write_text("{}")
+        with pytest.raises(StateError, match="no report that could be resumed: KeyError: 'cases'"):
+            bench.benchmark(json_path=str(path), resume=True)
 
     def test_picture(self, tmp_path):
         pytest.importorskip("matplotlib")

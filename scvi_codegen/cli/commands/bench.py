@@ -19,9 +19,16 @@ __all__ = ["bench"]
 @click.option("--json", "json_path", type=click.Path(), metavar="FILE", help="All measurements as JSON.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
+@click.option("--resume", is_flag=True, help="Go on: what FILE of --json has is not measured again.")
 @click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
 def bench(
-    sections: tuple[str, ...], peers: str | None, json_path: str | None, plot: str | None, repeats: int, quick: bool
+    sections: tuple[str, ...],
+    peers: str | None,
+    json_path: str | None,
+    plot: str | None,
+    repeats: int,
+    resume: bool,
+    quick: bool,
 ) -> None:
     """Time this project and the installed peers in turn, and compare them at equal error.
 
@@ -33,19 +40,21 @@ def bench(
     (larger systems, from text to first step), mechanisms (of SymPy, beside lambdify and PyDy), held (bodies held by
     rods, beside MuJoCo), sums (over indices: lattices, fields, many bodies), growth (with their number of coordinates)
     or builds (other compilers and processors); by default all; kepler is both of its kind.
-    Install the peers with 'scvi-codegen[bench]'. Ctrl-C ends it with what was measured.
+    Install the peers with 'scvi-codegen[bench]'. Sections are printed, and written to the JSON, as they are measured;
+    Ctrl-C ends it with these, and with --resume it goes on from there.
 
     \b
     Examples:
       scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
       scvi-codegen bench drift hand-written --json measured.json
     """
+    if resume and json_path is None:
+        raise click.UsageError("--resume goes on from the FILE of --json: give it")
     for path, hint in ((json_path, "'--json'"), (plot, "'--plot'")):
         if path is not None:
             check_writable(Path(path), hint)
     names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
     plan, say = Plan(peers=names, repeats=repeats, quick=quick), partial(click.echo, err=True)
-    report = benchmark(sections, plan, json_path=json_path, plot_path=plot, say=say)
-    click.echo(report.text())
+    report = benchmark(sections, plan, json_path=json_path, plot_path=plot, resume=resume, say=say, show=click.echo)
     if report.interrupted:
         raise CommandFailure(f"interrupted in '{report.interrupted}'; what was measured before is above", INTERRUPTED)

@@ -21,7 +21,9 @@ __all__ = ["control_of", "control_of_sweep", "ladder_of"]
 
 RUNGS, REACH = 4, 2
 """Rungs an octave, and how many of them a step may be from the one before for its guess to be continued."""
-MANTISSAS = tuple(2.0 ** (k / RUNGS) for k in range(RUNGS))
+MANTISSAS = tuple(round(2.0 ** (k / RUNGS + 32)) / 2.0**32 for k in range(RUNGS))
+"""Of 32 bits. In 53 the square of the root of 2 is 2 and an ulp; what that does to a product by rounding depends on the
+leading digits alone, the same in every orbit, and adds up: 2e-17 to 7e-17 of Kepler's energy an orbit at e = 0.9."""
 
 
 def control_of(program: Program) -> Control | None:
