@@ -57,15 +57,16 @@ static inline int start_velocities(const step_data *step, lanes (*z)[M])
   return status;
 }
 
-/* How the sweeps of a step come on. */
+/* How the sweeps of a step come on: the first change, the last two; the one that they were stirred at, if any, and for
+ * how many sweeps they have been. */
 typedef struct {
-  double first, last;
-  int status;
+  double first, last, before, stirred;
+  int status, since;
 } progress;
 
 static inline progress before_sweeps(void)
 {
-  const progress none = {0.0, INFINITY, 0};
+  const progress none = {0.0, INFINITY, INFINITY, 0.0, 0, 0};
   return none;
 }
 
@@ -79,8 +80,38 @@ static inline void take_change(progress *now, double change, const solver_option
 {
   now->status = sweep_status(change, now->last, options, k);
   now->first = k == 0 ? change : now->first;
+  now->before = now->last;
   now->last = change;
   report->iterations++;
+}
+
+#define STIR 1e3 /* times the last change, which has to shrink again to about what it was, */
+#define STIRRED_SWEEPS 3 /* in so many sweeps: */
+#define ABOUT 16.0 /* fourfold, squared */
+#define STIRRED_LEVEL 1e-16 /* changes below 1e-8 of the state */
+
+/* Whether sweeps that shrink no longer are at rest, or what else is to be done with them: 1, to stir them. */
+static SELDOM int tell_rest(progress *now, const solver_options *options, int k)
+{
+  if (now->stirred > 0.0) {
+    now->since++;
+    now->status = now->last <= ABOUT * now->stirred ? 1 : -(now->since == STIRRED_SWEEPS);
+    return 0;
+  }
+  if (options->absolute || !(now->last < STIRRED_LEVEL) || k + STIRRED_SWEEPS >= options->max_iterations)
+    return 0;
+  now->stirred = now->last;
+  now->last = INFINITY;
+  now->status = 0;
+  return 1;
+}
+
+/* Whether the last change is to be magnified, to see whether it shrinks. Where masses are nearly singular, rounding
+ * alone changes velocities by more than any fixed level; but sweeps that contract slowly stop shrinking there, too. What
+ * was rounding is gone in a sweep or two, what was slow is not. */
+static inline int stirs(progress *now, const solver_options *options, int k)
+{
+  return now->status <= 0 && (now->stirred > 0.0 || now->last >= now->before) ? tell_rest(now, options, k) : 0;
 }
 
 /* What the sweeps came to. */

@@ -58,15 +58,17 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   if (*steps > 0)
     memcpy(m, past + CURVE_MEMORY, sizeof m);
   for (int k = 0; needs_sweep(&now); k++) {
-    lanes change = lanes_of(0.0), r[M], gamma[M];
+    lanes change = lanes_of(0.0), r[M], gamma[M], corrected[M];
     double total, misfit[M], last = now.last;
     evaluate_nodes(step, &curve, m, node, mass);
     factor_mass(mass);
     for (int i = 0; i < M; i++)
       r[i] = h * node[i];
     solve_mass(mass, r);
-    for (int i = 0; i < M; i++)
-      curve.z[0][i] -= r[i];
+    for (int i = 0; i < M; i++) {
+      corrected[i] = -r[i];
+      curve.z[0][i] += corrected[i];
+    }
     if (k == 0)
       measure_curve(step, &curve, options, inverse_size);
     for (int i = 0; i < M; i++) {
@@ -91,6 +93,9 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     }
     total += lanes_total(change);
     take_change(&now, total, options, k, report);
+    if (stirs(&now, options, k))
+      for (int i = 0; i < M; i++)
+        curve.z[0][i] += STIR * corrected[i];
     if (settled && now.status == 0) {
       now.status = comes_to_rest(total, last, options, ROUNDING_MARGIN);
     } else if (now.status > 0 && !settled) { /* once more: the rate of contraction shows late */

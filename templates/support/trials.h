@@ -14,18 +14,24 @@ static int rungs_up(const trial *now)
 }
 
 /* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail, and
- * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. Or all that
- * such a step shows is rounding, which looks like a large error: none counts before the first that is small enough. */
+ * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. Or rounding
+ * is all that it shows, which looks like an error of any size: that of a curve rises by as much as is expected. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
+  real shorter = run->h != 0 ? REAL_MIN : (real)INFINITY;
   int found = 0, up = 1;
   run->rung = rung_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
   try_step(run, now, 0, options, report);
   while (!now->last && up > 0) {
-    const int failed = !(now->error < INFINITY);
-    found = found || now->error <= now->limits.most;
-    up = !found || (failed && SHORT_STEPS_FAIL) ? MOST_UP : rungs_up(now);
+    const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
+    const int as_expected = now->error > error_at(shorter, up / 2) && now->error < error_at(shorter, up + 1);
+    const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
+    found = found || small;
+    up = small ? rungs_up(now) : 0;
+    if (up == 0 && !(found && rises))
+      up = MOST_UP;
+    shorter = now->error;
     run->rung += up;
     if (up > 0)
       try_step(run, now, 0, options, report);
