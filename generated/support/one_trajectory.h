@@ -107,8 +107,8 @@ static SELDOM int tell_rest(progress *now, const solver_options *options, int k)
 }
 
 /* Whether the last change is to be magnified, to see whether it shrinks. Where masses are nearly singular, rounding
- * alone changes velocities by more than any fixed level; but sweeps that contract slowly stop shrinking there, too. What
- * was rounding is gone in a sweep or two, what was slow is not. */
+ * alone changes velocities by more than any fixed level; but sweeps that contract slowly stop shrinking there, too.
+ * What was rounding is gone in a sweep or two, what was slow is not. */
 static inline int stirs(progress *now, const solver_options *options, int k)
 {
   return now->status <= 0 && (now->stirred > 0.0 || now->last >= now->before) ? tell_rest(now, options, k) : 0;
