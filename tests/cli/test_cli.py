@@ -242,6 +242,14 @@ class TestChoices:
             ("kepler -o no/orbit.npz", "there is no folder 'no'"),
             ("kepler --plot orbit.gif", "saved as .png or .svg"),
             ("relativistic-particle --velocity 2", "q = "),
+            ("kepler --tolerance 1e-6 --advise 1e-6", "--tolerance and --advise exclude each other"),
+            ("kepler --advise 1e-6 --step 0.1", "--advise chooses the step: leave out --step"),
+            ("kepler --advise 1e-6 --monitor distance --step 0.1", "--advise chooses the step: leave out --step"),
+            ("kepler --advise 1e-6 --monitor distance", "give --tolerance in place of --advise"),
+            ("kepler -o orbit.run --plot orbit.png", "--plot is for a trajectory in memory, not for a run in a folder"),
+            ("kepler --ensemble states.csv --plot orbit.png", "--plot is for one trajectory, not for --ensemble"),
+            ("kepler --ensemble states.csv --advise 1e-6", "--advise is for one trajectory, not for --ensemble"),
+            ("kepler --ensemble states.csv --monitor distance --step 0.1", "every trajectory has its own times"),
         ],
     )
     def test_mistakes_are_usage_errors(self, words, message):
