@@ -397,6 +397,23 @@ def test_the_compiler_from_the_wheel_compiles(monkeypatch):
     assert building.load(source(), flags=building.TUNED_FLAGS).lib.tiny_answer() == 42.0
 
 
+WITHOUT_VECTOR_FUNCTIONS = """#!/bin/sh
+case "$*" in *-lmvec*) echo "no libmvec here" >&2; exit 1 ;; esac
+exec cc "$@"
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="the script calls cc")
+def test_a_machine_without_vector_functions_computes_by_those_of_numbers(tmp_path, monkeypatch):
+    script = tmp_path / "plain-cc"
+    script.write_text(WITHOUT_VECTOR_FUNCTIONS)
+    script.chmod(0o755)
+    monkeypatch.setenv("CC", str(script))
+    commands = compiler_runs(monkeypatch)
+    assert building.load(source(), flags=building.TUNED_FLAGS).lib.tiny_answer() == 42.0
+    assert "-lmvec" not in commands[-1]
+
+
 CROSS_COMPILER = """#!/bin/sh
 cc "$@" || exit
 for last; do :; done
