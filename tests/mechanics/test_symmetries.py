@@ -18,6 +18,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.symmetry import invariants
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -611,3 +612,19 @@ def test_headers_say_what_is_conserved():
 def test_hamiltonians_without_lagrangian_that_are_free():
     system = HamiltonianSystem.from_text(name="shear", coordinates=["q"], hamiltonian="p_q*c", parameters={"c": 2.0})
     assert set(formulas(system).values()) >= {"p_q"}
+
+
+@pytest.mark.parametrize("smallest", [0.0, 1e-12, 0.9e-9, 1.1e-9, 1e-6, 1.0])
+def test_singular_values_are_called_large_only_if_they_are(smallest):
+    rng = np.random.default_rng(7)
+    left, right = (np.linalg.qr(rng.normal(size=(size, size)))[0] for size in (50, 40))
+    matrix = left[:, :40] * np.append(np.geomspace(1.0, max(smallest, 1e-3), 39), smallest) @ right
+    said = invariants._all_larger(matrix, 1e-9)
+    assert not said or smallest > 1e-9
+    assert said or smallest < 1e-6
+
+
+def test_where_nothing_is_conserved_no_singular_values_are_computed(monkeypatch):
+    tilted = particle("sin(x*y) + x**4 + cos(y) + x*cos(t)")
+    monkeypatch.setattr(np.linalg, "svd", None)
+    assert symmetries(tilted) == ()
