@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import time
 from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
 import pytest
 import sympy
+from counting import at_most
 from sympy import Symbol
 
 from scvi_codegen.compiler import compile_stepper, generate_source
@@ -338,9 +338,8 @@ def test_searching_takes_no_time_to_speak_of():
     for name in (*PROBLEMS, "fput-chain:64"):
         system = problem(name).system
         symmetries.cache_clear()
-        began = time.process_time()
-        symmetries(system)
-        assert time.process_time() - began < 1.0, name  # 0.1 s measured for the slowest
+        with at_most(1_000_000):  # the slowest takes 400,000, a tenth of a second
+            symmetries(system)
 
 
 # What is given.

@@ -331,9 +331,9 @@ def test_processes_that_race_into_an_empty_cache_all_succeed_with_one_entry(cach
     processes = [context.Process(target=racer, args=(str(cache), barrier, results)) for _ in range(6)]
     for process in processes:
         process.start()
-    assert [results.get(timeout=60) for _ in processes] == [42.0] * 6
+    assert [results.get(timeout=600) for _ in processes] == [42.0] * 6
     for process in processes:
-        process.join(timeout=60)
+        process.join(timeout=600)
         assert process.exitcode == 0
     (entry,) = entries(cache)
     assert building._is_intact(entry)
