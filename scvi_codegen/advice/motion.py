@@ -130,17 +130,12 @@ def solve_motion(
     p = stepper.momenta_given(q, given, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, wish, (q, p, end - start), along)
-    steps = _steps(stepper, start, end, plan)
-    status, message, failure = REACHED, "The end of the span was reached.", None
+    told = {**_steps(stepper, start, end, plan), **along, "events": events, "t_eval": None if dense_output else asked}
     try:
-        trajectory = stepper.integrate(q, p, **steps, **along, events=events, t_eval=None if dense_output else asked)
+        trajectory = stepper.integrate(q, p, **told)
+        status, message = _outcome(trajectory, plan)
     except StepFailedError as error:
-        status, message, trajectory, failure = FAILED, str(error), Trajectory.before(error), error
-    ended_by = trajectory.ended_by
-    if ended_by is not None and failure is None:
-        status, message = EVENT, f"The terminal event '{ended_by.function}' was met."
-    if failure is None and (broken := plan.broken(trajectory)):
-        status, message = BROKEN, broken
+        trajectory, status, message = Trajectory.before(error), FAILED, str(error)
     return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
 
 
@@ -242,6 +237,15 @@ def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[st
         return {"h": math.copysign(checked_step(plan.h), sign), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}
+
+
+def _outcome(trajectory: Trajectory, plan: _Chosen) -> tuple[int, str]:
+    """Status and message of a run none of whose steps failed."""
+    if broken := plan.broken(trajectory):
+        return BROKEN, broken
+    if trajectory.ended_by is not None:
+        return EVENT, f"The terminal event '{trajectory.ended_by.function}' was met."
+    return REACHED, "The end of the span was reached."
 
 
 def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, status: int, message: str) -> Motion:

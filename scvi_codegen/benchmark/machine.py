@@ -9,7 +9,8 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-from scvi_codegen.native.building import TUNED_FLAGS, find_compiler
+from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.version import __version__
 
 __all__ = ["machine"]

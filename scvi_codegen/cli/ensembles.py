@@ -17,10 +17,10 @@ from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble_work import driven_work
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
@@ -92,7 +92,7 @@ def _work(
     common: dict[str, Any] = {"every": model.every, "t": model.t, "parameters": states.parameters, "options": options}
     if model.system.inputs:
         inputs = model.all_inputs()
-        return DrivenEnsemble.of(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
+        return driven_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
         return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance or None, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)

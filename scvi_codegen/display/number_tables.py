@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import singledispatch
 from typing import TypeAlias
 
 import sympy
@@ -20,6 +21,8 @@ __all__ = ["NumberTable", "Part", "decimal", "number_table", "numbers_html", "po
 
 Part: TypeAlias = Nodes | Quadrature | Tableau
 """What the numbers of a method are made from."""
+_Column: TypeAlias = tuple[str, Vector, Sequence[sympy.Expr] | None]
+"""Its heading, its numbers and, where they are known, their exact forms."""
 SHORT = 40
 """Characters of an exact form that is shown."""
 SIGNIFICANT = 17
@@ -42,21 +45,30 @@ class NumberTable:
     rows: tuple[tuple[str | sympy.Expr, ...], ...]
 
 
+@singledispatch
 def number_table(part: Part) -> NumberTable:
     """All numbers of a part of a method."""
-    if isinstance(part, Tableau):
-        return _tableau_table(part)
-    if isinstance(part, Nodes):
-        exact = exact_points(part)
-        columns, series = [("node", part.points, exact)], range(len(part.points))
-        title = f"Nodes: {part.name}, degree {part.degree}"
-    else:
-        rule = exact_rule(part)
-        columns = [("point", part.points, rule and rule[0]), ("weight", part.weights, rule and rule[1])]
-        columns += [(f"weight of derivative {k}", w, None) for k, w in enumerate(part.derivative_weights, 1)]
-        series = range(1, len(part) + 1)
-        title = f"Quadrature: {part.name}, of order {part.order}"
-    written = [written for name, values, exact in columns for written in _columns(name, values, exact)]
+    raise TypeError(f"{part!r} has no numbers to show")
+
+
+@number_table.register
+def _(nodes: Nodes) -> NumberTable:
+    series = range(len(nodes.points))
+    return _listed(f"Nodes: {nodes.name}, degree {nodes.degree}", series, [("node", nodes.points, exact_points(nodes))])
+
+
+@number_table.register
+def _(quadrature: Quadrature) -> NumberTable:
+    points, weights = exact_rule(quadrature) or (None, None)
+    columns: list[_Column] = [("point", quadrature.points, points), ("weight", quadrature.weights, weights)]
+    columns += [(f"weight of derivative {k}", w, None) for k, w in enumerate(quadrature.derivative_weights, 1)]
+    title = f"Quadrature: {quadrature.name}, of order {quadrature.order}"
+    return _listed(title, range(1, len(quadrature) + 1), columns)
+
+
+def _listed(title: str, series: range, columns: Sequence[_Column]) -> NumberTable:
+    """A row a point, by its number in the ``series``."""
+    written = [written for column in columns for written in _columns(*column)]
     return NumberTable(
         title=title,
         columns=("", *(name for name, _ in written)),
@@ -102,7 +114,8 @@ def _columns(
     yield name, tuple(map(decimal, values))
 
 
-def _tableau_table(tableau: Tableau) -> NumberTable:
+@number_table.register
+def _(tableau: Tableau) -> NumberTable:
     exact = exact_tableau(tableau)
     rows: list[tuple[str | sympy.Expr, ...]]
     if exact is not None and all(short(x) for part in (*exact[0], *exact[1:]) for x in part):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.files.labelled import Labelled, imported, missing, write_hdf5, write_zarr
+from scvi_codegen.files.labelled import CHUNK_BYTES, Labelled, imported, missing, write_hdf5, write_zarr
 
 if TYPE_CHECKING:
     import pandas
@@ -32,7 +32,6 @@ Array = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, Array, Array, NDArray[np.int32]]
 """Some of the states, one after the other: t (n,), q (n, m), p (n, m), iterations (n,)."""
 
-CHUNK_BYTES = 2**24
 COLUMNS = ("t", "q", "p", "iterations")
 
 

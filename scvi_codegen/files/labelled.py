@@ -23,9 +23,10 @@ from scvi_codegen.errors import MissingLibraryError, StateError
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Labelled", "checked_units", "imported", "missing", "to_dataset", "write_hdf5", "write_zarr"]
+__all__ = ["CHUNK_BYTES", "Labelled", "checked_units", "imported", "missing", "to_dataset", "write_hdf5", "write_zarr"]
 
 CHUNK_BYTES = 2**24
+"""Of what is in memory at a time, and of a chunk of a file."""
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 LONG_NAMES = {

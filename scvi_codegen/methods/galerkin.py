@@ -36,7 +36,7 @@ from scvi_codegen.tables.basis import next_step
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import Quadrature
-from scvi_codegen.tables.spaces import CurveSpace, Polynomials, Trigonometric
+from scvi_codegen.tables.spaces import CurveSpace
 
 __all__ = ["SVI"]
 
@@ -76,7 +76,7 @@ class SVI(Method):
         object.__setattr__(self, "space", resolve_space(self.space))
         own = self.curves.default_rule(self.degree) if self.quadrature is None else self.quadrature
         object.__setattr__(self, "quadrature", resolve_quadrature(own, self.degree))
-        if self.nodes is not None and not isinstance(self.curves, Polynomials):
+        if self.nodes is not None and not self.curves.nodal:
             raise MethodError(f"nodes parametrise polynomials, not {self.curves.name}: leave them out")
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
         size = self.curves.dimension(self.degree)
@@ -109,13 +109,13 @@ class SVI(Method):
     @property
     def name(self) -> str:
         """``svi-<degree>-<quadrature>[-<curves>]``."""
-        own = [] if isinstance(self.curves, Polynomials) else [self.curves.name]
+        own = [] if self.curves.nodal else [self.curves.name]
         return "-".join(["svi", str(self.degree), self.rule.name, *own]).replace(":", "-").replace(" ", "-")
 
     @property
     def title(self) -> str:
         """One line for people."""
-        own = "" if isinstance(self.curves, Polynomials) else f" {self.curves.name},"
+        own = "" if self.curves.nodal else f" {self.curves.name},"
         return f"Galerkin spectral variational integrator,{own} degree {self.degree}, {self.rule.name}"
 
     @property
@@ -154,7 +154,7 @@ class SVI(Method):
     @property
     def exactness(self) -> Exactness:
         """Of the curves; with as many points as the degree and the highest order all that Gauss methods conserve."""
-        if not isinstance(self.curves, Polynomials):
+        if not self.curves.nodal:
             return Exactness(curve=0)
         gauss = len(self.rule) == self.degree and self.rule.order == 2 * self.degree
         return Exactness(polynomials=2 * gauss, curve=self.degree, quadrature=self.rule.order)
@@ -162,18 +162,18 @@ class SVI(Method):
     @property
     def frequency(self) -> float | None:
         """That of trigonometric curves."""
-        return self.curves.frequency if isinstance(self.curves, Trigonometric) else None
+        return self.curves.fitted
 
     @property
     def parts(self) -> tuple[Part, ...]:
         """Nodes of polynomials, and the quadrature along the step."""
-        return (self.node_set, self.rule) if isinstance(self.curves, Polynomials) else (self.rule,)
+        return (self.node_set, self.rule) if self.curves.nodal else (self.rule,)
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
         assert isinstance(self.quadrature, Quadrature)
         common: dict[str, str | int] = {"method": "svi", "degree": self.degree, "quadrature": self.quadrature.name}
-        if isinstance(self.curves, Polynomials):
+        if self.curves.nodal:
             return common | {"nodes": self.node_set.name}
         return common | {"space": self.curves.name}
 
@@ -203,7 +203,7 @@ class SVI(Method):
 
         Of curves other than polynomials, and of quadratures with derivatives, the compiled equations, all digits kept.
         """
-        if not isinstance(self.curves, Polynomials) or self.rule.derivative_weights:
+        if not self.curves.nodal or self.rule.derivative_weights:
             return self._equations(system, rounded=False)
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))

@@ -1,8 +1,8 @@
-"""C text to a loaded library: compilers, the cache, cffi.
+"""C text to a loaded library: the compiler's work, the cache, cffi.
 
 An integrator is compiled once into a shared library, and its declarations once into cffi's description of them (ABI
 mode: no compiled binding, so no headers of Python, at the price of .2 microseconds a call). Both are kept in the user's
-cache folder under a name made from everything that determines them: text, compiler, flags, cffi, processor. They are
+cache folder under a name made from everything that determines them (:mod:`scvi_codegen.native.fingerprint`). They are
 built in a temporary folder inside the cache and renamed into place, so processes may race without locks; what does not
 match its recorded checksum is built anew. A cache that cannot be written, or that others can write, falls back to a
 temporary folder (:mod:`scvi_codegen.files.cache`).
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import atexit
 import hashlib
-import importlib.util
 import json
 import os
 import platform
@@ -20,18 +19,14 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
-
-import _cffi_backend
 
 from scvi_codegen.errors import BuildError
 from scvi_codegen.files.cache import (
@@ -44,6 +39,8 @@ from scvi_codegen.files.cache import (
     touch,
     trusted_folder,
 )
+from scvi_codegen.native.compilers import another_compiler, find_compiler, from_wheel
+from scvi_codegen.native.fingerprint import FLAGS_VARIABLE, fingerprint
 from scvi_codegen.native.processes import running
 from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.source import Source
@@ -55,10 +52,7 @@ __all__ = [
     "TUNED_FLAGS",
     "Library",
     "cache_folder",
-    "compiler_title",
-    "find_compiler",
     "fingerprint",
-    "from_wheel",
     "load",
 ]
 
@@ -82,9 +76,6 @@ become a heap of scalars (leapfrog of 8 masses: half as long again). The lanes o
 WRITTEN_OUT = frozenset({"support/newton_solver.h", "support/shooting_sweep.h"})
 """Steps of one trajectory whose short loops, over unknowns or functions of points, take a tenth longer as loops."""
 
-FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
-"""Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
-WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
 COMPILE_SECONDS = 600
 NOT_RUN = (126, 127)
 ATTEMPTS = 3
@@ -104,34 +95,6 @@ class Library(NamedTuple):
     path: Path
 
 
-def find_compiler() -> tuple[str, ...]:
-    """The command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel.
-
-    Raises:
-        BuildError: if there is none.
-    """
-    chosen = os.environ.get("CC")
-    if chosen:
-        command = tuple(shlex.split(chosen))
-        if not command or shutil.which(command[0]) is None:
-            raise BuildError(f"the compiler named by the environment variable CC ({chosen!r}) was not found")
-        return command
-    for name in ("cc", "gcc", "clang"):
-        if shutil.which(name):
-            return (name,)
-    if importlib.util.find_spec("ziglang"):
-        return (sys.executable, "-m", "ziglang", "cc")
-    raise BuildError(
-        "no C compiler was found; install one (Debian, Ubuntu: apt install gcc libc6-dev; "
-        f"macOS: xcode-select --install), or {WHEEL}"
-    )
-
-
-def from_wheel(compiler: tuple[str, ...]) -> bool:
-    """Whether a command is the compiler of the extra ``compiler``."""
-    return "ziglang" in compiler
-
-
 def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
     """The library of a source, from memory, from the cache or built now.
 
@@ -141,71 +104,11 @@ def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
         BuildError: without a compiler, or if it refuses the text.
     """
     compiler = find_compiler()
-    key = _key(source, compiler, flags)
+    key = fingerprint(source, flags=flags)
     with _locks.setdefault(key, threading.Lock()):
         if key not in _loaded:
             _loaded[key] = _load_or_build(source, compiler, flags, f"_scvi_{key}")
         return _loaded[key]
-
-
-def fingerprint(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> str:
-    """24 digits made from all that determines the compiled code: text, compiler, flags, cffi, processor."""
-    return _key(source, find_compiler(), flags)
-
-
-def compiler_title() -> str:
-    """The first line that the compiler says of its version."""
-    return _title_of(find_compiler())
-
-
-@cache
-def _title_of(command: tuple[str, ...]) -> str:
-    result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
-    return (result.stdout.splitlines() or [" ".join(command)])[0]
-
-
-def _key(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
-    parts = [
-        json.dumps([each.to_record() for each in source.sources]),
-        " ".join(compiler),
-        _compiler_version(compiler),
-        " ".join(flags),
-        os.environ.get(FLAGS_VARIABLE, ""),
-        _cffi_backend.__version__,
-        _processor() if _tuned(compiler, flags) else platform.machine(),
-    ]
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
-
-
-def _tuned(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
-    """Whether any flag, wherever it stands, asks for the instructions of this processor (-march, -mcpu, -mtune)."""
-    return "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
-
-
-@cache
-def _compiler_version(compiler: tuple[str, ...]) -> str:
-    """What tells compilers apart: the file that is run, or what a command of several words says of itself."""
-    if len(compiler) == 1:
-        file = Path(shutil.which(compiler[0]) or compiler[0]).resolve()
-        with suppress(OSError):
-            status = file.stat()
-            return f"{file} {status.st_size} {status.st_mtime_ns}"
-    try:
-        result = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise BuildError(f"the compiler {' '.join(compiler)!r} does not run: {error}") from error
-    return result.stdout
-
-
-@cache
-def _processor() -> str:
-    """What ``-march=native`` depends on."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}"
-    wanted = ("model name", "flags", "Features", "CPU part")
-    return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
 
 
 def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> Library:
@@ -388,14 +291,7 @@ def _finished(command: list[str], folder: Path) -> Iterator[None]:
         except subprocess.TimeoutExpired as error:
             raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
     if process.returncode in NOT_RUN:
-        raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}{_another(command)}")
+        raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}{another_compiler(command)}")
     if process.returncode:
         shown = "\n".join(errors.splitlines()[:30])
-        raise BuildError(f"the C compiler refused the text\n{' '.join(command)}\n{shown}{_another(command)}")
-
-
-def _another(command: list[str]) -> str:
-    """What to try where this compiler, its headers or its linker are not whole."""
-    if from_wheel(tuple(command)):
-        return ""
-    return f"\nif this compiler is not whole, {WHEEL}, and set CC='python -m ziglang cc'"
+        raise BuildError(f"the C compiler refused the text\n{' '.join(command)}\n{shown}{another_compiler(command)}")

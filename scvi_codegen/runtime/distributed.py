@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.driven_to_ends import driven_work
 from scvi_codegen.runtime.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
-from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble_work import driven_work, ensemble_work
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -78,20 +78,15 @@ def integrate_ensemble(
         StateError: on wrong shapes, names or numbers, before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
-    common: dict[str, Any] = {"every": every, "t": t, "parameters": parameters, "options": options}
+    start: dict[str, Any] = {"velocity": velocity, "t": t, "parameters": parameters, "options": options, "every": every}
+    way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
     work: Ensemble | EnsembleToEnds
-    if inputs is not None:
-        if t_eval is not None:
-            raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
-        way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
-        work = driven_work(stepper, q, p, velocity=velocity, inputs=inputs, **way, **common)
-    elif h is None and steps is None and t_end is not None:
-        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
-        work = EnsembleToEnds(stepper, q, p, t_end=t_end, tolerance=tolerance, t_eval=t_eval, **common)
+    if inputs is None:
+        work = ensemble_work(stepper, q, p, t_eval=t_eval, **way, **start)
+    elif t_eval is None:
+        work = driven_work(stepper, q, p, inputs=inputs, **way, **start)
     else:
-        p = momenta_of_each(stepper, q, p, velocity, t, parameters)
-        h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
-        work = Ensemble(stepper, q, p, h=h, steps=steps, **common)
+        raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())

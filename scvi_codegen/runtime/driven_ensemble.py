@@ -10,20 +10,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.driven import (
     Input,
     Stretch,
-    checked_inputs,
-    entered,
     later,
     parameters_at,
     part_of_inputs,
@@ -32,39 +29,12 @@ from scvi_codegen.runtime.driven import (
 from scvi_codegen.runtime.ensemble import Change, Ensemble, Portion
 from scvi_codegen.runtime.ensemble_states import (
     EnsembleParameters,
-    checked_ensemble,
-    momenta_of_each,
-    parameters_of_each,
 )
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.inputs import Array, check_left_to_inputs, columns_of_inputs
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["DrivenEnsemble", "driven_start"]
-
-
-def driven_start(
-    stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
-    velocity: ArrayLike | None,
-    inputs: Mapping[str, Any],
-    way: tuple[float, float],
-    parameters: EnsembleParameters,
-) -> tuple[dict[str, Input], ArrayLike, Array]:
-    """Inputs, momenta, and (k, number of parameters) at the start of a ``way`` from a time to one.
-
-    Raises:
-        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and where a monitor chooses steps.
-    """
-    if stepper.interface.monitor:
-        raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
-    count = len(checked_ensemble(stepper, q, q)[0])
-    data = checked_inputs(stepper.interface, inputs, count)
-    check_left_to_inputs(stepper.interface, parameters)
-    own = parameters_of_each(stepper, parameters, count)
-    start = parameters_at(stepper.parameters, own, data, entered(*way))
-    return data, momenta_of_each(stepper, q, p, velocity, way[0], start), start
+__all__ = ["DrivenEnsemble"]
 
 
 class DrivenEnsemble(Ensemble):
@@ -99,24 +69,6 @@ class DrivenEnsemble(Ensemble):
         self.numbers = sorted({*range(0, steps + 1, every), *self.ends})
         super().__init__(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
         self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
-
-    @classmethod
-    def of(
-        cls,
-        stepper: Integrator,
-        q: ArrayLike,
-        p: ArrayLike | None,
-        *,
-        inputs: Mapping[str, Any],
-        t_end: float,
-        velocity: ArrayLike | None = None,
-        t: float = 0.0,
-        parameters: EnsembleParameters = None,
-        **others: Any,
-    ) -> DrivenEnsemble:
-        """From inputs and initial states as users give them."""
-        data, p, start = driven_start(stepper, q, p, velocity, inputs, (t, t_end), parameters)
-        return cls(stepper, q, p, data, t=t, t_end=t_end, parameters=start, **others)
 
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""

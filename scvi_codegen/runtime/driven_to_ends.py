@@ -9,24 +9,21 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.driven import (
     Input,
-    end_of,
     ends_on_the_way,
     entered,
     parameters_at,
     part_of_inputs,
     stretches,
 )
-from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble, driven_start
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, LaneStates
@@ -38,34 +35,7 @@ from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.runtime.workers import Heed
 
-__all__ = ["DrivenToEnds", "driven_work"]
-
-
-def driven_work(
-    stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike | None,
-    *,
-    h: float | None,
-    steps: int | None,
-    t_end: ArrayLike | None,
-    tolerance: float | None,
-    t: float,
-    **others: Any,
-) -> DrivenEnsemble | DrivenToEnds:
-    """An ensemble with inputs as users ask for it: by steps of h, or to t_end by steps that choose their length."""
-    if h is not None:
-        if tolerance is not None:
-            raise StateError("a tolerance is for steps that choose their length: give t_end, and neither h nor steps")
-        if t_end is not None and np.ndim(t_end):
-            raise StateError("steps of h lead all trajectories to one t_end; leave out h for an end of each")
-        end = end_of(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))
-        return DrivenEnsemble.of(stepper, q, p, h=h, t_end=end, t=t, **others)
-    if t_end is None or steps is not None:
-        raise StateError(
-            "give h and steps or t_end, for steps of h, or t_end alone, for steps that choose their length"
-        )
-    return DrivenToEnds.of(stepper, q, p, t_end=t_end, tolerance=tolerance, t=t, **others)
+__all__ = ["DrivenToEnds"]
 
 
 class DrivenToEnds(EnsembleToEnds):
@@ -102,25 +72,6 @@ class DrivenToEnds(EnsembleToEnds):
         for goal in self.goals:
             ends_on_the_way(self.t0, goal.t_end, data)
         self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
-
-    @classmethod
-    def of(
-        cls,
-        stepper: Integrator,
-        q: ArrayLike,
-        p: ArrayLike | None,
-        *,
-        inputs: Mapping[str, Any],
-        t_end: ArrayLike,
-        velocity: ArrayLike | None = None,
-        t: float = 0.0,
-        parameters: EnsembleParameters = None,
-        **others: Any,
-    ) -> DrivenToEnds:
-        """From inputs and initial states as users give them."""
-        towards = float(real_array(t_end, "t_end").flat[0])
-        data, p, start = driven_start(stepper, q, p, velocity, inputs, (t, towards), parameters)
-        return cls(stepper, q, p, data, t=t, t_end=t_end, parameters=start, **others)
 
     def part(self, part: slice) -> dict[str, object]:
         """Arguments by name that make the ensemble of a part of the trajectories."""

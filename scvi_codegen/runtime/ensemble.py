@@ -40,33 +40,12 @@ __all__ = [
     "Ensemble",
     "LaneBlock",
     "Portion",
-    "integrate_ensemble",
 ]
 
 FIRST_PORTION = 64
 """Steps of a block before the first look at the clock."""
 PORTION_SECONDS = 0.02
 """Time between looks, in a block, for a wish to stop."""
-
-
-def integrate_ensemble(
-    stepper: Integrator,
-    q: ArrayLike,
-    p: ArrayLike,
-    *,
-    h: float,
-    steps: int,
-    every: int = 1,
-    t: float = 0.0,
-    parameters: EnsembleParameters = None,
-    options: SolverOptions | None = None,
-    progress: Callable[[int], None] | None = None,
-    threads: int | None = None,
-) -> EnsembleTrajectory:
-    """See :meth:`scvi_codegen.runtime.stepper.Stepper.integrate_ensemble`."""
-    work = Ensemble(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
-    work.run(progress=progress, threads=threads)
-    return work.result()
 
 
 class Change(NamedTuple):

@@ -28,17 +28,7 @@ from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.runtime.workers import Heed, run_each
 
-__all__ = ["EnsembleToEnds", "steps_of_ensemble"]
-
-
-def steps_of_ensemble(h: float | None, steps: int | None, **others: object) -> tuple[float, int]:
-    """The step and number of steps of an ensemble that does not go to its ends by steps of their own lengths."""
-    given = [name for name, value in others.items() if value is not None]
-    if h is None or steps is None:
-        raise StateError("give h and steps, for steps of one length, or t_end, for steps that choose theirs")
-    if given:
-        raise StateError(f"{given[0]} is for steps that choose their length: give t_end, and neither h nor steps")
-    return h, steps
+__all__ = ["EnsembleToEnds"]
 
 
 class LaneStates(Protocol):

@@ -13,11 +13,9 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
-from scvi_codegen.runtime.driven_to_ends import driven_work
-from scvi_codegen.runtime.ensemble import integrate_ensemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
-from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds, steps_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble_work import driven_work, ensemble_work
 
 __all__ = ["Ensembles"]
 
@@ -64,38 +62,23 @@ class Ensembles(ConstrainedStates):
         Raises:
             StateError: on wrong shapes, names or numbers.
         """
-        if self.interface.monitor:
-            raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
-        p = momenta_of_each(self, q, p, velocity, t, parameters)
-        if h is None and steps is None and t_end is not None:
-            work = EnsembleToEnds(
-                self,
-                q,
-                p,
-                t_end=t_end,
-                tolerance=tolerance,
-                every=every,
-                t=t,
-                t_eval=t_eval,
-                parameters=parameters,
-                options=options,
-            )
-            work.run(progress=progress, threads=threads)
-            return work.result()
-        h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
-        return integrate_ensemble(
+        work = ensemble_work(
             self,
             q,
             p,
+            velocity=velocity,
             h=h,
             steps=steps,
+            t_end=t_end,
+            tolerance=tolerance,
+            t_eval=t_eval,
             every=every,
             t=t,
             parameters=parameters,
             options=options,
-            progress=progress,
-            threads=threads,
         )
+        work.run(progress=progress, threads=threads)
+        return work.result()
 
     @takes(StateError, progress=FUNCTION, inputs=MAPPING)
     def drive_ensemble(

@@ -14,6 +14,7 @@ import numpy as np
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.dense_output import whole_steps
 from scvi_codegen.runtime.kept_states import Array, KeptStates
+from scvi_codegen.runtime.times import WHOLE
 
 __all__ = ["refuse_strays", "retaken", "steps_between"]
 
@@ -21,8 +22,6 @@ Found = TypeVar("Found")
 
 SAME_STATE = 1e-6
 """Of the largest number of a state: roots lie further apart, and rounding seldom grows so far between kept states."""
-WHOLE = 1e-9
-"""Of a step: what a span may differ from so many whole ones."""
 
 
 def retaken(

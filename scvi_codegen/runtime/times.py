@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["steps_within", "times_after"]
+__all__ = ["WHOLE", "steps_within", "times_after"]
 
 SPLITTER = 2.0**27 + 1.0
 """Times a number of 53 bits, it splits off the upper 26 (Dekker 1971)."""

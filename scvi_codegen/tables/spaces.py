@@ -47,6 +47,16 @@ class CurveSpace(ABC):
         """Whether a curve run backward is one of the space."""
         return True
 
+    @property
+    def nodal(self) -> bool:
+        """Whether values at nodes give a curve, as they do a polynomial."""
+        return False
+
+    @property
+    def fitted(self) -> float | None:
+        """The frequency, in radians a step, that its curves are made for; ``None`` where there is none."""
+        return None
+
     @abstractmethod
     def dimension(self, degree: int) -> int:
         """The number s of velocities that give a curve."""
@@ -84,6 +94,11 @@ class Polynomials(CurveSpace):
     def name(self) -> str:
         """``polynomials``."""
         return "polynomials"
+
+    @property
+    def nodal(self) -> bool:
+        """Yes."""
+        return True
 
     def dimension(self, degree: int) -> int:
         """The degree."""
@@ -137,6 +152,11 @@ class Trigonometric(CurveSpace):
             harmonics = checked_count(self.harmonics, "the number of harmonics", least=1, error=MethodError)
             object.__setattr__(self, "harmonics", harmonics)
         object.__setattr__(self, "frequency", frequency)
+
+    @property
+    def fitted(self) -> float | None:
+        """Its frequency."""
+        return self.frequency
 
     @property
     def name(self) -> str:

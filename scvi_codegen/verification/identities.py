@@ -35,7 +35,6 @@ from scvi_codegen.tables.quadrature import (
     gauss_lobatto,
     gauss_radau,
 )
-from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.subject import Subject
 
@@ -107,7 +106,7 @@ def _(method: Composition, separable: bool) -> Iterator[_Twin]:
 @_twins.register
 def _(method: SVI, separable: bool) -> Iterator[_Twin]:
     s, rule = method.degree, method.rule
-    if not isinstance(method.curves, Polynomials) or rule.derivative_weights:
+    if not method.curves.nodal or rule.derivative_weights:
         return
     if s > 1:
         other = "equispaced" if method.node_set.name != "equispaced" else "chebyshev-lobatto"

@@ -2,7 +2,8 @@
  * them there. Before it: legendre.h, newton.h, the kernels constraints and constrained_motion, and CONSTRAINT_ENTRY,
  * the places of the slopes G = g_q, or A. */
 
-#define MOST_PROJECTIONS 100
+#define MOST_PROJECTIONS 100 /* steps of Gauss and Newton: where so many do not lead, no state is near */
+#define MOMENTUM_PROJECTIONS 3 /* one is enough but for rounding and for kinetic energies that are not quadratic */
 #define SETTLED REAL(1e-6) /* of a state, what an update may still want that rounding does not let come nearer */
 
 /* Factors of the matrix [L_vv, G^T; G, 0] of a state, and room for a right-hand side. */
@@ -137,11 +138,11 @@ static int project_position(real t, real *u, const real *parameters, const saddl
   return NOT_CONVERGED;
 }
 
-/* p less what leaves the tangent space; twice, for rounding and kinetic energies that are not quadratic. */
+/* p less what leaves the tangent space. */
 static int project_momentum(real t, const real *q, real *p, const real *parameters, const saddle *at, real *workspace)
 {
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], slope[CONSTRAINT_ENTRIES];
-  for (int k = 0; k < 3; k++) {
+  for (int k = 0; k < MOMENTUM_PROJECTIONS; k++) {
     int status = constrained(t, q, p, parameters, u, g, rate, workspace);
     if (status == OK)
       status = factorise_saddle(t, u, parameters, at, g);

@@ -1,6 +1,8 @@
 /* From one communication point to the next. Before it: fmu.h, and PROJECT, which puts a state on constraints. */
 
 #define NO_STEP 1e-9 /* of a step: what is left that is not worth one, as where inputs are tables */
+#define TIME_ROUNDING (4 * DBL_EPSILON) /* of a time, what sums of steps may be off */
+#define MISTAKEN 1e3 /* so many times what a time may be off: a step from elsewhere, not rounding */
 #define FAR_OFF 1e-2 /* the constraints, relative to the positions: an initial state that is not meant */
 
 /* In the place of PROJECT where there is nothing to project on. */
@@ -52,7 +54,7 @@ FMI_EXPORT fmi3Status FMI(ExitInitializationMode)(fmi3Instance instance)
 /* How exactly a time is known, and has to be met. */
 static double slack_at(double t)
 {
-  return NO_STEP * STEP + 4 * DBL_EPSILON * fabs(t);
+  return NO_STEP * STEP + TIME_ROUNDING * fabs(t);
 }
 
 /* The number of steps that lead to the next communication point, and their length: STEP where that fits, that of the
@@ -82,7 +84,7 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   (void)no_return;
   if (one->now.mode != STEP_MODE)
     return not_now(one, "fmi3DoStep");
-  if (!(fabs(point - run->t) <= 1e3 * slack_at(point)))
+  if (!(fabs(point - run->t) <= MISTAKEN * slack_at(point)))
     return failed(one, fmi3Error, "a step from t = %.17g, where this FMU is at %.17g", point, run->t);
   if (!(size > 0 && size / STEP < 1 / DBL_EPSILON))
     return failed(one, fmi3Error, "a communication step of %g: it is positive, and less than 2^52 steps", size);

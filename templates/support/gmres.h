@@ -4,7 +4,7 @@
 
 enum {
   BASIS = 16, /* vectors until it begins anew */
-  MOST_CYCLES = 30
+  MOST_CYCLES = 30 /* then Newton goes on with what there is */
 };
 
 #define LINEAR_TOLERANCE 1e-6 /* of a system, relative: so much an iteration of Newton's gains */

@@ -1,6 +1,6 @@
 /* The part of a step that lasts as long as is wanted. Before it: run.h, clock.h. */
 
-#define MOST_TRIALS 60
+#define MOST_TRIALS 60 /* bisection alone takes as many as a number has bits: 53 */
 #define SMALLEST_MISS (4 * REAL_EPSILON) /* of the times at hand */
 
 int NAME(part_of_step)(real t, real h, real end, const real *q0, const real *p0, const real *parameters,

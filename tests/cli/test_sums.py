@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.native.building import find_compiler
+from scvi_codegen.native.compilers import find_compiler
 
 RING = """
 [system]

@@ -41,6 +41,7 @@ from scvi_codegen.display.page.blocks import Formula, Paragraph
 from scvi_codegen.display.page.typesetting import SPACE
 from scvi_codegen.ir import curve_sweeps, sweeps
 from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.rendering.outline import functions_of, reached
 from scvi_codegen.rendering.text import render
@@ -131,9 +132,26 @@ class TestEquations:
     )
     def test_the_pattern_is_that_of_the_jacobian(self, method):
         system = sc.problem("henon-heiles").system
-        pattern = jacobian_pattern(method.paper_form(system), system.dimension)
-        found = {(r, c) for r, row in enumerate(pattern.rows) for c in row}
-        assert found == set(derive(system, method).jacobian.todok())
+        assert_pattern_is_of_jacobian(system, method)
+
+    def test_of_constraints_whose_multipliers_are_fewer_than_coordinates(self):
+        assert_pattern_is_of_jacobian(swing(constraints=["x**2 + y**2 - 1"]), sc.SVI(2, "gauss-lobatto:3"))
+
+
+def assert_pattern_is_of_jacobian(system: sc.LagrangianSystem, method: Any) -> None:
+    pattern = jacobian_pattern(paper_equations(system, method), system.dimension)
+    found = {(r, c) for r, row in enumerate(pattern.rows) for c in row}
+    derived = derive(system, method)
+    assert pattern.size == len(derived.unknowns)
+    assert found == set(derived.jacobian.todok())
+
+
+def swing(**more: Any) -> sc.LagrangianSystem:
+    """A point that falls, and what acts on it beside that."""
+    formula = "(x_dot**2 + y_dot**2)/2 - y"
+    return sc.LagrangianSystem.from_text(
+        name="swing", coordinates=["x", "y"], lagrangian=formula, parameters={"c": 0.1}, **more
+    )
 
 
 @cache
@@ -235,6 +253,25 @@ class TestPage:
         page = derivation_html(sc.hamiltonian_of(sc.problem("henon-heiles").system), sc.SVI(1))
         assert "Hamilton&#39;s equations</h2>" in page
         assert page.count("(19a)") == page.count("(19b)") == 2
+
+    @pytest.mark.parametrize(
+        ("more", "said"),
+        [
+            ({"forces": {"x": "-c*x_dot**3"}}, "Forces act beside it; where"),
+            ({"damping": "c"}, "Momenta are damped at one rate,"),
+            ({"constraints": ["x**2 + y**2 - 1"]}, "Constraints hold,"),
+        ],
+        ids=["forces", "damping", "constraints"],
+    )
+    def test_what_acts_beside_a_lagrangian_is_told(self, more, said):
+        plain, acted_on = (derivation_html(swing(**each), sc.SVI(2, "gauss-lobatto:3")) for each in ({}, more))
+        assert said in acted_on
+        assert said not in plain
+        Page(acted_on)
+
+    def test_a_composition_is_told_as_its_leapfrog_steps(self):
+        method = sc.Composition(8)
+        assert f"{len(method.fractions)} leapfrog steps of sizes" in kepler_page(method)
 
     def test_names_are_escaped(self):
         system = sc.LagrangianSystem.from_text(name="<b> & */ q", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")

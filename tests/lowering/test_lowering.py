@@ -24,7 +24,7 @@ from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import double_pendulum, duffing, fput_chain, kepler
-from scvi_codegen.native.building import find_compiler
+from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.printer import print_expression, print_number
 
 mp = mpmath.mp.clone()

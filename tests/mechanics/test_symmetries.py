@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import time
 from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
 import pytest
 import sympy
+from counting import at_most
 from sympy import Symbol
 
 from scvi_codegen.compiler import compile_stepper, generate_source
@@ -18,6 +18,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.symmetry import invariants
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -337,9 +338,8 @@ def test_searching_takes_no_time_to_speak_of():
     for name in (*PROBLEMS, "fput-chain:64"):
         system = problem(name).system
         symmetries.cache_clear()
-        began = time.process_time()
-        symmetries(system)
-        assert time.process_time() - began < 1.0, name  # 0.1 s measured for the slowest
+        with at_most(1_000_000):  # the slowest takes 400,000, a tenth of a second
+            symmetries(system)
 
 
 # What is given.
@@ -611,3 +611,19 @@ def test_headers_say_what_is_conserved():
 def test_hamiltonians_without_lagrangian_that_are_free():
     system = HamiltonianSystem.from_text(name="shear", coordinates=["q"], hamiltonian="p_q*c", parameters={"c": 2.0})
     assert set(formulas(system).values()) >= {"p_q"}
+
+
+@pytest.mark.parametrize("smallest", [0.0, 1e-12, 0.9e-9, 1.1e-9, 1e-6, 1.0])
+def test_singular_values_are_called_large_only_if_they_are(smallest):
+    rng = np.random.default_rng(7)
+    left, right = (np.linalg.qr(rng.normal(size=(size, size)))[0] for size in (50, 40))
+    matrix = left[:, :40] * np.append(np.geomspace(1.0, max(smallest, 1e-3), 39), smallest) @ right
+    said = invariants._all_larger(matrix, 1e-9)
+    assert not said or smallest > 1e-9
+    assert said or smallest < 1e-6
+
+
+def test_where_nothing_is_conserved_no_singular_values_are_computed(monkeypatch):
+    tilted = particle("sin(x*y) + x**4 + cos(y) + x*cos(t)")
+    monkeypatch.setattr(np.linalg, "svd", None)
+    assert symmetries(tilted) == ()

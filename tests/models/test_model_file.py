@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ExpressionError, ModelFileError, SystemDefinitionError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import dump_model, load_model, parse_model, save_model
@@ -200,6 +201,14 @@ def test_a_catalogue_reference_may_be_changed():
         ("[system]", "system = 3\n[zzz]", "unknown section 'zzz'"),
         ("[system]", '[system]\ncatalogue = "kepler"', "unknown key 'name' in [system] beside catalogue"),
         ("[run]", "[run", "this is not TOML"),
+        ("[run]", '[tables]\n"b[N]" = [1]\n[run]', "[tables] belongs to coordinates that are arrays"),
+        ('"svi"', '"svi:4"', "[method] method = 'svi:4' and degree = 3 contradict each other"),
+        ('["q"]', '["q"]\nmomenta = ["p"]', "[system] has momenta beside a lagrangian"),
+        (
+            'lagrangian = "m*q_dot**2/2 + cos(q)"',
+            'hamiltonian = "p_q**2/2"\ndissipation = "q_dot**2"',
+            "[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]",
+        ),
     ],
 )
 def test_mistakes_are_named(old, new, message, tmp_path):
@@ -209,6 +218,21 @@ def test_mistakes_are_named(old, new, message, tmp_path):
     with pytest.raises(ModelFileError, match=re.escape(message)) as caught:
         load_model(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_forces_are_for_systems_that_are_written_out():
+    with pytest.raises(ModelFileError, match=r"\[forces\] act on a system that is written out"):
+        parse_model('[system]\ncatalogue = "kepler"\n[forces]\nq1 = "-q1_dot"\n')
+
+
+@pytest.mark.parametrize("more", [{"damping": "m/4"}, {"forces": {"q": "-m*q_dot**3"}}, {"dissipation": "q_dot**2"}])
+def test_what_acts_on_a_system_survives_a_round_trip(more):
+    formula = "m*q_dot**2/2 + cos(q)"
+    system = LagrangianSystem.from_text(
+        name="pendulum", coordinates=["q"], lagrangian=formula, parameters={"m": 2.0}, **more
+    )
+    model = replace(parse_model(PENDULUM), system=system)
+    assert parse_model(dump_model(model)) == model != parse_model(PENDULUM)
 
 
 def test_all_that_is_missing_is_named_at_once():

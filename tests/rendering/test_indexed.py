@@ -9,7 +9,7 @@ from style import check_style
 from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate, with_control
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import as_method
-from scvi_codegen.native.building import find_compiler
+from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.indexed import render_indexed
 from scvi_codegen.rendering.source import Source
 

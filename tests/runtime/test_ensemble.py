@@ -26,7 +26,7 @@ from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.ensemble import Ensemble, integrate_ensemble
+from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -298,7 +298,7 @@ class TestArguments:
     def test_faults_are_named(self, kepler: Stepper, changes: dict[str, object], message: str):
         arguments: dict[str, object] = {"q": np.ones((3, 2)), "p": np.zeros((3, 2)), "h": 0.1, "steps": 5} | changes
         with pytest.raises(StateError, match=message):
-            integrate_ensemble(kepler, **arguments)  # type: ignore[arg-type]
+            kepler.integrate_ensemble(**arguments)  # type: ignore[arg-type]
 
     def test_one_state_is_an_ensemble_of_one(self, kepler: Stepper):
         assert len(kepler.integrate_ensemble([1.0, 0.0], [0.0, 1.0], h=0.1, steps=5)) == 1

@@ -14,6 +14,7 @@ from scvi_codegen.tables.basis import (
     cardinal_integrals,
     cardinal_slopes,
     cardinal_values,
+    continuation,
     differentiation_matrix,
     extrapolation,
     matrix_product,
@@ -156,6 +157,7 @@ def test_products_and_transposes() -> None:
         (lambda: extrapolation((0, 1), 1, 2), "degree 2 does not fit 2 points"),
         (lambda: extrapolation((0, 1), 1, 0.5), "must be a whole number"),
         (lambda: extrapolation((0, 1), 1, -1), "at least 0"),
+        (lambda: continuation((0, 1), 3), "degree 3 does not fit 3 points"),
     ],
 )
 def test_impossible_requests_are_refused(call: object, message: str) -> None:

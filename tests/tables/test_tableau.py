@@ -338,6 +338,7 @@ def test_radau_iia_agrees_with_the_abscissae_of_scipy(s: int) -> None:
         (lambda: gauss(2.0), r"not 2\.0"),
         (lambda: tableau_by_name("radau-iib:3"), "did you mean 'radau-iia'"),
         (lambda: tableau_by_name("gauss"), "lacks its number"),
+        (lambda: collocation_tableau(range(65)), "65 abscissae are too many: take at most 64"),
     ],
 )
 def test_impossible_requests_are_refused(call: object, message: str) -> None:

@@ -21,7 +21,6 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
-from scvi_codegen.tables.spaces import Polynomials
 from scvi_codegen.tables.tableau import Tableau
 
 __all__ = ["curve_section", "kronecker_form", "tables_section"]
@@ -106,7 +105,7 @@ def _curve(method: Method) -> Iterator[Content]:
 
 @_curve.register
 def _(method: SVI) -> Iterator[Content]:
-    if isinstance(method.curves, Polynomials):
+    if method.curves.nodal:
         yield from _nodal(method.degree)
     else:
         yield Paragraph(

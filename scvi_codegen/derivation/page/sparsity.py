@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
+from itertools import accumulate
 
 from scvi_codegen.display.page.blocks import Drawing
 from scvi_codegen.formulas.derivatives import jacobian
@@ -32,15 +33,17 @@ class Pattern:
 
 
 def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
-    """Of the residuals with respect to the unknowns, in the order of the equations: block after block of m."""
-    found: list[set[int]] = [set() for _ in range(len(stages.rows) * dimension)]
+    """Of the residuals with respect to the unknowns, in the order of the equations: block after block."""
+    places = [0, *accumulate(stages.block_sizes(dimension))]
+    lines = [0, *accumulate(stages.row_sizes(dimension))]
+    found: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
     for family in stages.families:
         for scatter in family.scatters:
             for gather in family.gathers:
                 pairs = jacobian(scatter.results, gather.arguments)
                 for r, b in _met(scatter.table.entries, gather.table.entries, len(stages.rows)):
                     for i, j in pairs:
-                        found[r * dimension + i].add(b * dimension + j)
+                        found[lines[r] + i].add(places[b] + j)
     return Pattern(len(found), tuple(tuple(sorted(row)) for row in found))
 
 

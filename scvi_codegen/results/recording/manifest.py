@@ -9,7 +9,8 @@ from typing import Any
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.native import building
+from scvi_codegen.native.compilers import compiler_title
+from scvi_codegen.native.fingerprint import fingerprint
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.goal import Goal
@@ -47,8 +48,8 @@ class Build:
         return cls(
             step=step,
             version=__version__,
-            compiler=building.compiler_title(),
-            fingerprint=building.fingerprint(stepper.source, flags=stepper.flags),
+            compiler=compiler_title(),
+            fingerprint=fingerprint(stepper.source, flags=stepper.flags),
         )
 
 

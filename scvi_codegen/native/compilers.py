@@ -1,0 +1,80 @@
+"""Which command compiles C, what it says of itself, and what to try where there is none that works."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from scvi_codegen.errors import BuildError
+
+__all__ = ["another_compiler", "compiler_title", "compiler_version", "find_compiler", "from_wheel"]
+
+WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
+
+
+def find_compiler() -> tuple[str, ...]:
+    """The command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel.
+
+    Raises:
+        BuildError: if there is none.
+    """
+    chosen = os.environ.get("CC")
+    if chosen:
+        command = tuple(shlex.split(chosen))
+        if not command or shutil.which(command[0]) is None:
+            raise BuildError(f"the compiler named by the environment variable CC ({chosen!r}) was not found")
+        return command
+    for name in ("cc", "gcc", "clang"):
+        if shutil.which(name):
+            return (name,)
+    if importlib.util.find_spec("ziglang"):
+        return (sys.executable, "-m", "ziglang", "cc")
+    raise BuildError(
+        "no C compiler was found; install one (Debian, Ubuntu: apt install gcc libc6-dev; "
+        f"macOS: xcode-select --install), or {WHEEL}"
+    )
+
+
+def from_wheel(compiler: tuple[str, ...]) -> bool:
+    """Whether a command is the compiler of the extra ``compiler``."""
+    return "ziglang" in compiler
+
+
+def compiler_title() -> str:
+    """The first line that the compiler says of its version."""
+    return _title_of(find_compiler())
+
+
+@cache
+def _title_of(command: tuple[str, ...]) -> str:
+    result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    return (result.stdout.splitlines() or [" ".join(command)])[0]
+
+
+@cache
+def compiler_version(compiler: tuple[str, ...]) -> str:
+    """What tells compilers apart: the file that is run, or what a command of several words says of itself."""
+    if len(compiler) == 1:
+        file = Path(shutil.which(compiler[0]) or compiler[0]).resolve()
+        with suppress(OSError):
+            status = file.stat()
+            return f"{file} {status.st_size} {status.st_mtime_ns}"
+    try:
+        result = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BuildError(f"the compiler {' '.join(compiler)!r} does not run: {error}") from error
+    return result.stdout
+
+
+def another_compiler(command: list[str]) -> str:
+    """What to try where this compiler, its headers or its linker are not whole."""
+    if from_wheel(tuple(command)):
+        return ""
+    return f"\nif this compiler is not whole, {WHEEL}, and set CC='python -m ziglang cc'"

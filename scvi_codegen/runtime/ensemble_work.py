@@ -1,0 +1,134 @@
+"""Which ensemble does what is asked for: by common steps or by steps of each, with inputs or without."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.driven import Input, checked_inputs, end_of, entered, parameters_at
+from scvi_codegen.runtime.driven_ensemble import DrivenEnsemble
+from scvi_codegen.runtime.driven_to_ends import DrivenToEnds
+from scvi_codegen.runtime.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble_states import (
+    EnsembleParameters,
+    checked_ensemble,
+    momenta_of_each,
+    parameters_of_each,
+)
+from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
+from scvi_codegen.runtime.inputs import Array, check_left_to_inputs
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["driven_work", "ensemble_work"]
+
+
+def ensemble_work(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    *,
+    velocity: ArrayLike | None,
+    h: float | None,
+    steps: int | None,
+    t_end: ArrayLike | None,
+    tolerance: float | None,
+    t_eval: ArrayLike | None,
+    t: float,
+    parameters: EnsembleParameters,
+    **others: Any,
+) -> Ensemble | EnsembleToEnds:
+    """An ensemble without inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
+
+    Raises:
+        StateError: on wrong shapes, names or numbers, and where a monitor chooses steps.
+    """
+    _refuse_monitors(stepper)
+    p = momenta_of_each(stepper, q, p, velocity, t, parameters)
+    common = {"t": t, "parameters": parameters, **others}
+    if h is None and steps is None and t_end is not None:
+        return EnsembleToEnds(stepper, q, p, t_end=t_end, tolerance=tolerance, t_eval=t_eval, **common)
+    h, steps = _common_steps(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
+    return Ensemble(stepper, q, p, h=h, steps=steps, **common)
+
+
+def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple[float, int]:
+    """The step and number of steps of an ensemble that does not go to its ends by steps of their own lengths."""
+    given = [name for name, value in others.items() if value is not None]
+    if h is None or steps is None:
+        raise StateError("give h and steps, for steps of one length, or t_end, for steps that choose theirs")
+    if given:
+        raise StateError(f"{given[0]} is for steps that choose their length: give t_end, and neither h nor steps")
+    return h, steps
+
+
+def driven_work(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    *,
+    inputs: Mapping[str, Any],
+    velocity: ArrayLike | None = None,
+    h: float | None = None,
+    steps: int | None = None,
+    t_end: ArrayLike | None = None,
+    tolerance: float | None = None,
+    t: float,
+    parameters: EnsembleParameters,
+    **others: Any,
+) -> DrivenEnsemble | DrivenToEnds:
+    """An ensemble with inputs; arguments as of :meth:`Stepper.drive_ensemble`.
+
+    Raises:
+        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and where a monitor chooses steps.
+    """
+    make: partial[DrivenEnsemble] | partial[DrivenToEnds]
+    if h is not None:
+        if tolerance is not None:
+            raise StateError("a tolerance is for steps that choose their length: give t_end, and neither h nor steps")
+        if t_end is not None and np.ndim(t_end):
+            raise StateError("steps of h lead all trajectories to one t_end; leave out h for an end of each")
+        towards = end_of(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))
+        make = partial(DrivenEnsemble, h=h, t_end=towards)
+    elif t_end is None or steps is not None:
+        raise StateError(
+            "give h and steps or t_end, for steps of h, or t_end alone, for steps that choose their length"
+        )
+    else:
+        towards = float(real_array(t_end, "t_end").flat[0])
+        make = partial(DrivenToEnds, t_end=t_end, tolerance=tolerance)
+    data, p, start = _driven_start(stepper, q, p, velocity, inputs, (t, towards), parameters)
+    return make(stepper, q, p, data, t=t, parameters=start, **others)
+
+
+def _driven_start(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    velocity: ArrayLike | None,
+    inputs: Mapping[str, Any],
+    way: tuple[float, float],
+    parameters: EnsembleParameters,
+) -> tuple[dict[str, Input], ArrayLike, Array]:
+    """Inputs, momenta, and (k, number of parameters) at the start of a ``way`` from a time to one.
+
+    Raises:
+        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and where a monitor chooses steps.
+    """
+    _refuse_monitors(stepper)
+    count = len(checked_ensemble(stepper, q, q)[0])
+    data = checked_inputs(stepper.interface, inputs, count)
+    check_left_to_inputs(stepper.interface, parameters)
+    own = parameters_of_each(stepper, parameters, count)
+    start = parameters_at(stepper.parameters, own, data, entered(*way))
+    return data, momenta_of_each(stepper, q, p, velocity, way[0], start), start
+
+
+def _refuse_monitors(stepper: Integrator) -> None:
+    if stepper.interface.monitor:
+        raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
