@@ -131,7 +131,7 @@ def benchmark(
         plan: how to measure.
         json_path, plot_path: files to write, the first after each section; beside the picture of adaptive cases
             another, NAME-steps, of the length of a step along an orbit.
-        resume: take the sections that ``json_path`` has, and did not fail, from there.
+        resume: keep the sections that ``json_path`` has, and did not fail, and add others to them.
         say: told what is being done.
         show: given the text of the report, a section as soon as it is measured.
 
@@ -144,7 +144,8 @@ def benchmark(
 
         check_plot_path(plot_path)
     known = _known(json_path) if resume and json_path is not None else {}
-    for report in _reports(sections or tuple(SECTIONS), known, plan or Plan(), say, show):
+    wanted = dict.fromkeys((*known, *(sections or SECTIONS)))
+    for report in _reports(tuple(wanted), known, plan or Plan(), say, show):
         if json_path is not None:
             text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
             write_atomically(json_path, lambda file, text=text: file.write(text.encode()))
