@@ -131,7 +131,7 @@ def benchmark(
         plan: how to measure.
         json_path, plot_path: files to write, the first after each section; beside the picture of adaptive cases
             another, NAME-steps, of the length of a step along an orbit.
-        resume: take the sections that ``json_path`` has, and did not fail, from there.
+        resume: keep the sections that ``json_path`` has, and did not fail, and add others to them.
         say: told what is being done.
         show: given the text of the report, a section as soon as it is measured.
 
@@ -144,10 +144,10 @@ def benchmark(
 
         check_plot_path(plot_path)
     known = _known(json_path) if resume and json_path is not None else {}
-    for report in _reports(sections or tuple(SECTIONS), known, plan or Plan(), say, show):
+    wanted = dict.fromkeys((*known, *(sections or SECTIONS)))
+    for report in _reports(tuple(wanted), known, plan or Plan(), say, show):
         if json_path is not None:
-            text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
-            write_atomically(json_path, lambda file, text=text: file.write(text.encode()))
+            _write(report, json_path)
     if plot_path is not None and report.cases:
         from scvi_codegen.benchmark.picture import plot_curves
 
@@ -187,6 +187,11 @@ def _known(json_path: str) -> dict[str, Result]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StateError(f"{json_path} is no report that could be resumed: {type(error).__name__}: {error}") from None
     return {each.name: each for each in found}
+
+
+def _write(report: Report, json_path: str) -> None:
+    text = json.dumps(report.data(), indent=1, allow_nan=False) + "\n"
+    write_atomically(json_path, lambda file: file.write(text.encode()))
 
 
 def _reports(names: Sequence[str], known: Mapping[str, Result], plan: Plan, say: Say, show: Say) -> Iterator[Report]:

@@ -7,7 +7,7 @@ far) and on halves of them; the difference is the accuracy that is kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -158,14 +158,23 @@ def _kepler_end(q: Array, v: Array, t: float) -> tuple[Any, Any]:
 
 def _ends(chosen: Case, velocity: Extended) -> Reference:
     stepper, field, m = compile_stepper(chosen.system, SVI(8)), field_of(chosen), chosen.dimension
-    found = []
-    for q, v in zip(chosen.q, velocity, strict=True):
-        t = stepper.integrate(q, velocity=v.astype(float), t_end=chosen.span).t.astype(np.longdouble)
-        start = np.concatenate([q.astype(np.longdouble), v])[np.newaxis]
-        found.append([end[0, :m] for end in _with_two_steps(field, start, np.diff(t))])
-    rough, fine = np.array(found).swapaxes(0, 1)
+    runs = [
+        stepper.integrate(q, velocity=v, t_end=chosen.span).t
+        for q, v in zip(chosen.q, velocity.astype(float), strict=True)
+    ]
+    start = np.concatenate([chosen.q.astype(np.longdouble), velocity], axis=1)
+    rough, fine = (ends[:, :m] for ends in _with_two_steps(field, start, _shortest(runs)))
     high, low = two_doubles(fine)
     return Reference(high=high, low=low, accuracy=rms(rough - fine) / rms(high))
+
+
+def _shortest(runs: Sequence[Array]) -> Extended:
+    """Steps for all runs together, from the times of each: as long as the shortest that one of them takes there."""
+    times, end = [float(runs[0][0])], float(runs[0][-1])
+    while times[-1] < end:
+        places = [np.searchsorted(run[1:-1], times[-1], side="right") for run in runs]
+        times.append(min(end, times[-1] + min(run[k + 1] - run[k] for run, k in zip(runs, places, strict=True))))
+    return np.diff(np.array(times, dtype=np.longdouble))
 
 
 def _with_two_steps(

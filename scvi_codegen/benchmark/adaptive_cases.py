@@ -29,7 +29,7 @@ from scvi_codegen.models.problems import problem
 __all__ = ["ADAPTIVE_CASES", "ECCENTRICITIES", "adaptive_case"]
 
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
-KEPLER_SPAN = 200.0
+KEPLER_SPAN = 2000.0
 MERCURY = {"axis": 0.387098, "eccentricity": 0.205630, "mass": 1.66e-7, "inclination": math.radians(7.0)}
 """In astronomical units and solar masses."""
 COMET = {"axis": 10.0, "eccentricity": 0.97, "mass": 1e-15, "inclination": math.radians(20.0)}

@@ -46,7 +46,7 @@ class CaseResult:
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> CaseResult:
         """What :meth:`data` gave; numbers that it had as null are none."""
-        found = [
+        found: list[dict[str, Any]] = [
             {key: math.nan if value is None else value for key, value in each.items()} for each in data["measurements"]
         ]
         return cls(

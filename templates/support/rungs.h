@@ -57,8 +57,8 @@ static inline real error_at(real error, int rungs)
   return error;
 }
 
-/* By how many rungs the next step is longer, or shorter, an octave at most. The error is expected to go on growing as
- * it did; where it fell, much of that may have been luck. */
+/* By how many rungs the next step is longer; shorter by an octave at most. The error is expected to go on growing as it
+ * did; where it fell, much of that may have been luck. */
 static int next_change(real error, real before, const error_limits *limits)
 {
   const real expected =

@@ -14,6 +14,7 @@ from scvi_codegen.benchmark import adaptive
 from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES, adaptive_case
 from scvi_codegen.benchmark.references import field_of, final_states, states_after
 from scvi_codegen.benchmark.step_lengths import plot_step_lengths, step_lengths
+from scvi_codegen.errors import StateError
 from scvi_codegen.native import building
 
 needs_extended = pytest.mark.skipif(np.finfo(np.longdouble).eps > 1e-18, reason="long double is no wider than double")
@@ -71,6 +72,30 @@ def test_references_on_chosen_steps_are_those_on_equal_ones():
     assert np.abs((equal[:, :2] - found.high) - found.low).max() < 1e-17
     split = states_after(field_of(chosen), start, [0.0625, 0.03125, 0.03125] + 46 * [0.0625])
     assert np.abs(split - equal).max() < 1e-12
+
+
+def test_steps_of_a_reference_are_the_shortest_of_its_runs():
+    runs = np.array([0.0, 1.0, 1.5, 2.0, 4.0]), np.array([0.0, 0.75, 2.75, 4.0])
+    steps = adaptive._shortest(runs)
+    assert np.array_equal(steps, [0.75, 1.0, 0.5, 1.75])
+    third = adaptive._shortest([np.linspace(0.0, 4.0, 4), np.linspace(0.0, 4.0, 3)])
+    assert third.sum() == 4.0
+
+
+def test_a_reference_takes_shorter_steps_where_long_ones_cannot_be_solved(monkeypatch):
+    asked = []
+
+    def states_after(field, start, steps):
+        asked.append(float(steps[0]))
+        if steps[0] > 0.3:
+            raise StateError("no")
+        return start
+
+    monkeypatch.setattr(adaptive, "states_after", states_after)
+    adaptive._with_two_steps(lambda x: x, np.zeros((1, 2)), np.ones(3, dtype=np.longdouble))
+    assert asked == [1.0, 0.5, 0.25, 0.125]
+    with pytest.raises(StateError):
+        adaptive._with_two_steps(lambda x: x, np.zeros((1, 2)), np.full(3, 9.0))
 
 
 @needs_extended

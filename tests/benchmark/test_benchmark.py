@@ -384,9 +384,10 @@ class TestCommand:
         monkeypatch.setattr(bench, "SECTIONS", {name: partial(section, name) for name in ("one", "two", "three")})
         bench.benchmark(json_path=str(path))
         assert measured == [("one", []), ("two", ["one"]), ("three", ["one", "two"])]
-        again = bench.benchmark(json_path=str(path), resume=True)
+        again = bench.benchmark(["two"], json_path=str(path), resume=True)
         assert [name for name, _ in measured[3:]] == ["two"]
-        assert [result.name for result in again.results] == ["one", "two", "three"]
+        assert [result.name for result in again.results] == ["one", "three", "two"]
+        assert [table["name"] for table in json.loads(path.read_text())["tables"]] == ["one", "three", "two"]
         path.write_text("{}")
         with pytest.raises(StateError, match="no report that could be resumed: KeyError: 'cases'"):
             bench.benchmark(json_path=str(path), resume=True)

@@ -19,7 +19,7 @@ __all__ = ["bench"]
 @click.option("--json", "json_path", type=click.Path(), metavar="FILE", help="All measurements as JSON.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
-@click.option("--resume", is_flag=True, help="Go on: what FILE of --json has is not measured again.")
+@click.option("--resume", is_flag=True, help="Keep what FILE of --json has, and add to it.")
 @click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
 def bench(
     sections: tuple[str, ...],
