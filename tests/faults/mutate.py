@@ -21,6 +21,7 @@ from collections import Counter
 from pathlib import Path
 
 from checkout import ROOT, copied, run
+from near import near
 from operators import Place, places
 
 PACKAGE = ("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables")
@@ -39,98 +40,6 @@ CERTIFIED = (
     "double/verlet",
 )
 MOST_CASES = 4
-NEAR: dict[str, tuple[str, ...]] = {
-    "templates/support/indexed": (
-        "runtime/test_indexed.py",
-        "verification/test_indexed.py",
-        "rendering/test_indexed.py",
-    ),
-    "templates/indexed": ("runtime/test_indexed.py", "rendering/test_indexed.py"),
-    "templates/main": ("models/test_package.py",),
-    "templates/parts/main": ("models/test_package_inputs.py",),
-    "templates/support/constraints": ("methods/test_constraints.py", "methods/test_rolling.py"),
-    "templates/support/density": ("runtime/test_density.py",),
-    "templates/support/exchanges": ("runtime/test_exchanges.py",),
-    "templates/support/inputs": ("runtime/test_driven.py", "models/test_package_inputs.py"),
-    "templates/support/push": ("runtime/test_sensitivity.py", "runtime/test_deviations.py"),
-    "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
-    "templates/support/flow": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
-    "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
-    "templates/support/xla": ("frameworks/test_jax.py", "rendering/test_flow_text.py"),
-    "templates/support/float": ("rendering/test_c_text.py",),
-    "templates/support/lent": ("runtime/test_fallback.py",),
-    "templates/support/borrowed": ("runtime/test_fallback.py",),
-    "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
-    "templates/support/events": ("runtime/test_events.py",),
-    "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
-    "templates/support/control": (
-        "runtime/test_controlled_steps.py",
-        "lowering/test_ladder.py",
-        "results/test_controlled_recording.py",
-    ),
-    "templates/support/legendre": ("runtime/test_given_velocities.py", "runtime/test_stepper.py"),
-    "templates/support/clock": ("runtime/test_clock.py", "mechanics/test_transformed_time.py"),
-    "templates/support/newton": (
-        "lowering/test_iterations.py",
-        "lowering/test_newton.py",
-        "lowering/test_stiff_newton.py",
-    ),
-    "templates/support/band": ("lowering/test_band.py", "lowering/test_newton.py"),
-    "templates/support/crowd": ("runtime/test_ensemble.py",),
-    "templates/support/many": ("runtime/test_ensemble.py",),
-    "templates/support/trajectories": ("runtime/test_ensemble.py", "runtime/test_drift.py"),
-    "templates/": (
-        "lowering/test_iterations.py",
-        "lowering/test_sweeps.py",
-        "lowering/test_contraction.py",
-        "runtime/test_quantities.py",
-        "lowering/test_collocation_solver.py",
-        "runtime/test_stepper.py",
-        "runtime/test_drift.py",
-    ),
-    "scvi_codegen/ir": ("lowering/test_lowering.py", "lowering/test_rounding.py", "rendering/test_generated.py"),
-    "scvi_codegen/lowering": ("lowering", "rendering/test_generated.py"),
-    "scvi_codegen/rendering": (
-        "rendering/test_generated.py",
-        "rendering/test_written_out.py",
-        "rendering/test_c_text.py",
-    ),
-    "scvi_codegen/methods": ("methods", "promises/test_identities.py", "promises/test_order.py"),
-    "scvi_codegen/runtime": (
-        "runtime/test_quantities.py",
-        "runtime/test_stepper.py",
-        "runtime/test_times.py",
-        "runtime/test_dense_output.py",
-        "runtime/test_events.py",
-        "runtime/test_ensemble.py",
-        "runtime/test_controlled_steps.py",
-        "runtime/test_clock.py",
-        "runtime/test_distributed.py",
-    ),
-    "scvi_codegen/runtime/indexed": ("runtime/test_indexed.py", "models/test_indexed_model_file.py"),
-    **{
-        f"scvi_codegen/runtime/{stem}": ("runtime/test_deviations.py", "runtime/test_tangents.py")
-        for stem in ("changes_in_lanes", "spreading", "nearby", "growth", "deviations")
-    },
-    **{
-        f"scvi_codegen/runtime/{stem}": ("runtime/test_sensitivity.py", "runtime/test_periodic.py")
-        for stem in ("gradients", "linearised", "compiled_method", "periodic")
-    },
-    "scvi_codegen/runtime/driven": ("runtime/test_driven.py", "runtime/test_driven_ensemble.py"),
-    "scvi_codegen/runtime/longest": ("runtime/test_longest_step.py",),
-    "scvi_codegen/runtime/constrain": ("methods/test_constraints.py", "methods/test_rolling.py"),
-    "scvi_codegen/lowering/indexed": ("lowering/test_indexed_sums.py", "runtime/test_indexed.py"),
-    "scvi_codegen/rendering/indexed": ("rendering/test_indexed.py", "runtime/test_indexed.py"),
-    "scvi_codegen/mechanics/indexed": ("mechanics/test_indexed.py", "runtime/test_indexed.py"),
-    "scvi_codegen/formulas/indexed": ("formulas/test_indexed.py", "runtime/test_indexed.py"),
-    "scvi_codegen/native": ("native",),
-    "scvi_codegen/mechanics": ("mechanics",),
-    "scvi_codegen/files": ("files", "results/test_recording.py", "results/test_ensemble_files.py"),
-    "scvi_codegen/formulas": ("formulas/test_derivatives.py", "formulas/test_expression_text.py"),
-    "scvi_codegen/tables": ("tables",),
-}
-
-
 OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
 OF_TEXT = ("--deselect", "tests/rendering/test_generated.py::test_no_file_is_stale")
 """Notices that a text is another one, as it would of what is no fault."""
@@ -154,13 +63,6 @@ def drawn(count: int, seed: int, only: str) -> list[Place]:
         own = [place for place in own if place.path.startswith(only)]
         chosen.append(chooser.sample(own, min(len(own), count // 2)))
     return [place for pair in zip(*chosen, strict=False) for place in pair] if all(chosen) else chosen[0] or chosen[1]
-
-
-def near(path: str) -> list[str]:
-    """The test files that stand next to a file: that of its name, and those of the longest beginning of its path."""
-    key = max((key for key in NEAR if path.startswith(key)), key=len)
-    own = sorted(str(found.relative_to(ROOT)) for found in ROOT.glob(f"tests/*/test_{Path(path).stem}.py"))
-    return list(dict.fromkeys([*own, *(f"tests/{name}" for name in NEAR[key])]))
 
 
 def noticed(copy: Path, place: Place, unfit: list[str]) -> tuple[str, str]:
