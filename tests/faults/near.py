@@ -11,6 +11,9 @@ __all__ = ["NEAR", "near"]
 NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/indexed": (
         "runtime/test_indexed.py",
+        "runtime/test_indexed_scales.py",
+        "runtime/test_indexed_newton.py",
+        "runtime/test_indexed_runs.py",
         "verification/test_indexed.py",
         "rendering/test_indexed.py",
     ),
@@ -111,7 +114,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "rendering/test_written_out.py",
         "rendering/test_c_text.py",
     ),
-    "scvi_codegen/methods": ("methods", "promises/test_identities.py", "promises/test_order.py"),
+    "scvi_codegen/methods": ("methods", "promises/test_identities.py", "promises/test_order.py", "display"),
     "scvi_codegen/runtime": (
         "runtime/test_quantities.py",
         "runtime/test_stepper.py",
@@ -123,7 +126,16 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_clock.py",
         "runtime/test_distributed.py",
     ),
-    "scvi_codegen/runtime/indexed": ("runtime/test_indexed.py", "models/test_indexed_model_file.py"),
+    "scvi_codegen/runtime/indexed": (
+        "runtime/test_indexed.py",
+        "runtime/test_indexed_runs.py",
+        "models/test_indexed_model_file.py",
+    ),
+    **{f"scvi_codegen/runtime/{stem}": ("runtime/test_fitting.py",) for stem in ("measurements", "fitting")},
+    **{
+        f"scvi_codegen/runtime/{stem}": ("runtime/test_exchanges.py", "runtime/test_step_error.py")
+        for stem in ("retaken", "accuracy", "segments")
+    },
     **{
         f"scvi_codegen/runtime/{stem}": ("runtime/test_deviations.py", "runtime/test_tangents.py")
         for stem in ("changes_in_lanes", "spreading", "nearby", "growth", "deviations")
@@ -138,11 +150,20 @@ NEAR: dict[str, tuple[str, ...]] = {
     "scvi_codegen/lowering/indexed": ("lowering/test_indexed_sums.py", "runtime/test_indexed.py"),
     "scvi_codegen/rendering/indexed": ("rendering/test_indexed.py", "runtime/test_indexed.py"),
     "scvi_codegen/mechanics/indexed": ("mechanics/test_indexed.py", "runtime/test_indexed.py"),
-    "scvi_codegen/formulas/indexed": ("formulas/test_indexed.py", "runtime/test_indexed.py"),
+    "scvi_codegen/formulas/indexed": (
+        "formulas/test_indexed.py",
+        "mechanics/test_indexed.py",
+        "runtime/test_indexed.py",
+        "derivation",
+    ),
     "scvi_codegen/native": ("native",),
     "scvi_codegen/mechanics": ("mechanics",),
     "scvi_codegen/files": ("files", "results/test_recording.py", "results/test_ensemble_files.py"),
-    "scvi_codegen/formulas": ("formulas/test_derivatives.py", "formulas/test_expression_text.py"),
+    "scvi_codegen/formulas": (
+        "formulas/test_derivatives.py",
+        "formulas/test_expression_text.py",
+        "mechanics/test_system.py",
+    ),
     "scvi_codegen/tables": ("tables",),
 }
 """By the beginning of paths; the longest that fits counts."""

@@ -43,10 +43,15 @@ def test_where_the_new_folder_cannot_be_moved_the_old_one_is_back(tmp_path: Path
     assert [*tmp_path.iterdir()] == [target]
 
 
-def test_what_was_not_made_whole_changes_nothing(tmp_path: Path) -> None:
-    target = filled(tmp_path / "run", "old")
-    with pytest.raises(RuntimeError), replaced(target) as made:
+def half_made(target: Path) -> None:
+    with replaced(target) as made:
         filled(made, "half")
         raise RuntimeError
+
+
+def test_what_was_not_made_whole_changes_nothing(tmp_path: Path) -> None:
+    target = filled(tmp_path / "run", "old")
+    with pytest.raises(RuntimeError):
+        half_made(target)
     assert (target / "part").read_text() == "old"
     assert [*tmp_path.iterdir()] == [target]

@@ -90,6 +90,14 @@ def test_factors_of_newtons_matrix_serve_the_next_step_where_steps_are_short():
     assert run._memory.guess == 2
 
 
+@pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 154)), ("tangle/scvi", (22, 74))])
+def test_steps_that_choose_their_length_are_guessed_by_the_one_before(name, expected):
+    """By Newton's iteration, where it was as long: steps, and iterations of all."""
+    given = case(name)
+    run = stepper(name, "newton").integrate(given.q, given.p, t_end=10 * given.h, tolerance=1e-6)
+    assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
+
+
 def test_kept_factors_take_two_looks_where_nothing_is_left_to_do():
     """Factors of another point must have shrunk an update once before one that is small says anything."""
     own = problem("fput-chain").system
