@@ -56,6 +56,7 @@ class CompiledMethod:
         self._ensemble, self._controlled, self._fallback, self._tangent = ensemble, controlled, fallback, tangent
         self._changes, self._with_changes = changes, dict[int, Source | None]()
         self._curvature = curvature
+        self._second: Source | None = None
         self._with_tangent: Binding | None = None
         self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
@@ -98,7 +99,8 @@ class CompiledMethod:
     @property
     def second_derivatives(self) -> Source | None:
         """The same with second derivatives, derived when first asked for."""
-        return self._curvature()
+        self._second = self._curvature()
+        return self._second
 
     def changes(self, count: int) -> Source | None:
         """The C text for many trajectories at once with so many small changes beside each, kept when asked for.
@@ -138,7 +140,10 @@ class CompiledMethod:
 
     def _why_not(self) -> str:
         if not self.interface.energy_parameter:
-            return ": of systems with damping there are first derivatives alone"
+            return (
+                ": of systems with damping there are first derivatives alone, and a pickled stepper has second ones if "
+                "they were asked for (its second_derivatives) before it was pickled"
+            )
         return (
             ": in transformed time the energy of the start is a parameter of every step, and time an integral along "
             "them. Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"

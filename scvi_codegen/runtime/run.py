@@ -25,7 +25,7 @@ class Run(Memory):
         known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
         for name in self._awaited:
             del known[f"{name}_0"]
-        return (_restored, (self.stepper, self.save(), known, self._options, self.goal))
+        return (_restored, (self.stepper, self.save(), known, self._options, self.goal, self.longest))
 
     def record(
         self, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
@@ -54,6 +54,13 @@ class Run(Memory):
 
 
 def _restored(
-    stepper: Integrator, saved: bytes, parameters: Parameters, options: SolverOptions | None, goal: Goal | None
+    stepper: Integrator,
+    saved: bytes,
+    parameters: Parameters,
+    options: SolverOptions | None,
+    goal: Goal | None,
+    longest: float = 0.0,
 ) -> Run:
-    return Run.restored(stepper, saved, parameters=parameters, options=options, goal=goal)
+    run = Run.restored(stepper, saved, parameters=parameters, options=options, goal=goal)
+    run.longest = longest
+    return run

@@ -39,10 +39,8 @@ class Stepper(Ensembles):
     """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        second = (
-            self.second_derivatives if self._with_curvature else None
-        )  # what takes long to derive goes if it is there
-        texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives, second)
+        # what takes long to derive, second derivatives and changes, goes if it was asked for
+        texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives, self._second)
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events, self._with_changes))
 
     @takes(StateError, progress=FUNCTION)
@@ -252,7 +250,7 @@ def _rebuild(
     with_changes: Mapping[int, Source | None],
 ) -> Stepper:
     ensemble, controlled, fallback, tangent, curvature = (*texts, None, None)[:5]
-    return Stepper(
+    stepper = Stepper(
         source,
         interface,
         ensemble=lambda: ensemble,
@@ -264,3 +262,6 @@ def _rebuild(
         flags=flags,
         events=events,
     )
+    stepper._second = curvature
+    stepper._with_changes.update(with_changes)
+    return stepper

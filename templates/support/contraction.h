@@ -1,7 +1,7 @@
 /* When sweeps have come near enough to their fixed point. Before it: SWEEPS_AFTER, how many sweeps follow the last one
  * that is measured. Changes are squared, as are the thresholds here. */
 
-#define MARGIN 16.0 /* what is left is to be less than a quarter of the tolerance */
+#define MARGIN 16.0 /* what is left is to be a quarter of the tolerance, a half where sweeps contract slowly */
 #define FASTEST_CONTRACTION 1e-6 /* what a thousandfold contraction in one sweep is believed to be */
 #define SLOWEST_CONTRACTION 0.5 /* and what slower ones are taken for: they end where they stop shrinking */
 #define ROUNDING_LEVEL 1e-25 /* changes below 3e-13 of the state may be rounding */

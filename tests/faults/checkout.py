@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import subprocess
 from pathlib import Path
 
-__all__ = ["ROOT", "TOO_LONG", "copied", "run"]
+__all__ = ["ROOT", "copied", "run"]
 
 ROOT = Path(__file__).resolve().parents[2]
-TOO_LONG = 600
-"""Seconds after which what does not end counts as noticed."""
+TOO_LONG = 300
+"""Seconds of work of one process, after which what does not end counts as noticed, on a busy machine, too."""
+WAITED_FOR = 10 * TOO_LONG
+"""Seconds by the clock, for what waits and never works."""
 OF_TESTS = tuple(f"tests/{name}" for name in ("oracles", "tools", "faults"))
 
 
@@ -31,10 +34,21 @@ def run(copy: Path, *command: str) -> tuple[int, str]:
     }
     try:
         found = subprocess.run(
-            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TOO_LONG, check=False
+            command,
+            cwd=copy,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=WAITED_FOR,
+            check=False,
+            preexec_fn=_limited,
         )
     except subprocess.TimeoutExpired:
         return 1, "it does not end"
     lines = (found.stdout.strip() or found.stderr.strip()).splitlines() or [""]
     failed = [line for line in lines if line.startswith(("FAILED", "ERROR", "BROKEN"))] or lines
     return found.returncode, failed[-1]
+
+
+def _limited() -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (TOO_LONG, TOO_LONG))

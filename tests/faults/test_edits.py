@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from checkout import ROOT, copied, run
-from mutate import NEAR
+from near import NEAR
 from tiers import first_of_each
 
 Edit = dict[str, str]

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import shutil
+import subprocess
 from contextlib import nullcontext, suppress
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,3 +66,116 @@ def test_slow_sweeps_are_not_taken_for_rounding():
         with nullcontext() if h < 3.5 else suppress(StepFailedError):
             found = np.concatenate(sweeps.step([1.0], [0.3], h))
             assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)
+
+
+VERDICTS = """
+#include <float.h>
+#include <math.h>
+enum {{ M = 3, SWEEPS_AFTER = {after} }};
+typedef double number;
+typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
+static double larger(double a, double b) {{ return a > b ? a : b; }}
+static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
+static double number_of(double x) {{ return x; }}
+#include "{header}"
+int verdict(double change, double last, double tolerance, int absolute, int k)
+{{
+  const solver_options options = {{tolerance, 40, absolute}};
+  return sweep_status(change * change, last * last, &options, k);
+}}
+int continued(long long steps, double change) {{ return (int)steps_to_continue(steps, change * change); }}
+void scales(double absolute, double *size)
+{{
+  const solver_options options = {{1e-7, 40, absolute > 0.0}};
+  invert_sizes(&options, absolute, size);
+}}
+"""
+
+
+@cache
+def header(folder: Path, after: int):
+    """The functions of the header alone, of changes that are not squared."""
+    compiler = shutil.which("cc") or pytest.skip("there is no C compiler")
+    path = Path(__file__).parents[2] / "templates/support/contraction.h"
+    (folder / f"{after}.c").write_text(VERDICTS.format(after=after, header=path))
+    command = [compiler, "-std=c99", "-shared", "-fPIC", f"{after}.c", "-o", f"{after}.so", "-lm"]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    found = ctypes.CDLL(str(folder / f"{after}.so"))
+    found.verdict.argtypes = [ctypes.c_double] * 3 + [ctypes.c_int] * 2
+    found.continued.argtypes = [ctypes.c_longlong, ctypes.c_double]
+    found.scales.argtypes = [ctypes.c_double, ctypes.c_void_p]
+    return found
+
+
+ON, DONE, GIVEN_UP = 0, 1, -1
+ROUNDED = 2.0**-53
+TABLE = [
+    # change, the one before, tolerance, absolute, sweep; verdict
+    ("shrinking", 1e-6, 1e-4, ROUNDED, 0, 3, ON),
+    ("shrinking, but slowly where sweeps are far from rest", 0.8e-6, 1e-6, ROUNDED, 0, 5, GIVEN_UP),
+    ("as slowly, among the first sweeps", 0.8e-6, 1e-6, ROUNDED, 0, 4, ON),
+    ("fast enough, a little", 0.7e-6, 1e-6, ROUNDED, 0, 5, ON),
+    ("as slowly, near rest", 0.8e-10, 1e-10, ROUNDED, 0, 5, ON),
+    ("too many sweeps", 1e-6, 1e-4, ROUNDED, 0, 40, GIVEN_UP),
+    ("one sweep less", 1e-6, 1e-4, ROUNDED, 0, 39, ON),
+    ("growing at 1e-9 of the state: no rounding is that large", 1.1e-9, 1e-9, ROUNDED, 0, 3, ON),
+    ("growing at 1e-12", 1.1e-12, 1e-12, ROUNDED, 0, 3, ON),
+    ("growing at 4e-13", 4e-13, 3.9e-13, ROUNDED, 0, 3, ON),
+    ("growing at the level of rounding", 2.5e-13, 2.4e-13, ROUNDED, 0, 3, DONE),
+    ("the same by chance", 2.5e-13, 2.5e-13, ROUNDED, 0, 1, DONE),
+    ("shrinking at the level of rounding", 1e-13, 2e-13, ROUNDED, 0, 3, ON),
+    ("nothing at all", 0.0, 1e-3, ROUNDED, 0, 2, DONE),
+    ("nothing at all, at once", 0.0, np.inf, ROUNDED, 0, 0, DONE),
+    ("not a number", np.nan, 1e-3, ROUNDED, 0, 2, GIVEN_UP),
+    ("infinite", np.inf, 1e-3, ROUNDED, 0, 2, GIVEN_UP),
+    ("slowly, well below the tolerance", 1e-8, 1.1e-8, 1e-7, 0, 3, DONE),
+    ("the first, far below the tolerance", 1e-17, np.inf, ROUNDED, 0, 0, DONE),
+    ("the first, large", 1e-12, np.inf, ROUNDED, 0, 0, ON),
+    ("absolute, below", 0.9e-6, 1e-3, 1e-6, 1, 2, DONE),
+    ("absolute, above", 1.1e-6, 1e-3, 1e-6, 1, 2, ON),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "last", "tolerance", "absolute", "k", "expected"), [x[1:] for x in TABLE], ids=[x[0] for x in TABLE]
+)
+@pytest.mark.parametrize("after", [0, 1])
+def test_verdicts_on_a_sweep(tmp_path_factory, after, change, last, tolerance, absolute, k, expected):
+    verdict = header(tmp_path_factory.getbasetemp(), after).verdict
+    assert verdict(change, last, tolerance, absolute, k) == expected
+
+
+@pytest.mark.parametrize("after", [0, 1])
+@pytest.mark.parametrize("rate", [0.01, 0.1, 0.3, 0.6])
+def test_what_is_left_when_sweeps_end_is_a_quarter_of_the_tolerance(tmp_path_factory, after, rate):
+    """Changes that shrink by one rate: what all sweeps to come, but those that follow anyway, would add up to.
+
+    At most; up to half of it where they contract slowly, for 1 / (1 - r) is taken from squares.
+    """
+    tolerance, change = 1e-7, 1e-5
+    verdict = header(tmp_path_factory.getbasetemp(), after).verdict
+    ends = [k for k in range(60) if verdict(change * rate**k, change * rate ** (k - 1), tolerance, 0, 3) == DONE]
+    left = [change * rate ** (k + 1 + after) / (1 - rate) for k in (ends[0], ends[0] - 1)]
+    assert left[0] < (1 + rate) * tolerance / 4 * 1.001
+    assert left[1] > (1 + rate) * tolerance / 4
+
+
+def test_guesses_are_continued_from_two_steps_after_one_that_was_near(tmp_path_factory):
+    continued = header(tmp_path_factory.getbasetemp(), 0).continued
+    cases = {(0, 1e-9): 1, (1, 1e-9): 2, (2, 0.9e-3): 2, (1, 1.1e-3): 1, (2, 1.1e-3): 1}
+    assert {case: continued(*case) for case in cases} == cases
+
+
+@pytest.mark.parametrize("absolute", [0.0, 0.25])
+def test_sizes_are_inverted_and_what_rests_at_zero_has_one(tmp_path_factory, absolute):
+    scales = header(tmp_path_factory.getbasetemp(), 0).scales
+    for sizes in ([4.0, 0.5, 0.0], [0.0, 2.0**-40, 8.0], [0.0, 0.0, 0.0], [1.0, np.inf, 2.0]):
+        found = np.array(sizes)
+        scales(absolute, found.ctypes.data)
+        if not np.isfinite(max(sizes)):
+            assert np.isnan(found).all()
+        elif absolute:
+            assert np.array_equal(found, [absolute] * 3)
+        else:
+            least = np.finfo(float).eps * max(sizes) + np.finfo(float).tiny
+            assert found == pytest.approx(1.0 / (np.array(sizes) + least), rel=1e-15)

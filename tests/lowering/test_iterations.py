@@ -14,7 +14,9 @@ from certified_cases import case
 from samples import QUICK_FLAGS
 
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.ensemble import Ensemble, LaneBlock
 from scvi_codegen.runtime.stepper import Stepper
 
 STEPS = 100
@@ -51,6 +53,21 @@ def test_runs_take_as_many_iterations_as_they_did(name, solver):
     assert counts == pytest.approx([*expected.values()], rel=ROUNDING, abs=2)
 
 
+@pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
+def test_lanes_take_as_many_sweeps_as_single_runs(name):
+    """From the same state in every lane: guesses from one step and from two are as good in a block."""
+    given, own = case(name), stepper(name, "fixed-point")
+    for part in (1, 8, 64):
+        h = given.h / part
+        work = Ensemble(own, [given.q] * 8, [given.p] * 8, h=h, steps=STEPS)
+        make, _ = work.blocks()
+        block = make(0)
+        assert isinstance(block, LaneBlock)
+        block.advance(STEPS)
+        run = own.integrate(given.q, given.p, h=h, steps=STEPS)
+        assert block.memory.sweeps == pytest.approx(int(run.iterations.sum()), rel=ROUNDING, abs=2)
+
+
 @pytest.mark.parametrize("name", CONTINUED)
 def test_two_former_steps_say_more_than_one(name):
     """What one sweep leaves to be done after the first step, and after the third: another table serves then."""
@@ -71,3 +88,19 @@ def test_factors_of_newtons_matrix_serve_the_next_step_where_steps_are_short():
     run = stepper("chain/svi-4", "newton").start(given.q, given.p, h=given.h / 64)
     run.skip(3)
     assert run._memory.guess == 2
+
+
+@pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 154)), ("tangle/scvi", (22, 74))])
+def test_steps_that_choose_their_length_are_guessed_by_the_one_before(name, expected):
+    """By Newton's iteration, where it was as long: steps, and iterations of all."""
+    given = case(name)
+    run = stepper(name, "newton").integrate(given.q, given.p, t_end=10 * given.h, tolerance=1e-6)
+    assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
+
+
+def test_kept_factors_take_two_looks_where_nothing_is_left_to_do():
+    """Factors of another point must have shrunk an update once before one that is small says anything."""
+    own = problem("fput-chain").system
+    rest = [0.0] * own.dimension
+    run = compile_stepper(own, "svi:4", solver="newton", flags=QUICK_FLAGS).integrate(rest, rest, h=0.01, steps=5)
+    assert run.iterations[1:].tolist() == [1, 2, 2, 2, 2]

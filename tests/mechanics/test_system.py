@@ -16,6 +16,7 @@ from sympy.physics.mechanics import LagrangesMethod, Particle, Point, ReferenceF
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
 from scvi_codegen.formulas.symbols import C_KEYWORDS
+from scvi_codegen.mechanics.forms import curve_rates, forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 T = dynamicsymbols._t
@@ -343,3 +344,20 @@ def test_a_large_coupled_mass_matrix() -> None:
     with pytest.raises(SystemDefinitionError, match="singular"):
         from_text(" ".join(names), coupled)
     assert from_text(" ".join(names), coupled + " + x0_dot**2").dimension == 40
+
+
+def test_rates_along_a_curve_are_those_of_its_taylor_series():
+    """dL/dt and d2L/dt2 of a system with velocities in every term, beside L along a given curve of time."""
+    system = LagrangianSystem.from_text(
+        name="twisted",
+        coordinates=["x", "y"],
+        lagrangian="x_dot**2*y/2 + y_dot**2*exp(x)/2 + t*x*y_dot - x**2*y + sin(t)*x",
+    )
+    t = system.time
+    curve = dict(zip(system.coordinates, (sympy.sin(t), t**3 + 2 * t), strict=True))
+    names = [*system.coordinates, *system.velocities, *(s for group in curve_rates(system, 2) for s in group)]
+    along = [x.diff(t, k) for k in range(4) for x in curve.values()]
+    values = dict(zip(names, along, strict=False))
+    exact = system.lagrangian.subs(values)
+    for k, rate in enumerate(forms_of(system).rates(2), 1):
+        assert sympy.simplify(rate.subs(values) - exact.diff(t, k)) == 0

@@ -13,6 +13,7 @@ import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.runtime.clock import part_of_step
 from scvi_codegen.tables.precision import mp
 
 KEPLER = sc.LagrangianSystem.from_text(
@@ -277,3 +278,20 @@ def test_what_is_not_made_for_transformed_time_is_refused():
     system = sc.reparametrise(sc.problem("kepler").system, "frequency")
     with pytest.raises(sc.MethodError, match="of which there is no advice"):
         sc.advise(system, sc.SVI(4), [1.9, 0.0], [0.0, 0.2], span=10.0, tolerance=1e-9)
+
+
+@pytest.mark.parametrize("h", [0.05, 0.4, -0.4])
+def test_the_part_of_a_step_is_that_which_ends_at_the_time(h: float) -> None:
+    """Along an orbit on which the rate changes a hundredfold: the step of that part, taken alone, ends there."""
+    made = stepper("L", "newton")
+    run = made.integrate(*START, h=h, steps=40)
+    values = made.parameters_at(*map(np.asarray, START))
+    for k in range(0, 40, 3):
+        for share in (1e-12, 0.02, 0.5, 0.98, 1.0):
+            end = run.t[k] + share * (run.t[k + 1] - run.t[k])
+            q, p, part = part_of_step(made, run.t[k], h, end, run.q[k], run.p[k], values, None)
+            assert 0.0 < part <= 1.0
+            short = made.integrate(run.q[k], run.p[k], h=part * h, steps=1, t=run.t[k], parameters=values)
+            assert abs(short.t[1] - end) <= 6 * 2.0**-52 * max(abs(end), abs(run.t[k]), abs(end - run.t[k]))
+            assert np.array_equal(short.q[1], q)
+            assert np.array_equal(short.p[1], p)

@@ -385,3 +385,12 @@ def test_inputs_of_a_hamiltonian(pendulum):
     assert told == taken
     found = compile_stepper(told, SVI(6)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     assert_allclose(found.q, expected.q, atol=1e-13)
+
+
+def test_the_step_of_a_driven_run_is_that_of_its_first_piece(pendulum):
+    stepper = compile_stepper(pendulum, "svi:2")
+    inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
+    for h in (0.1, 0.4):
+        run = stepper.drive([0.3], [0.1], inputs=inputs, h=h, t_end=2.3)
+        assert run.h == run.t[1] - run.t[0] == min(h, KNOTS[1])
+    assert stepper.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1

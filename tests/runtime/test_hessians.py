@@ -86,6 +86,19 @@ def test_it_is_the_derivative_of_the_gradient_of_any_run_of_steps(stepper, optio
     assert v[:-1] @ found[:, 1] == pytest.approx(w[:-1] @ found[:, 0], rel=1e-11)
 
 
+def test_many_directions_are_as_good_as_each_alone(stepper):
+    """More of them than are taken through a step at once."""
+    run = run_from(stepper, START)
+    weights, bends = square(len(run), 3)
+    directions = np.random.default_rng(4).normal(size=(stepper.given, 19))
+    many = run.hessian_product(weights, directions, bends)
+    names = ("q", "p", "parameters", "t", "h")
+    for k in range(directions.shape[1]):
+        alone = run.hessian_product(weights, directions[:, k], bends)
+        for name in names:
+            assert_allclose(np.asarray(getattr(many, name))[..., k], getattr(alone, name), rtol=1e-12, atol=1e-12)
+
+
 def test_a_long_run_has_the_hessian_of_its_pieces(stepper):
     """More steps than are linearised at a time, with all states and with few."""
     weights, bends = square(2501, 3)

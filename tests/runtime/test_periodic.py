@@ -217,3 +217,11 @@ def test_names_of_a_state_are_each_its_own():
     along = periodic_orbit(stepper, *given, period=6.0, steps=60, hold=["p_x", "p_p_x", "x"])
     assert along.p[0] != 0.3
     assert periodic_orbit(stepper, *given, period=6.0, steps=60, hold=["_p_x"]).p[0] == 0.3
+
+
+@pytest.mark.parametrize("q", [0.0, np.pi])
+def test_a_state_at_rest_is_named_as_such(q):
+    """Every period closes it."""
+    own = compile_stepper(problem("planar-pendulum").system, SVI(4))
+    with pytest.raises(OrbitError, match="a state at rest"):
+        periodic_orbit(own, [q], [0.0], period=2.0, steps=40)

@@ -17,12 +17,13 @@ from scvi_codegen.tables.basis import (
     continuation,
     differentiation_matrix,
     extrapolation,
+    legendre_functional,
     matrix_product,
     transpose,
 )
 from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.tables.precision import Matrix, Vector, mp
-from scvi_codegen.tables.quadrature import gauss_legendre
+from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
 
 FIFTY_DIGITS = mp.mpf("1e-50")
 
@@ -163,3 +164,15 @@ def test_products_and_transposes() -> None:
 def test_impossible_requests_are_refused(call: object, message: str) -> None:
     with pytest.raises(MethodError, match=message):
         call()
+
+
+@pytest.mark.parametrize("count", range(1, 12))
+@pytest.mark.parametrize("nodes", [lambda n: gauss_legendre(n).abscissae, lambda n: [Fraction(k, n) for k in range(n)]])
+def test_coefficients_of_legendre_polynomials_are_one_and_zero(count, nodes):
+    points = tuple(mp.mpf(c) if not isinstance(c, Fraction) else number(c) for c in nodes(count))
+    values = {k: [legendre_value(k, 2 * c - 1) for c in points] for k in range(count)}
+    for degree in range(count):
+        functional = legendre_functional(points, degree)
+        for k, own in values.items():
+            assert abs(mp.fdot(functional, own) - (k == degree)) < mp.mpf("1e-45")
+    assert legendre_functional(points, -1) == (mp.zero,) * count

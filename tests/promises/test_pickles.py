@@ -1,0 +1,149 @@
+"""What was chosen survives pickling: every option of a stepper and of a run; no default takes its place."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.models.problems import problem
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.stepper import Stepper
+
+Q, P = [0.3, 0.8], [-1.1, 0.4]
+H, STEPS = 0.1, 6
+KEPLER = problem("kepler").system
+STEPPERS: dict[str, dict[str, Any]] = {
+    "": {},
+    "solver": {"solver": "newton"},
+    "flags": {"flags": (*QUICK_FLAGS, "-DCHOSEN")},
+    "prefix": {"prefix": "chosen"},
+    "symmetries": {"symmetries": [sc.check_symmetry(KEPLER, ["q2 + 0*q1", "-q1"])]},
+    "events": {"events": ["q1 - 0.25", sc.Event("q2 - 0.7", direction=-1)]},
+    "monitor": {"monitor": "distance"},
+}
+"""By the option that it is not the default of."""
+
+
+@cache
+def stepper(option: str) -> Stepper:
+    return compile_stepper(KEPLER, "svi:3", **{"flags": QUICK_FLAGS, **STEPPERS[option]})
+
+
+def copied(given: Any) -> Any:
+    return pickle.loads(pickle.dumps(given))
+
+
+def test_every_option_of_a_stepper_stands_in_the_table() -> None:
+    signature = inspect.signature(compile_stepper)
+    options = {name for name, each in signature.parameters.items() if each.kind is each.KEYWORD_ONLY}
+    assert options == set(STEPPERS) - {""}
+
+
+@pytest.mark.parametrize("option", STEPPERS)
+def test_a_stepper_is_what_it_was(option: str) -> None:
+    own = stepper(option)
+    made = {"changes": own.changes(2), "second_derivatives": own.second_derivatives}  # which go if asked for
+    for copy in (copied(own), copied(copied(own))):
+        kept = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
+        assert [name for name in kept if getattr(copy, name) != getattr(own, name)] == []
+        assert {"changes": copy.changes(2), "second_derivatives": copy.second_derivatives} == made
+        goal: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "monitor" else {"h": H, "steps": STEPS}
+        runs = [each.integrate(Q, P, **goal) for each in (own, copy)]
+        assert_same(*runs)
+        assert [len(each) for each in runs[0].events] == [len(each) for each in runs[1].events]
+        if option != "monitor":
+            assert_same(*(each.integrate(Q, P, t_end=0.5) for each in (own, copy)))
+            assert_same(*(each.integrate_ensemble([Q], [P], h=H, steps=STEPS) for each in (own, copy)))
+
+
+def test_second_derivatives_that_were_not_asked_for_are_missed_by_name() -> None:
+    with pytest.raises(sc.MethodError, match="asked for"):
+        _ = copied(compile_stepper(KEPLER, "svi:2", flags=QUICK_FLAGS)).curvature
+
+
+def assert_same(one: Any, other: Any) -> None:
+    assert np.array_equal(one.t, other.t)
+    assert np.array_equal(one.q, other.q)
+    assert np.array_equal(one.p, other.p)
+
+
+OWN = sc.SolverOptions(tolerance=1e-9, max_iterations=37)
+RUNS: dict[str, dict[str, Any]] = {
+    "h": {"h": H},
+    "t": {"h": H, "t": 1.5},
+    "t_end": {"t_end": 1.2},
+    "tolerance": {"t_end": 1.2, "tolerance": 1e-7},
+    "parameters": {"h": H, "parameters": {"mu": 1.3}},
+    "options": {"h": H, "options": OWN},
+    "velocity": {"h": H, "velocity": P},
+}
+"""By the argument of ``start`` that it is about."""
+
+
+def test_every_argument_of_a_run_stands_in_the_table() -> None:
+    assert set(inspect.signature(Stepper.start).parameters) - {"self", "q", "p"} == set(RUNS)
+
+
+@pytest.mark.parametrize("argument", RUNS)
+@pytest.mark.parametrize("steps", [0, 3])
+def test_a_run_goes_on_as_it_would_have(argument: str, steps: int) -> None:
+    given = RUNS[argument]
+    run = stepper("").start(Q, None if "velocity" in given else P, **given)
+    run.record(steps)
+    check_same_run(run, copied(run), lambda each: each.record(None if each.goal else STEPS))
+
+
+def test_a_run_of_a_monitor_goes_on_as_it_would_have() -> None:
+    run = stepper("monitor").start(Q, P, h=0.2, t_end=0.9)
+    run.record(2)
+    check_same_run(run, copied(run), Run.record)
+
+
+def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
+    for name in ("t", "h", "goal", "options", "steps", "longest"):
+        assert getattr(copy, name) == getattr(run, name), name
+    assert np.array_equal(copy.parameters, run.parameters)
+    assert copy.save() == run.save()
+    assert_same(record(run), record(copy))
+
+
+def test_a_run_may_be_given_another_goal_and_keeps_it() -> None:
+    run = stepper("").start(Q, P, t_end=5.0)
+    run.change(goal=Goal(t_end=0.7, tolerance=1e-6))
+    assert copied(run).goal == Goal(t_end=0.7, tolerance=1e-6)
+    assert copied(run).record().t[-1] == 0.7
+
+
+@cache
+def driven() -> Stepper:
+    system = sc.LagrangianSystem.from_text(
+        name="cart with two forces",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - x**2/2 + u*x + w*x**2",
+        inputs=["u", "w"],
+    )
+    return compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
+
+
+@pytest.mark.parametrize("held", [(), ("u",), ("w",), ("u", "w")])
+def test_a_run_waits_for_the_inputs_that_were_not_given(held: tuple[str, ...]) -> None:
+    run = driven().start([0.3], [0.1], h=H)
+    run.hold(**dict.fromkeys(held, 0.7))
+    copy = copied(run)
+    for each in (run, copy):
+        for name in {"u", "w"} - set(held):
+            with pytest.raises(sc.StateError, match=name):
+                each.skip(1)
+            each.hold(**{name: 0.2})
+        each.skip(2)
+    assert copy.save() == run.save()

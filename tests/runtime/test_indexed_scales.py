@@ -1,0 +1,71 @@
+"""Sums over indices know no size of their own: a linear system scaled by a power of two moves the same, bit for bit.
+
+How many iterations runs of them take stands beside it: what is slower than it was has forgotten former steps.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+SMALL = 2.0**-40
+STEPS = 40
+Q = np.sin(np.arange(6.0)) + 0.1
+P = np.cos(2.0 * np.arange(6.0)) / 2
+WAYS = {
+    ("svi:4", "fixed-point"): {0.1: 83, 0.4: 280},
+    ("svi:4", "newton"): {0.1: 81, 0.8: 120},
+    ("stoermer-verlet", "fixed-point"): {0.1: 40},
+    ("hamiltonian", "fixed-point"): {0.1: 162, 0.4: 361},
+}
+"""Iterations of so many steps of h, when each was looked at."""
+
+
+def springs(form):
+    energy = "sum(i in N periodic, (q[i+1] - q[i])**2)/2 + sum(i in N, q[i]**2)/2"
+    if form == "hamiltonian":
+        momenta = "sum(i in N, p[i]**2)/2 + sum(i in N, q[i]*p[i])/8"
+        return sc.IndexedSystem.from_text(
+            name="springs", coordinates=["q[N]"], momenta=["p[N]"], hamiltonian=f"{momenta} + {energy}"
+        )
+    return sc.IndexedSystem.from_text(
+        name="springs", coordinates=["q[N]"], lagrangian=f"sum(i in N, q_dot[i]**2)/2 - ({energy})"
+    )
+
+
+@cache
+def run_of(method, solver, h, scale):
+    form = "hamiltonian" if method == "hamiltonian" else ""
+    made = sc.compile_indexed(springs(form), "svi:4" if form else method, solver=solver)
+    run = made.start(scale * Q, scale * P, h=h)
+    run.advance(STEPS)
+    return run
+
+
+EACH = [(*way, h) for way, counts in WAYS.items() for h in counts]
+
+
+@pytest.mark.parametrize(("method", "solver", "h"), EACH)
+def test_a_linear_system_is_the_same_at_every_scale(method, solver, h):
+    one, small = run_of(method, solver, h, 1.0), run_of(method, solver, h, SMALL)
+    assert np.array_equal(SMALL * one.q["q"], small.q["q"])
+    assert np.array_equal(SMALL * one.p["q"], small.p["q"])
+    assert small.iterations == one.iterations
+
+
+@pytest.mark.parametrize(("method", "solver", "h"), EACH)
+def test_runs_take_as_many_iterations_as_they_did(method, solver, h):
+    assert run_of(method, solver, h, 1.0).iterations == pytest.approx(WAYS[method, solver][h], rel=0.02, abs=2)
+
+
+def test_a_momentum_that_is_no_number_is_no_step():
+    """The last kick of a leapfrog step is at a wall, which the positions just reach."""
+    wall = sc.IndexedSystem.from_text(
+        name="wall", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2)/2 - sum(i in N, 1/(q[i] - 1))"
+    )
+    run = sc.compile_indexed(wall, "stoermer-verlet").start([0.0], [0.5], h=1.0)
+    with pytest.raises(sc.StepFailedError, match="finite"):
+        run.advance(1)
+    assert run.q["q"][0] == 0.0
