@@ -475,6 +475,16 @@ class TestTables:
         assert stiff.stretch < 1e-5 < soft.stretch < 1e-2
         assert stiff.energy < 1e-4
 
+    def test_what_is_unstable_says_so_and_leaves_no_file(self, monkeypatch, tmp_path):
+        """MuJoCo would write its warnings into the working folder."""
+        pytest.importorskip("mujoco", reason="extra bench")
+        monkeypatch.chdir(tmp_path)
+        chain = held_bodies.HELD["chain"]()
+        move = held_bodies.mujoco_motion(chain, "Euler")
+        rows = list(held._rows(chain, "MuJoCo", move, (100, 1000), bench.Plan()))
+        assert ["unstable" in row.get("why_not", "") for row in rows] == [True, False]
+        assert not list(tmp_path.iterdir())
+
     def test_rows_of_held_bodies_are_told_at_equal_time(self, monkeypatch):
         monkeypatch.setattr(held, "OUR_STEPS", (1000, 500))
         monkeypatch.setattr(held, "_others", lambda bodies: [("other", held.our_motion(bodies, "svi:1"))])
