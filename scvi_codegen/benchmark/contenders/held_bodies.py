@@ -6,8 +6,8 @@
                by its equality ``connect``
 
 A contender gives a function of (step, number of steps): how energies at the end of ten equal parts differ, how far rods
-are off their lengths there, and the processor time that the steps took. It raises :class:`ArithmeticError` where a step is
-too long.
+are off their lengths there, and the processor time that the steps took. It raises :class:`ArithmeticError` where a step
+is too long.
 """
 
 from __future__ import annotations
