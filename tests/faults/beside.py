@@ -67,10 +67,10 @@ DAMPING = (
 RATTLES = tuple(
     text(f"{what}, rods/rattle", case("rods/rattle"), *edit)
     for what, *edit in (
-        ("a hidden constraint without g_t", r"value \+ M, lambda\)", "value + M + CONSTRAINTS, lambda)"),
-        ("half of the force at the end", r"now\.force\[i\] \+ force\[i\]", "now.force[i] + force[i] / 2"),
-        ("constraints of the start of a step", r"constraints\(u, step->t \+ step->h", "constraints(u, step->t"),
-        ("masses that are not inverted", r"now\.inverse_mass\[i\] = 1 / now", "now.inverse_mass[i] = now"),
+        ("a hidden constraint without g_t", r"value \+ M, 1, lambda\)", "value + M + CONSTRAINTS, 1, lambda)"),
+        ("half of the force at the end", r"now->force\[i \* B \+ DEGREE\];", "now->force[i * B + DEGREE] / 2;"),
+        ("constraints of the start of a step", r"step->t \+ HELD_ABSCISSA\[n\] \* step->h;", "step->t;"),
+        ("masses that are not inverted", r"now->inverse_mass\[i\] = 1 / now", "now->inverse_mass[i] = now"),
     )
 )
 
