@@ -162,7 +162,7 @@ class TestReference:
 
     def test_oscillator_with_a_span_that_is_no_multiple_of_the_step(self):
         start = np.array([[1.0, 0.0]], dtype=np.longdouble)
-        end = final_states(lambda x: np.stack([x[..., 1], -x[..., 0]], axis=-1), start, 10.1, 0.75)
+        end = final_states(lambda x, t: np.stack([x[..., 1], -x[..., 0]], axis=-1), start, 10.1, 0.75)
         t = np.longdouble(10.1)
         assert np.abs(end[0] - [np.cos(t), -np.sin(t)]).max() < 2e-18
 

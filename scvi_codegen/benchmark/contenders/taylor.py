@@ -189,7 +189,7 @@ def _formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:
     for formulation in case.formulations:
         yield formulation.name, list(zip(x, formulation.rates(x, case.parameters, heyoka), strict=True)), formulation
     plain = case.formulations[0]
-    if m <= LARGEST_LAGRANGIAN:
+    if m <= LARGEST_LAGRANGIAN and not any(case.system.forces):
         yield LAGRANGIAN, _from_lagrangian(case), plain
     if case.bodies is not None and not case.bodies.fixed_centre:
         yield "heyoka.model.nbody", _n_bodies(case), plain
