@@ -79,7 +79,7 @@ def _rods(name: str, n: int, start: float, *, methods: tuple[str, ...], span: fl
 CONSTRAINED_CASES: Mapping[str, Callable[[], ConstrainedCase]] = {
     "pendulum": partial(_rods, "pendulum", 1, 0.5, methods=("svi:6", "svi:8"), span=1000.0, fine=0.25),
     "double-pendulum": partial(_rods, "double-pendulum", 2, 0.5, methods=("svi:6", "svi:8"), span=200.0, fine=0.125),
-    "chain:8": partial(_rods, "chain:8", 8, 0.3, methods=("svi:4", "svi:6"), span=100.0, fine=0.125),
-    "chain:32": partial(_rods, "chain:32", 32, 0.3, methods=("svi:4", "svi:6"), span=50.0, fine=0.0625),
+    "chain:5": partial(_rods, "chain:5", 5, 0.3, methods=("svi:6",), span=100.0, fine=0.125),
+    "chain:20": partial(_rods, "chain:20", 20, 0.3, methods=("svi:6",), span=50.0, fine=0.0625),
 }
 """By the name after ``constrained:``."""

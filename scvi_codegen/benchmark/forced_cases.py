@@ -3,7 +3,7 @@
     duffing           damped and driven in one of its wells
     cart-pole         a crane: friction of the cart and of the hinge, the cart driven
     double-pendulum   friction in both joints, a motor in the first
-    chain:8           the same of eight rods
+    chain:5           the same of five rods
 
 Drives keep the motions going for as long as they are followed.
 """
@@ -107,6 +107,6 @@ FORCED_CASES: Mapping[str, Callable[[], Case]] = {
     "duffing": _duffing_case,
     "cart-pole": _crane_case,
     "double-pendulum": partial(_rods_case, "double-pendulum", 2, span=200.0, fine=0.125),
-    "chain:8": partial(_rods_case, "chain:8", 8, span=100.0, fine=0.125),
+    "chain:5": partial(_rods_case, "chain:5", 5, span=100.0, fine=0.125),
 }
 """By the name after ``forced:``."""
