@@ -6,11 +6,14 @@ import math
 import os
 import shutil
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import sympy
 from mpmath import mp
+from scipy.integrate import solve_ivp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import (
@@ -28,14 +31,18 @@ from scvi_codegen.benchmark import (
     start_up,
     sums,
 )
+from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders import held_bodies, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
 from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
+from scvi_codegen.benchmark.forced_cases import FORCED_CASES
+from scvi_codegen.benchmark.hanging_rods import angles_of, rod_accelerations
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -80,6 +87,41 @@ class TestCases:
             for other, its_velocity, n in zip(system.coordinates, system.velocities, range(m), strict=True):
                 residual += momentum.diff(other) * x[m + n] + momentum.diff(its_velocity) * rates[m + n]
             assert abs(float(residual.subs(place))) < 1e-12
+
+    @pytest.mark.parametrize("name", FORCED_CASES)
+    def test_hand_solved_forces_are_those_of_the_equations_of_motion(self, name):
+        """d/dt L_v = L_q + f at a random state and time, in exact numbers but for sines."""
+        chosen = FORCED_CASES[name]()
+        system, m, t = chosen.system, chosen.dimension, 0.7
+        x = [sympy.Rational(int(value), 1000) for value in np.random.default_rng(3).integers(100, 600, 2 * m)]
+        functions = SimpleNamespace(sin=sympy.sin, cos=sympy.cos, sqrt=sympy.sqrt, time=t)
+        rates = chosen.formulations[0].rates(x, chosen.parameters, functions)
+        place = dict(zip((*system.coordinates, *system.velocities, system.time), (*x, t), strict=True))
+        place |= dict(zip(system.parameters, system.defaults, strict=True))
+        for q, v, force in zip(system.coordinates, system.velocities, system.forces, strict=True):
+            momentum, residual = system.lagrangian.diff(v), -system.lagrangian.diff(q) - force
+            for n, (other, its) in enumerate(zip(system.coordinates, system.velocities, strict=True)):
+                residual += momentum.diff(other) * x[m + n] + momentum.diff(its) * rates[m + n]
+            assert abs(float(residual.subs(place))) < 1e-12
+        assert abs(float(system.forces[0].subs(place))) > 1e-3
+
+    @pytest.mark.parametrize("name", ["pendulum", "double-pendulum", "chain:5"])
+    def test_rods_in_angles_obey_their_lagrangian_and_move_as_the_constraints_do(self, name):
+        both = CONSTRAINED_CASES[name]()
+        assert np.abs(angles_of(both.places.q) - both.angles.q).max() < 1e-15
+        stepper = compile_stepper(both.places.system, "svi:4")
+        end = stepper.integrate(*stepper.project(both.places.q[0]), h=0.02, steps=50).q[-1]
+        accelerations = partial(rod_accelerations, of=both.angles.parameters, functions=np)
+        start = np.concatenate([both.angles.q[0], both.angles.velocity[0]])
+        exact = solve_ivp(
+            lambda t, x: [*x[len(x) // 2 :], *accelerations(x[: len(x) // 2], x[len(x) // 2 :])],
+            (0.0, 1.0),
+            start,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-14,
+        ).y[: len(start) // 2, -1]
+        assert np.abs(angles_of(end) - exact).max() < 1e-10
 
     def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
         chosen = cases.case("relativistic-particle")
@@ -493,6 +535,18 @@ class TestTables:
         assert {row["bodies"] for row in rows} == {"chain", "four-bar"}
         assert all(row["ratio"] > 0.0 for row in others if row["ours_then"] is not None)
         assert any(row["ours_then"] is not None for row in others)
+
+    @pytest.mark.full
+    @needs_extended
+    def test_forced_and_constrained_problems_are_measured_at_their_errors(self, monkeypatch):
+        monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-6,))
+        for name, methods in (("forced:cart-pole", 1), ("constrained:pendulum", 2)):
+            plan = bench.Plan(peers=("scipy",), repeats=1, quick=True)
+            found = [each for each in bench.SECTIONS[name](plan, lambda text: None).measurements if not each.failure]
+            own = [each for each in found if each.method.startswith("scvi-codegen")]
+            assert len(own) == methods
+            assert all(each.error < 1e-4 and each.seconds > 0.0 for each in own)
+            assert max(each.error for each in found if each not in own) < 1e-10
 
     @pytest.mark.parametrize("lattice", [sums.ring(8, 1.0), sums.field(6, 0.2)], ids=lambda lattice: lattice.name)
     def test_lattices_by_hand_move_as_generated_ones(self, lattice):

@@ -285,13 +285,13 @@ class _Recorder:
 
 
 def _check_inputs(run: Run) -> None:
-    """Inputs of a run in a folder are held: data, whose pieces change h and parameters on the way, are not kept in it."""
+    """Inputs of a run in a folder are held: it does not keep how pieces of data change h and parameters on the way."""
     try:
         run.check_inputs()
     except StateError as error:
         raise StateError(
-            f"{error}. A folder records a run whose inputs are held at numbers; one that follows data is kept in memory "
-            "and written to a file: stepper.drive(...).save('run.npz')"
+            f"{error}. A folder records a run whose inputs are held at numbers; one that follows data is kept in "
+            "memory and written to a file: stepper.drive(...).save('run.npz')"
         ) from error
 
 
