@@ -173,9 +173,11 @@ static int meet(const step_data *step, held_step *now, const newton_data *data, 
     places(step, data->z, change);
     for (int j = 0; j < M * DEGREE; j++)
       change[j] -= now->u[j];
-    for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+      const int row = CONSTRAINT_ENTRY[e][0] * DEGREE, column = CONSTRAINT_ENTRY[e][1] * DEGREE;
       for (int r = 0; r < DEGREE; r++)
-        g[CONSTRAINT_ENTRY[e][0] * DEGREE + r] += now->slope[e * B + r + 1] * change[CONSTRAINT_ENTRY[e][1] * DEGREE + r];
+        g[row + r] += now->slope[e * B + r + 1] * change[column + r];
+    }
     if (!all_finite(g, CONSTRAINTS * DEGREE))
       return NOT_FINITE;
     solve_held(data, g, DEGREE, lambda);
