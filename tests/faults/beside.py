@@ -72,6 +72,17 @@ RATTLES = tuple(
         ("constraints of the start of a step", r"step->t \+ HELD_ABSCISSA\[n\] \* step->h;", "step->t;"),
         ("masses that are not inverted", r"now->inverse_mass\[i\] = 1 / now", "now->inverse_mass[i] = now"),
     )
+) + tuple(
+    text(f"{what}, rods/lobatto-svi", case("rods/lobatto-svi"), *edit)
+    for what, *edit in (
+        ("slopes of the next point", r"slope = now->slope \+ e \* B, \*own", "slope = now->slope + e * B + 1, *own"),
+        ("velocities of the forces before", r"HELD_MOMENTUM\[n\]\[b\] \* f", "HELD_MOMENTUM[0][b] * f"),
+        (
+            "positions but for what was cut off",
+            r"HELD_POSITION\[b\]\[r\] \* z",
+            "HELD_POSITION[b][r] * (1 + 1e-12) * z",
+        ),
+    )
 )
 
 HAMILTONIANS = (
