@@ -42,16 +42,16 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   (void)unused;
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, &data) : 1;
-  if (*guess) {
-    guess_from(memory, &data);
 #ifdef RATTLE
+  if (*guess)
+    guess_from(memory, &data);
+  if (*guess || line_from(step, &data) == OK)
     status = rattle(step, &data, dp, options, report);
-    keep = 0;
-    if (status != OK)
-      guess_from(memory, &data);
+  keep = 0;
 #endif
-    if (status != OK)
-      status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
+  if (status != OK && *guess) {
+    guess_from(memory, &data);
+    status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)
     status = newton_from_line(step, &data, dp, &keep, options, report);
