@@ -6,6 +6,7 @@
     peers         REBOUND, CyRK, JiTCODE, SciPy and (in taylor) heyoka at several tolerances
     measuring     all of them timed in turn, in one process
     racing        the above for one case, or for an ensemble of 64 trajectories
+    forced_cases  the same with friction and drives;  constrained_cases: with constraints, beside peers in angles
     curves        time at equal error, by interpolation
     report        table and JSON of these;  picture: the work-precision plot
     adaptive      steps that choose their length, on adaptive_cases; step_lengths: their picture
@@ -39,15 +40,17 @@ from scvi_codegen.benchmark.builds import run_builds
 from scvi_codegen.benchmark.cases import CASES
 from scvi_codegen.benchmark.compile_times import run_compile_times
 from scvi_codegen.benchmark.compositions import run_compositions
+from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.drift import run_drift
+from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hand_written import run_hand_written
 from scvi_codegen.benchmark.held import run_held
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.mechanisms import run_mechanisms
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
 from scvi_codegen.benchmark.plan import Plan, Say
-from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_ensemble
+from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.sums import run_growth, run_sums
@@ -63,6 +66,8 @@ SCHEMA = 2
 SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     **{name: partial(run_case, name) for name in CASES},
     **{f"ensemble:{name}": partial(run_ensemble, name) for name in ENSEMBLES},
+    **{f"forced:{name}": partial(run_forced, name) for name in FORCED_CASES},
+    **{f"constrained:{name}": partial(run_constrained, name) for name in CONSTRAINED_CASES},
     **{f"adaptive:{name}": partial(run_adaptive, name) for name in ADAPTIVE_CASES},
     "drift": run_drift,
     "tables": run_paper_tables,

@@ -36,7 +36,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Vector = Sequence[Any]
 Rates = Callable[[Vector, Mapping[str, Any], Any], list[Any]]
-"""Derivative of a first-order state x, from (x, parameters, a module with sin, cos and sqrt)."""
+"""Derivative of a first-order state x, from (x, parameters, what has sin, cos, sqrt and, for what is driven, time)."""
 
 STATES = 8
 """Initial states of a case: its error is the root of the mean square over them."""

@@ -10,6 +10,7 @@ import numpy as np
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.contenders.held_bodies import (
     HELD,
+    PARTS,
     Held,
     HeldRun,
     motion_in_angles,
@@ -19,7 +20,6 @@ from scvi_codegen.benchmark.contenders.held_bodies import (
 from scvi_codegen.benchmark.curves import FLOOR, Point, error_at
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.errors import StepFailedError
 
 __all__ = ["run_held"]
 
@@ -30,6 +30,8 @@ OUR_STEPS = (2000, 1000, 500, 250, 100)
 STEPS = (10000, 5000, 2000, 1000)
 """Of MuJoCo, whose own default is 5000."""
 INTEGRATORS = ("Euler", "implicitfast", "RK4")
+LOST = 1.0
+"""Of the weight, where a change of energy leaves nothing to compare."""
 
 Move = Callable[[float, int], HeldRun]
 
@@ -91,24 +93,27 @@ def _others(held: Held) -> Iterator[tuple[str, Move]]:
 def _rows(held: Held, by: str, move: Move, counts: Sequence[int], plan: Plan) -> Iterator[dict[str, Any]]:
     """One for each step, the median of the times."""
     span = SPAN * plan.share
-    for count in counts:
+    for count in (each for each in counts if each * plan.share >= PARTS):
         h = SPAN / count
         try:
             runs = [move(h, round(span / h)) for _ in range(plan.rounds)]
-        except StepFailedError:  # too long a step
+        except ArithmeticError as error:  # too long a step
+            yield {"by": by, "h": h, "why_not": str(error)}
             continue
         energy = runs[0].energy / held.weight
-        if np.isfinite(energy) and energy < 1.0:
-            seconds = float(np.median([run.seconds for run in runs]))
-            yield {"by": by, "h": h, "second_us": 1e6 * seconds / span, "energy": energy, "stretch": runs[0].stretch}
+        seconds = float(np.median([run.seconds for run in runs]))
+        lost = {} if energy < LOST else {"why_not": "too long a step: the energy is lost"}
+        yield {"by": by, "h": h, "second_us": 1e6 * seconds / span, "energy": energy, "stretch": runs[0].stretch} | lost
 
 
 def _points(rows: Sequence[dict[str, Any]]) -> list[Point]:
-    return [Point(seconds=row["second_us"], error=row["energy"]) for row in rows]
+    return [Point(seconds=row["second_us"], error=row["energy"]) for row in rows if "why_not" not in row]
 
 
 def _beside(row: dict[str, Any], curves: dict[str, list[Point]]) -> dict[str, Any]:
     """What this project's errors are in the time of a row."""
+    if "why_not" in row:
+        return {}
     ours, angles = (error_at(curves[name], row["second_us"]) for name in ("energy", "angles"))
     ratio = None if ours is None else row["energy"] / max(ours, FLOOR)
     return {"ours_then": ours, "ratio": ratio, "in_angles_then": angles}

@@ -9,17 +9,19 @@ from functools import partial
 import numpy as np
 
 from scvi_codegen.benchmark.cases import STATES, Array, Case, case
+from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES, constrained_contenders
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
 from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
+from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.measuring import PEER_ERRORS, measure
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult
 from scvi_codegen.runtime.accuracy import unwarned
 
-__all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_ensemble"]
+__all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_constrained", "run_ensemble", "run_forced"]
 
 ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 """Names of the cases that are run as ensembles."""
@@ -35,10 +37,31 @@ ReferenceOf = Callable[[Case, Array | None], Reference]
 @unwarned()
 def run_case(name: str, plan: Plan, say: Say) -> CaseResult:
     """One trajectory after the other, by this project and all peers."""
-    chosen = case(name)
+    return _race_alone(case(name), plan, say)
+
+
+@unwarned()
+def run_forced(name: str, plan: Plan, say: Say) -> CaseResult:
+    """The same with friction and drives."""
+    return _race_alone(FORCED_CASES[name](), plan, say)
+
+
+def _race_alone(chosen: Case, plan: Plan, say: Say) -> CaseResult:
     chosen = replace(chosen, span=chosen.span * plan.share)
-    makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=plan.quick) for peer in plan.peers}
-    return race(chosen, partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick), makers, plan, say)
+    ours = partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick)
+    return race(chosen, ours, _makers(chosen, plan), plan, say)
+
+
+def _makers(chosen: Case, plan: Plan) -> Makers:
+    return {peer: partial(peer_contenders, peer, chosen, quick=plan.quick) for peer in plan.peers}
+
+
+@unwarned()
+def run_constrained(name: str, plan: Plan, say: Say) -> CaseResult:
+    """Rods as constraints by this project, beside peers, and this project, in the angles of the rods."""
+    both = CONSTRAINED_CASES[name]().shortened(plan.share)
+    ours = partial(constrained_contenders, both, quick=plan.quick)
+    return race(both.angles, ours, _makers(both.angles, plan), plan, say)
 
 
 @unwarned()

@@ -12,7 +12,9 @@ import hashlib
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,7 +42,8 @@ __all__ = [
 ]
 
 Extended = NDArray[np.longdouble]
-Field = Callable[[Extended], Extended]
+Field = Callable[[Extended, Extended], Extended]
+"""x' of x, (.., d), at times t, (..)."""
 
 STAGES = 16
 MOST_SWEEPS = 100
@@ -147,7 +150,7 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
     """(k, d) states after ``span``, by steps of h, a number of few binary digits, and a last shorter one.
 
     Args:
-        field: x' for x of shape (..., d).
+        field: x' for x of shape (..., d) and t.
         start: (k, d) initial states.
         span: length of time.
         h: step size.
@@ -159,26 +162,32 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
 def states_after(field: Field, start: Extended, steps: Sequence[float] | Extended) -> Extended:
     """(k, d) states after these steps."""
     a, b, guess_table = gauss_tables(STAGES)
-    x, carry, before = start.copy(), np.zeros_like(start), None
+    x, carry, before, t = start.copy(), np.zeros_like(start), None, np.longdouble(0)
     stages: Extended | None = None
     for size in steps:
         guess = None if stages is None or size != before else _product(guess_table, stages)
-        before = size
-        stages = _stages(field, x + carry, np.longdouble(size), a, guess)
-        change = carry + np.longdouble(size) * _product(b, stages)[0]
+        before, h = size, np.longdouble(size)
+        stages = _stages(partial(_at, field, t + h * a[0].sum(axis=1)), x + carry, h, a, guess)
+        change = carry + h * _product(b, stages)[0]
         new = x + change
         carry = change - (new - x)
-        x = new
+        x, t = new, t + h
     return x + carry
+
+
+def _at(field: Field, times: Extended, x: Extended) -> Extended:
+    """The field of (s, k, d) at (s,) times."""
+    return field(x, times[:, np.newaxis])
 
 
 def field_of(case: Case) -> Field:
     """The hand-solved equations in extended precision."""
     parameters = {name: np.longdouble(value) for name, value in case.parameters.items()}
 
-    def field(x: Extended) -> Extended:
-        rates = case.formulations[0].rates(list(np.moveaxis(x, -1, 0)), parameters, np)
-        return np.stack(rates, axis=-1)
+    def field(x: Extended, t: Extended) -> Extended:
+        functions = SimpleNamespace(sin=np.sin, cos=np.cos, sqrt=np.sqrt, time=t)
+        rates = case.formulations[0].rates(list(np.moveaxis(x, -1, 0)), parameters, functions)
+        return np.stack(np.broadcast_arrays(*rates), axis=-1)
 
     return field
 
@@ -193,9 +202,11 @@ def _product(table: tuple[Extended, ...], values: Extended) -> Extended:
     return result.reshape(-1, *values.shape[1:])
 
 
-def _stages(field: Field, x: Extended, h: np.longdouble, a: Table, guess: Extended | None) -> Extended:
+def _stages(
+    field: Callable[[Extended], Extended], x: Extended, h: np.longdouble, a: Table, guess: Extended | None
+) -> Extended:
     """(s, k, d) slopes F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
-    slopes = np.broadcast_to(field(x), (len(a[0]), *x.shape)).copy() if guess is None else guess
+    slopes = field(np.broadcast_to(x, (len(a[0]), *x.shape))) if guess is None else guess
     low = _product((a[1],), slopes)  # small enough to be left at the first guess
     scale, last = h / np.max(np.abs(x)), np.inf
     for _ in range(MOST_SWEEPS):

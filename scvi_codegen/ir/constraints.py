@@ -5,25 +5,37 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
 
 __all__ = ["Constraints", "Rattle"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rattle:
-    """What steps of RATTLE need where masses are constant and diagonal.
+    """What steps on s + 1 points of Lobatto's need where masses are constant and diagonal; RATTLE for s = 1.
 
     Attributes:
         force: L_q at u = q.
         mass: M (no arguments).
         products: (e, f) of slopes of constraints by the same coordinate.
         entries: of each product the two constraints (k, l).
+        abscissae: (s + 1,) of the points; weights: (s + 1,), of p1 = p0 + h sum_n w_n F_n.
+        start: (s,), 0 but for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
+            M V_b = (1 + start[b]) p0 + h sum_n momentum[n][b] F_n.
+        position: (s, s) from them to the points but the first, u_i = q0 + h sum_b position[b][i] V_b.
+        response: (s, s), the product of both, h^2 sum_n response[n][i] F_n / M.
     """
 
     force: Kernel
     mass: Kernel
     products: tuple[tuple[int, int], ...]
     entries: tuple[tuple[int, int], ...]
+    abscissae: tuple[Number, ...]
+    weights: tuple[Number, ...]
+    start: tuple[Number, ...]
+    momentum: NumberTable
+    position: NumberTable
+    response: NumberTable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

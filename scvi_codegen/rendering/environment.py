@@ -51,6 +51,12 @@ def _matrix(context: Context, name: str, rows: Rows) -> str:
     return table(f"static const {context['target'].scalar} {name}{size}", [_numbers(context, row) for row in rows])
 
 
+@pass_context
+def _rests(context: Context, rows: Rows) -> Rows:
+    """What rounding cuts off a table of rows of numbers."""
+    return [list(map(context["target"].rest, row)) for row in rows]
+
+
 def _integers(name: str, values: Sequence[int]) -> str:
     """A table of whole numbers; the name has its size."""
     return table(f"static const int {name}", list(map(str, values)))
@@ -89,6 +95,7 @@ FILTERS: dict[str, Callable[..., object]] = {
     "kernel_text": _kernel_text,
     "lane_kernel_text": _lane_kernel_text,
     "lane_mass_text": _lane_mass_text,
+    "rests": _rests,
     "transposed": lambda rows: tuple(zip(*rows, strict=True)),
     "wrapped": wrapped,
     "wrapped_comment": wrapped_comment,

@@ -24,6 +24,13 @@ static int remake_factors(const step_data *step, const real *point, const newton
   return linearise(&then, data, &shape);
 }
 
+/* The unknowns of the step before, extrapolated. */
+static void guess_from(const real *memory, const newton_data *data)
+{
+  gather(EXTRAPOLATION[0], B, 1, memory, M, data->z, 1, B);
+  gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data->z + M * B, 1, B);
+}
+
 /* The increments by RATTLE where a step is one, else by Newton's iteration, from the stages of the step before,
  * extrapolated, and from the straight line if there are none or they lead nowhere. Memory holds the stages, and where
  * factors go from step to step the point of the factors; guess says whether the first (1) or both (2) are of use. */
@@ -36,11 +43,14 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   if (POINT > 0 && *guess == 2)
     keep = step->first ? remake_factors(step, memory + N, &data) : 1;
 #ifdef RATTLE
-  status = rattle(step, memory, *guess > 0, &data, dp, options, report);
+  if (*guess)
+    guess_from(memory, &data);
+  if (*guess || line_from(step, &data) == OK)
+    status = rattle(step, &data, dp, options, report);
+  keep = 0;
 #endif
   if (status != OK && *guess) {
-    gather(EXTRAPOLATION[0], B, 1, memory, M, data.z, 1, B);
-    gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data.z + M * B, 1, B);
+    guess_from(memory, &data);
     status = newton(step, &data, NULL, NULL, dp, &keep, options, report);
   }
   if (status != OK)

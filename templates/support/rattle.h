@@ -1,139 +1,256 @@
-/* Steps of RATTLE for constant diagonal masses, without the matrix of Newton's iteration: the multipliers that lead to
- * g(q1) = 0, then those that put p1 on the tangent space, by systems of one equation a constraint. Before it: newton.h,
- * constraints.h, the kernels held_force and held_mass; PRODUCTS, pairs {e, f} of slopes of which the product belongs to
- * the entry {k, l} of PRODUCT_ENTRY; HELD_PLACE of constraints, HELD_REACH of their matrix. */
+/* Steps on Lobatto's points for constant diagonal masses, RATTLE for two of them, without the matrix of Newton's
+ * iteration: the multipliers that lead to g = 0 at the points, by Newton's iteration with the factors of their first
+ * guess, in which forces follow; then those that put p1 on the tangent space. Before it: newton.h, constraints.h, the
+ * kernels held_force and held_mass; the tables HELD_ABSCISSA, HELD_WEIGHT, HELD_START, HELD_MOMENTUM and its low part,
+ * HELD_POSITION and HELD_RESPONSE; PRODUCTS, pairs {e, f} of slopes of which the product belongs to the entry {k, l} of
+ * PRODUCT_ENTRY; HELD_PLACE of constraints, HELD_REACH of their matrix. */
 #define RATTLE
 
-static band held_shape(void)
+enum { DEGREE = B - 1 }; /* of B points; what belongs to a point stands n numbers behind what belongs to the first */
+
+/* Positions u at the points but the first; forces L_q and slopes G at all; multipliers at those but the last. */
+typedef struct {
+  real inverse_mass[M], u[M * DEGREE], force[M * B], slope[CONSTRAINT_ENTRIES * B], lambda[CONSTRAINTS * DEGREE];
+} held_step;
+
+static band held_shape(int count)
 {
-  const int full = 3 * HELD_REACH + 1 >= CONSTRAINTS;
-  const band shape = {CONSTRAINTS, HELD_REACH, full ? CONSTRAINTS : 3 * HELD_REACH, full ? 0 : 2 * HELD_REACH};
+  const int rows = CONSTRAINTS * count, reach = (HELD_REACH + 1) * count - 1, full = 3 * reach + 1 >= rows;
+  const band shape = {rows, reach, full ? rows : 3 * reach, full ? 0 : 2 * reach};
   return shape;
 }
 
-/* x += scale slope^T lambda. */
-static inline void add_reactions(const real *slope, const real *lambda, real scale, real *x)
+/* Factors of scale sum over coordinates of row_r response[n][r] column_n / mass, with rows r of each constraint, and
+ * columns n; row and column are slopes at so many points. Returns 0 if that matrix has no inverse. */
+static int factorise_held(const newton_data *data, const real *row, const real *column, const real *response, int count,
+    const real *inverse_mass, real scale)
 {
-  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    x[CONSTRAINT_ENTRY[e][1]] += scale * slope[e] * lambda[CONSTRAINT_ENTRY[e][0]];
+  const band shape = held_shape(count);
+  memset(data->factors, 0, sizeof(real) * band_size(&shape));
+  for (int q = 0; q < PRODUCTS; q++) {
+    const int e = PRODUCT[q][0], f = PRODUCT[q][1], to = HELD_PLACE[PRODUCT_ENTRY[q][1]] * count;
+    real *corner = data->factors + shape.first + to * shape.stride + HELD_PLACE[PRODUCT_ENTRY[q][0]] * count;
+    for (int n = 0; n < count; n++) {
+      const real term = scale * inverse_mass[CONSTRAINT_ENTRY[e][1]] * column[f * B + n];
+      for (int r = 0; r < count; r++)
+        corner[n * shape.stride + r] += response[n * count + r] * row[e * B + r] * term;
+    }
+  }
+  return all_finite(data->factors, (int)band_size(&shape)) && factorise(data->factors, &shape, data->pivot);
 }
 
-/* lambda of scale one M^-1 other^T lambda = -right; 0 if that matrix has no inverse. */
-static int solve_held(const newton_data *data, const real *one, const real *other, const real *inverse_mass, real scale,
-    const real *right, real *lambda)
+/* x with that matrix times x = -right. */
+static void solve_held(const newton_data *data, const real *right, int count, real *x)
 {
-  const band shape = held_shape();
-  memset(data->factors, 0, sizeof(real) * band_size(&shape));
-  for (int n = 0; n < PRODUCTS; n++) {
-    const int e = PRODUCT[n][0], f = PRODUCT[n][1], column = HELD_PLACE[PRODUCT_ENTRY[n][1]];
-    data->factors[shape.first + column * shape.stride + HELD_PLACE[PRODUCT_ENTRY[n][0]]] +=
-        scale * one[e] * inverse_mass[CONSTRAINT_ENTRY[e][1]] * other[f];
-  }
-  if (!all_finite(right, CONSTRAINTS) || !all_finite(data->factors, (int)band_size(&shape)) ||
-      !factorise(data->factors, &shape, data->pivot))
-    return 0;
+  const band shape = held_shape(count);
   for (int k = 0; k < CONSTRAINTS; k++)
-    data->update[HELD_PLACE[k]] = -right[k];
+    for (int r = 0; r < count; r++)
+      data->update[HELD_PLACE[k] * count + r] = -right[k * count + r];
   back_substitute(data->factors, &shape, data->pivot, data->update);
   for (int k = 0; k < CONSTRAINTS; k++)
-    lambda[k] = data->update[HELD_PLACE[k]];
-  return 1;
+    memcpy(x + k * count, data->update + HELD_PLACE[k] * count, sizeof(real) * (size_t)count);
 }
 
-/* What the step begins with, and the half of it that positions follow. */
-typedef struct {
-  real inverse_mass[M], force[M], slope[CONSTRAINT_ENTRIES], lambda[CONSTRAINTS], v[M];
-} half_step;
-
-/* The velocity v that lambda gives, and where it leads. */
-static void lead(const step_data *step, half_step *now, real *u)
+/* Force and slopes at point n, which is at u; the values of the constraints there. */
+static void look(const step_data *step, int n, const real *u, held_step *now, real *g)
 {
-  real impulse[M];
-  memcpy(impulse, now->force, sizeof impulse);
-  add_reactions(now->slope, now->lambda, 1, impulse);
-  for (int i = 0; i < M; i++) {
-    now->v[i] = (step->p0[i] + step->h / 2 * impulse[i]) * now->inverse_mass[i];
-    u[i] = step->q0[i] + (step->carry_q[i] + step->h * now->v[i]);
+  real force[M], slope[CONSTRAINT_ENTRIES];
+  const real t = step->t + HELD_ABSCISSA[n] * step->h;
+  held_force(u, t, step->parameters, force);
+  constraints(u, t, step->parameters, g, slope);
+  for (int i = 0; i < M; i++)
+    now->force[i * B + n] = force[i];
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    now->slope[e * B + n] = slope[e];
+}
+
+/* At all points but the first. */
+static void look_ahead(const step_data *step, held_step *now, real *g)
+{
+  for (int n = 0; n < DEGREE; n++) {
+    real u[M], own[CONSTRAINTS];
+    for (int i = 0; i < M; i++)
+      u[i] = now->u[i * DEGREE + n];
+    look(step, n + 1, u, now, own);
+    for (int k = 0; k < CONSTRAINTS; k++)
+      g[k * DEGREE + n] = own[k];
   }
 }
 
-/* By how much a change of lambda moves positions. */
-static movement moved_by(const step_data *step, const half_step *now, const real *change)
+/* f += G^T lambda at the points but the last. */
+static void add_reactions(const held_step *now, const real *lambda, real *f)
+{
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+    const real *slope = now->slope + e * B, *own = lambda + CONSTRAINT_ENTRY[e][0] * DEGREE;
+    real *at = f + CONSTRAINT_ENTRY[e][1] * DEGREE;
+    for (int n = 0; n < DEGREE; n++)
+      at[n] += slope[n] * own[n];
+  }
+}
+
+/* f = L_q + G^T lambda at the points but the last. */
+static void all_forces(const held_step *now, real *f)
+{
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < DEGREE; n++)
+      f[i * DEGREE + n] = now->force[i * B + n];
+  add_reactions(now, now->lambda, f);
+}
+
+/* By how much positions follow a change f of forces: x += h^2 sum_n response[n] f_n / mass. */
+static void add_response(const step_data *step, const held_step *now, const real *f, real *x)
+{
+  for (int i = 0; i < M; i++) {
+    const real scale = step->h * step->h * now->inverse_mass[i];
+    real sum[DEGREE] = {0};
+    for (int n = 0; n < DEGREE; n++)
+      for (int r = 0; r < DEGREE; r++)
+        sum[r] += HELD_RESPONSE[n][r] * f[i * DEGREE + n];
+    for (int r = 0; r < DEGREE; r++)
+      x[i * DEGREE + r] += scale * sum[r];
+  }
+}
+
+/* Velocities z that forces f lead to. */
+static void follow(const step_data *step, const held_step *now, const real *f, real *z)
+{
+  for (int i = 0; i < M; i++) {
+    real sum[DEGREE] = {0}, low[DEGREE] = {0};
+    for (int n = 0; n < DEGREE; n++)
+      for (int b = 0; b < DEGREE; b++) {
+        sum[b] += HELD_MOMENTUM[n][b] * f[i * DEGREE + n];
+        low[b] += HELD_MOMENTUM_LOW[n][b] * f[i * DEGREE + n];
+      }
+    for (int b = 0; b < DEGREE; b++)
+      z[i * B + b] =
+          (step->p0[i] + (HELD_START[b] * step->p0[i] + step->h * (sum[b] + low[b]))) * now->inverse_mass[i];
+  }
+}
+
+/* Positions u that velocities z lead to. */
+static void places(const step_data *step, const real *z, real *u)
+{
+  for (int i = 0; i < M; i++) {
+    real sum[DEGREE] = {0};
+    for (int b = 0; b < DEGREE; b++)
+      for (int r = 0; r < DEGREE; r++)
+        sum[r] += HELD_POSITION[b][r] * z[i * B + b];
+    for (int r = 0; r < DEGREE; r++)
+      u[i * DEGREE + r] = step->q0[i] + (step->carry_q[i] + step->h * sum[r]);
+  }
+}
+
+/* u += change; how much that is. */
+static movement move(const step_data *step, held_step *now, const real *change)
 {
   movement moved = no_movement();
-  real moves[M] = {0}, size[M];
-  add_reactions(now->slope, change, step->h * step->h / 2, moves);
+  real most[M], size[M];
   for (int i = 0; i < M; i++) {
-    moves[i] *= now->inverse_mass[i];
-    size[i] = MATH(fabs)(step->q0[i]) + MATH(fabs)(step->h * now->v[i]);
+    most[i] = 0;
+    size[i] = MATH(fabs)(step->q0[i]) + MATH(fabs)(step->h * step->p0[i] * now->inverse_mass[i]);
+    for (int r = 0; r < DEGREE; r++) {
+      now->u[i * DEGREE + r] += change[i * DEGREE + r];
+      most[i] = larger(most[i], MATH(fabs)(change[i * DEGREE + r]));
+    }
   }
-  measure(&moved, moves, size);
+  measure(&moved, most, size);
   return moved;
 }
 
-/* lambda and u with g(u) = 0, and the slopes there. */
-static int meet(const step_data *step, half_step *now, const newton_data *data, real *u, real *slope,
-    const solver_options *options, solver_report *report)
+/* lambda and u with g(u) = 0, and what is at the points then. */
+static int meet(const step_data *step, held_step *now, const newton_data *data, const solver_options *options,
+    solver_report *report)
 {
-  real g[CONSTRAINTS], change[CONSTRAINTS], last = (real)INFINITY;
-  for (int k = 0, met = 0;; k++) {
+  real g[CONSTRAINTS * DEGREE], lambda[CONSTRAINTS * DEGREE], f[M * DEGREE], change[M * DEGREE], last = (real)INFINITY;
+  look_ahead(step, now, g);
+  if (!factorise_held(data, now->slope + 1, now->slope, HELD_RESPONSE[0], DEGREE, now->inverse_mass, step->h * step->h))
+    return SINGULAR;
+  for (int k = 0; k < least(options->max_iterations, MOST_ITERATIONS); k++) {
     movement moved;
-    lead(step, now, u);
-    constraints(u, step->t + step->h, step->parameters, g, slope);
-    if (met)
-      return all_finite(u, M) ? OK : NOT_FINITE;
-    if (k >= least(options->max_iterations, MOST_ITERATIONS))
-      return NOT_CONVERGED;
-    if (!solve_held(data, slope, now->slope, now->inverse_mass, step->h * step->h / 2, g, change))
-      return SINGULAR;
-    for (int j = 0; j < CONSTRAINTS; j++)
-      now->lambda[j] += change[j];
-    moved = moved_by(step, now, change);
+    int met;
+    all_forces(now, f);
+    follow(step, now, f, data->z);
+    places(step, data->z, change);
+    for (int j = 0; j < M * DEGREE; j++)
+      change[j] -= now->u[j];
+    for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
+      const int row = CONSTRAINT_ENTRY[e][0] * DEGREE, column = CONSTRAINT_ENTRY[e][1] * DEGREE;
+      for (int r = 0; r < DEGREE; r++)
+        g[row + r] += now->slope[e * B + r + 1] * change[column + r];
+    }
+    if (!all_finite(g, CONSTRAINTS * DEGREE))
+      return NOT_FINITE;
+    solve_held(data, g, DEGREE, lambda);
+    for (int j = 0; j < CONSTRAINTS * DEGREE; j++)
+      now->lambda[j] += lambda[j];
+    memset(f, 0, sizeof f);
+    add_reactions(now, lambda, f);
+    add_response(step, now, f, change);
+    moved = move(step, now, change);
     report->iterations++;
     report->change = options->absolute ? moved.absolute : moved.relative;
-    if (options->absolute)
-      met = moved.absolute < options->tolerance;
-    else
-      met = moved.relative <= options->tolerance ||
-          (moved.overall <= ROUNDOFF_LEVEL && moved.relative >= STOPPED_SHRINKING * last);
+    look_ahead(step, now, g);
+    met = options->absolute ? moved.absolute < options->tolerance : moved.relative <= options->tolerance;
+    if (met || (!options->absolute && moved.overall <= ROUNDOFF_LEVEL && moved.relative >= STOPPED_SHRINKING * last))
+      return all_finite(now->u, M * DEGREE) ? OK : NOT_FINITE;
+    if (k > 1 && moved.overall > ROUNDOFF_LEVEL && !(moved.relative < STOPPED_SHRINKING * last))
+      return NOT_CONVERGED; /* Newton's iteration is quicker */
     last = moved.relative;
   }
+  return NOT_CONVERGED;
 }
 
-/* Unknowns z of the step, and p1 - p0; memory has those of the step before, if guess. */
-static int rattle(const step_data *step, const real *memory, int guess, const newton_data *data, real *dp,
-    const solver_options *options, solver_report *report)
+/* What the step begins with: the first point, and a guess of the others, from unknowns in data->z. */
+static void begin(const step_data *step, const newton_data *data, held_step *now)
 {
-  half_step now;
-  real u[2 * M], g[CONSTRAINTS], slope[CONSTRAINT_ENTRIES], force[M], lambda[CONSTRAINTS], value[M + 2 * CONSTRAINTS];
-  int status;
-  held_mass(NULL, step->t, step->parameters, now.inverse_mass);
-  held_force(step->q0, step->t, step->parameters, now.force);
-  constraints(step->q0, step->t, step->parameters, g, now.slope);
+  real g[CONSTRAINTS];
+  held_mass(NULL, step->t, step->parameters, now->inverse_mass);
   for (int i = 0; i < M; i++)
-    now.inverse_mass[i] = 1 / now.inverse_mass[i];
+    now->inverse_mass[i] = 1 / now->inverse_mass[i];
+  look(step, 0, step->q0, now, g);
+  places(step, data->z, now->u);
   for (int k = 0; k < CONSTRAINTS; k++)
-    now.lambda[k] = guess ? memory[(M + k) * B + 1] : 0;
-  status = meet(step, &now, data, u, slope, options, report);
-  if (status != OK)
-    return status;
-  held_force(u, step->t + step->h, step->parameters, force);
-  for (int i = 0; i < M; i++)
-    dp[i] = step->h / 2 * (now.force[i] + force[i]);
-  add_reactions(now.slope, now.lambda, step->h / 2, dp);
-  for (int i = 0; i < M; i++)
-    u[M + i] = (step->p0[i] + dp[i]) * now.inverse_mass[i];
-  constrained_motion(u, step->t + step->h, step->parameters, value);
-  if (!solve_held(data, slope, slope, now.inverse_mass, step->h / 2, value + M, lambda))
-    return SINGULAR;
-  add_reactions(slope, lambda, step->h / 2, dp);
+    memcpy(now->lambda + k * DEGREE, data->z + (M + k) * B, sizeof(real) * DEGREE);
+}
+
+/* p1 - p0 on the tangent space, and the unknowns z of the step. */
+static int arrive(const step_data *step, const held_step *now, const newton_data *data, real *dp)
+{
+  const real weight = step->h * HELD_WEIGHT[DEGREE];
+  real f[M * DEGREE], u[2 * M], value[M + 2 * CONSTRAINTS], lambda[CONSTRAINTS], own[1] = {1};
+  all_forces(now, f);
   for (int i = 0; i < M; i++) {
-    data->z[i * B] = now.v[i];
-    data->z[i * B + 1] = (step->p0[i] + dp[i]) * now.inverse_mass[i];
+    real sum = HELD_WEIGHT[DEGREE] * now->force[i * B + DEGREE];
+    for (int n = 0; n < DEGREE; n++)
+      sum += HELD_WEIGHT[n] * f[i * DEGREE + n];
+    dp[i] = step->h * sum;
+    u[i] = now->u[i * DEGREE + DEGREE - 1];
+    u[M + i] = (step->p0[i] + dp[i]) * now->inverse_mass[i];
   }
+  constrained_motion(u, step->t + step->h, step->parameters, value);
+  if (!all_finite(value, M + 2 * CONSTRAINTS) ||
+      !factorise_held(data, now->slope + DEGREE, now->slope + DEGREE, own, 1, now->inverse_mass, weight))
+    return SINGULAR;
+  solve_held(data, value + M, 1, lambda);
+  for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
+    dp[CONSTRAINT_ENTRY[e][1]] += weight * now->slope[e * B + DEGREE] * lambda[CONSTRAINT_ENTRY[e][0]];
+  follow(step, now, f, data->z);
+  for (int i = 0; i < M; i++)
+    data->z[i * B + DEGREE] = (step->p0[i] + dp[i]) * now->inverse_mass[i];
   for (int k = 0; k < CONSTRAINTS; k++) {
-    data->z[(M + k) * B] = now.lambda[k];
-    data->z[(M + k) * B + 1] = lambda[k];
+    memcpy(data->z + (M + k) * B, now->lambda + k * DEGREE, sizeof(real) * DEGREE);
+    data->z[(M + k) * B + DEGREE] = lambda[k];
   }
   return OK;
+}
+
+/* Unknowns z of the step, from a guess in their place, and p1 - p0. */
+static int rattle(const step_data *step, const newton_data *data, real *dp, const solver_options *options,
+    solver_report *report)
+{
+  held_step now;
+  int status;
+  begin(step, data, &now);
+  status = meet(step, &now, data, options, report);
+  return status == OK ? arrive(step, &now, data, dp) : status;
 }

@@ -13,7 +13,9 @@ enum {
 #define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
 #define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
 #define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: less is rounding */
+#ifndef ITERATION_PART
 #define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
+#endif
 
 /* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
  * `few`, two below `fewer`. */

@@ -7,11 +7,13 @@ import os
 import shutil
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import sympy
 from mpmath import mp
+from scipy.integrate import solve_ivp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import (
@@ -29,14 +31,18 @@ from scvi_codegen.benchmark import (
     start_up,
     sums,
 )
+from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders import held_bodies, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
 from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
+from scvi_codegen.benchmark.forced_cases import FORCED_CASES
+from scvi_codegen.benchmark.hanging_rods import angles_of, rod_accelerations
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -81,6 +87,41 @@ class TestCases:
             for other, its_velocity, n in zip(system.coordinates, system.velocities, range(m), strict=True):
                 residual += momentum.diff(other) * x[m + n] + momentum.diff(its_velocity) * rates[m + n]
             assert abs(float(residual.subs(place))) < 1e-12
+
+    @pytest.mark.parametrize("name", FORCED_CASES)
+    def test_hand_solved_forces_are_those_of_the_equations_of_motion(self, name):
+        """d/dt L_v = L_q + f at a random state and time, in exact numbers but for sines."""
+        chosen = FORCED_CASES[name]()
+        system, m, t = chosen.system, chosen.dimension, 0.7
+        x = [sympy.Rational(int(value), 1000) for value in np.random.default_rng(3).integers(100, 600, 2 * m)]
+        functions = SimpleNamespace(sin=sympy.sin, cos=sympy.cos, sqrt=sympy.sqrt, time=t)
+        rates = chosen.formulations[0].rates(x, chosen.parameters, functions)
+        place = dict(zip((*system.coordinates, *system.velocities, system.time), (*x, t), strict=True))
+        place |= dict(zip(system.parameters, system.defaults, strict=True))
+        for q, v, force in zip(system.coordinates, system.velocities, system.forces, strict=True):
+            momentum, residual = system.lagrangian.diff(v), -system.lagrangian.diff(q) - force
+            for n, (other, its) in enumerate(zip(system.coordinates, system.velocities, strict=True)):
+                residual += momentum.diff(other) * x[m + n] + momentum.diff(its) * rates[m + n]
+            assert abs(float(residual.subs(place))) < 1e-12
+        assert abs(float(system.forces[0].subs(place))) > 1e-3
+
+    @pytest.mark.parametrize("name", ["pendulum", "double-pendulum", "chain:5"])
+    def test_rods_in_angles_obey_their_lagrangian_and_move_as_the_constraints_do(self, name):
+        both = CONSTRAINED_CASES[name]()
+        assert np.abs(angles_of(both.places.q) - both.angles.q).max() < 1e-15
+        stepper = compile_stepper(both.places.system, "svi:4")
+        end = stepper.integrate(*stepper.project(both.places.q[0]), h=0.02, steps=50).q[-1]
+        accelerations = partial(rod_accelerations, of=both.angles.parameters, functions=np)
+        start = np.concatenate([both.angles.q[0], both.angles.velocity[0]])
+        exact = solve_ivp(
+            lambda t, x: [*x[len(x) // 2 :], *accelerations(x[: len(x) // 2], x[len(x) // 2 :])],
+            (0.0, 1.0),
+            start,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-14,
+        ).y[: len(start) // 2, -1]
+        assert np.abs(angles_of(end) - exact).max() < 1e-10
 
     def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
         chosen = cases.case("relativistic-particle")
@@ -163,7 +204,7 @@ class TestReference:
 
     def test_oscillator_with_a_span_that_is_no_multiple_of_the_step(self):
         start = np.array([[1.0, 0.0]], dtype=np.longdouble)
-        end = final_states(lambda x: np.stack([x[..., 1], -x[..., 0]], axis=-1), start, 10.1, 0.75)
+        end = final_states(lambda x, t: np.stack([x[..., 1], -x[..., 0]], axis=-1), start, 10.1, 0.75)
         t = np.longdouble(10.1)
         assert np.abs(end[0] - [np.cos(t), -np.sin(t)]).max() < 2e-18
 
@@ -509,6 +550,16 @@ class TestTables:
         assert stiff.stretch < 1e-5 < soft.stretch < 1e-2
         assert stiff.energy < 1e-4
 
+    def test_what_is_unstable_says_so_and_leaves_no_file(self, monkeypatch, tmp_path):
+        """MuJoCo would write its warnings into the working folder."""
+        pytest.importorskip("mujoco", reason="extra bench")
+        monkeypatch.chdir(tmp_path)
+        chain = held_bodies.HELD["chain"]()
+        move = held_bodies.mujoco_motion(chain, "Euler")
+        rows = list(held._rows(chain, "MuJoCo", move, (100, 1000), bench.Plan()))
+        assert ["unstable" in row.get("why_not", "") for row in rows] == [True, False]
+        assert not list(tmp_path.iterdir())
+
     def test_rows_of_held_bodies_are_told_at_equal_time(self, monkeypatch):
         monkeypatch.setattr(held, "OUR_STEPS", (1000, 500))
         monkeypatch.setattr(held, "_others", lambda bodies: [("other", held.our_motion(bodies, "svi:1"))])
@@ -517,6 +568,18 @@ class TestTables:
         assert {row["bodies"] for row in rows} == {"chain", "four-bar"}
         assert all(row["ratio"] > 0.0 for row in others if row["ours_then"] is not None)
         assert any(row["ours_then"] is not None for row in others)
+
+    @pytest.mark.full
+    @needs_extended
+    def test_forced_and_constrained_problems_are_measured_at_their_errors(self, monkeypatch):
+        monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-6,))
+        for name, methods in (("forced:cart-pole", 1), ("constrained:pendulum", 2)):
+            plan = bench.Plan(peers=("scipy",), repeats=1, quick=True)
+            found = [each for each in bench.SECTIONS[name](plan, lambda text: None).measurements if not each.failure]
+            own = [each for each in found if each.method.startswith("scvi-codegen")]
+            assert len(own) == methods
+            assert all(each.error < 1e-4 and each.seconds > 0.0 for each in own)
+            assert max(each.error for each in found if each not in own) < 1e-10
 
     @pytest.mark.parametrize("lattice", [sums.ring(8, 1.0), sums.field(6, 0.2)], ids=lambda lattice: lattice.name)
     def test_lattices_by_hand_move_as_generated_ones(self, lattice):

@@ -67,10 +67,21 @@ DAMPING = (
 RATTLES = tuple(
     text(f"{what}, rods/rattle", case("rods/rattle"), *edit)
     for what, *edit in (
-        ("a hidden constraint without g_t", r"value \+ M, lambda\)", "value + M + CONSTRAINTS, lambda)"),
-        ("half of the force at the end", r"now\.force\[i\] \+ force\[i\]", "now.force[i] + force[i] / 2"),
-        ("constraints of the start of a step", r"constraints\(u, step->t \+ step->h", "constraints(u, step->t"),
-        ("masses that are not inverted", r"now\.inverse_mass\[i\] = 1 / now", "now.inverse_mass[i] = now"),
+        ("a hidden constraint without g_t", r"value \+ M, 1, lambda\)", "value + M + CONSTRAINTS, 1, lambda)"),
+        ("half of the force at the end", r"now->force\[i \* B \+ DEGREE\];", "now->force[i * B + DEGREE] / 2;"),
+        ("constraints of the start of a step", r"step->t \+ HELD_ABSCISSA\[n\] \* step->h;", "step->t;"),
+        ("masses that are not inverted", r"now->inverse_mass\[i\] = 1 / now", "now->inverse_mass[i] = now"),
+    )
+) + tuple(
+    text(f"{what}, rods/lobatto-svi", case("rods/lobatto-svi"), *edit)
+    for what, *edit in (
+        ("slopes of the next point", r"slope = now->slope \+ e \* B, \*own", "slope = now->slope + e * B + 1, *own"),
+        ("velocities of the forces before", r"HELD_MOMENTUM\[n\]\[b\] \* f", "HELD_MOMENTUM[0][b] * f"),
+        (
+            "positions but for what was cut off",
+            r"HELD_POSITION\[b\]\[r\] \* z",
+            "HELD_POSITION[b][r] * (1 + 1e-12) * z",
+        ),
     )
 )
 

@@ -93,8 +93,8 @@ def test_degree_1_is_rattle():
         q, p = q1, p1
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_rattle_is_solved_for_multipliers_alone_where_masses_are_constant(moving):
+@pytest.mark.parametrize(("s", "moving"), [(1, False), (1, True), (2, True), (3, False), (4, True)])
+def test_multipliers_are_solved_for_alone_where_masses_are_constant(s, moving):
     """To the states of Newton's iteration; also by steps that choose their length, and where one fails."""
     chain = LagrangianSystem.from_text(
         name="two masses",
@@ -104,10 +104,9 @@ def test_rattle_is_solved_for_multipliers_alone_where_masses_are_constant(moving
         constraints=[f"x1**2 + y1**2 = (1 + w*sin(3*t)*{int(moving)})**2", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
         forces={"x2": "cos(t)*y2"},
     )
-    ours, newton = (compile_stepper(chain, lobatto(1), solver=solver) for solver in ("auto", "newton"))
+    ours, newton = (compile_stepper(chain, lobatto(s), solver=solver) for solver in ("auto", "newton"))
     assert "held_force(" in ours.source.amalgamated().code
     assert "held_force(" not in newton.source.amalgamated().code
-    assert "held_force(" not in compile_stepper(chain, lobatto(2)).source.amalgamated().code
     start = newton.project([0.6, -0.8, 1.5, -0.4], newton.momentum([0.6, -0.8, 1.5, -0.4], [0.1] * 4, 0.0))
     for way, bound in (({"h": 0.01, "steps": 100}, 1e-12), ({"h": -0.03, "steps": 20}, 1e-12), ({"t_end": 0.5}, 1e-8)):
         exactly = {} if "h" in way else {"tolerance": 1e-4}
@@ -115,7 +114,7 @@ def test_rattle_is_solved_for_multipliers_alone_where_masses_are_constant(moving
         assert one.steps == other.steps
         assert np.abs(one.q - other.q).max() < bound
         assert np.abs(one.p - other.p).max() < 10 * bound
-        assert np.abs(one.constraint_values()).max() < max(0.1 * bound, 2e-14)
+        assert np.abs(one.constraint_values()).max() < 2e-14
     with pytest.raises(StepFailedError):
         ours.integrate(*start, h=30.0, steps=1)
 

@@ -110,8 +110,8 @@ WHOLE = """
     linkage/lobatto-svi wire/lobatto-svi sleigh/lobatto-svi double/gauss-position kepler/radau-iia
     double/radau-ia kepler/lobatto
     driven/chebyshev pendulum/verlet double/verlet kepler/composition driven/euler
-    tangle/svi tangle/scvi tangle/sc chain/svi-4 field/gauss
-    slowed/svi-3 pushed/svi damped/svi rods/rattle pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
+    tangle/svi tangle/scvi tangle/sc chain/svi-4 field/gauss rods/rattle rods/lobatto-svi
+    slowed/svi-3 pushed/svi damped/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)
 REVERSIBLE = replace(case("kepler/svi-3"), monitor="frequency")

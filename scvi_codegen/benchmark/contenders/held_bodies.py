@@ -6,13 +6,15 @@
                by its equality ``connect``
 
 A contender gives a function of (step, number of steps): how energies at the end of ten equal parts differ, how far rods
-are off their lengths there, and the processor time that the steps took.
+are off their lengths there, and the processor time that the steps took. It raises :class:`ArithmeticError` where a step
+is too long.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +24,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["HELD", "Held", "HeldRun", "motion_in_angles", "mujoco_motion", "our_motion"]
+__all__ = ["HELD", "PARTS", "Held", "HeldRun", "motion_in_angles", "mujoco_motion", "our_motion"]
 
 GRAVITY = 9.81
 PARTS = 10
@@ -180,17 +182,34 @@ def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callab
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         seconds, energies, stretch = 0.0, [float(data.energy.sum())], 0.0
-        for _ in range(PARTS):
-            began = time.process_time()
-            mujoco.mj_step(model, data, nstep=steps // PARTS)
-            seconds += time.process_time() - began
-            mujoco.mj_forward(model, data)
-            energies.append(float(data.energy.sum()))
-            places = data.site_xpos[:, [0, 2]]
-            stretch = max(stretch, _stretch(held, places[: len(held.masses)]))
+        with _warnings() as told:
+            for _ in range(PARTS):
+                began = time.process_time()
+                mujoco.mj_step(model, data, nstep=steps // PARTS)
+                seconds += time.process_time() - began
+                mujoco.mj_forward(model, data)
+                energies.append(float(data.energy.sum()))
+                places = data.site_xpos[:, [0, 2]]
+                stretch = max(stretch, _stretch(held, places[: len(held.masses)]))
+        if told:
+            raise ArithmeticError(told[0])
         return HeldRun(seconds, float(np.ptp(energies)), stretch)
 
     return move
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """What MuJoCo warns of, which it would write to a file MUJOCO_LOG.TXT in the user's folder."""
+    import mujoco
+
+    told: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(told.append)
+    try:
+        yield told
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _document(held: Held, integrator: str, h: float, *, stiff: bool) -> str:

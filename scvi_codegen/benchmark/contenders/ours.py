@@ -84,7 +84,7 @@ def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
 def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
     """Numbers of steps that fill the span -> the tolerance for which each was advised, at the first initial state."""
     counts: dict[int, float] = {}
-    solver = "auto" if case.dimension <= LARGEST_NEWTON else "fixed-point"
+    solver = "auto" if case.dimension <= LARGEST_NEWTON or case.system.constraints else "fixed-point"
     for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
         try:
             advice = advise(case.system, method, case.q[0], momentum, case.span, tolerance, solver=solver)

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -181,7 +182,8 @@ def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
 
     began = time.perf_counter()
     x = [jitcode.y(n) for n in range(2 * case.dimension)]
-    rates = case.formulations[0].rates(x, case.parameters, symengine)
+    functions = SimpleNamespace(sin=symengine.sin, cos=symengine.cos, sqrt=symengine.sqrt, time=jitcode.t)
+    rates = case.formulations[0].rates(x, case.parameters, functions)
     system = jitcode.jitcode(rates, n=len(x), verbose=False)
     with _elsewhere():
         system.compile_C()

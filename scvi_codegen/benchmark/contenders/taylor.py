@@ -23,6 +23,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases import STATES, Array, Case, Formulation
 from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.mechanics.forms import forms_of
 
 __all__ = ["heyoka_contenders", "heyoka_ensembles", "heyoka_states"]
 
@@ -36,9 +37,9 @@ FEWEST_TOLERANCES = (0.0, 1e-12, 1e-10)
 """For what takes very long."""
 
 TRIALS = 5
-LARGEST_SMALL, LARGEST_QUICK, LARGEST_LAGRANGIAN, LARGEST_UNROLLED = 2, 8, 18, 64
+LARGEST_SMALL, LARGEST_QUICK, LARGEST_COUPLED, LARGEST_LAGRANGIAN, LARGEST_UNROLLED = 2, 8, 2, 18, 64
 """Degrees of freedom up to which compact code is never faster, code compiles within a second or so, the Lagrangian is
-tried, unrolled code compiles within a minute."""
+tried where masses are coupled (5 rods take minutes), and where they are not, unrolled code compiles within a minute."""
 
 
 def heyoka_contenders(case: Case, quick: bool) -> Iterator[Contender]:
@@ -189,7 +190,8 @@ def _formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:
     for formulation in case.formulations:
         yield formulation.name, list(zip(x, formulation.rates(x, case.parameters, heyoka), strict=True)), formulation
     plain = case.formulations[0]
-    if m <= LARGEST_LAGRANGIAN:
+    most = LARGEST_LAGRANGIAN if forms_of(case.system).separable else LARGEST_COUPLED
+    if m <= most and not any(case.system.forces):
         yield LAGRANGIAN, _from_lagrangian(case), plain
     if case.bodies is not None and not case.bodies.fixed_centre:
         yield "heyoka.model.nbody", _n_bodies(case), plain

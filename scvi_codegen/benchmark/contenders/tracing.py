@@ -16,6 +16,10 @@ class _Lines:
     def __init__(self) -> None:
         self.names: dict[str, str] = {}
 
+    @property
+    def time(self) -> _Traced:
+        return _Traced(self, "t")
+
     def add(self, text: str) -> _Traced:
         return _Traced(self, self.names.setdefault(text, f"w{len(self.names)}"))
 

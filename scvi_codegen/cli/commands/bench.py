@@ -33,7 +33,9 @@ def bench(
     """Time this project and the installed peers in turn, and compare them at equal error.
 
     SECTION is a problem (planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system,
-    double-pendulum, relativistic-particle, fput-chain:8, :64, :256), 64 trajectories of one at once
+    double-pendulum, relativistic-particle, fput-chain:8, :64, :256), one with friction and a drive (forced:duffing,
+    :cart-pole, :double-pendulum, :chain:5), rods as constraints beside their angles (constrained:pendulum,
+    :double-pendulum, :chain:5, :chain:20), 64 trajectories of one at once
     (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), adaptive (steps that choose their
     length, beside fixed steps, transformed time, heyoka and IAS15: adaptive:kepler:0.9, ..), drift (the energy over ten
     million steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up, compile

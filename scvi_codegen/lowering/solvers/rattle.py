@@ -1,12 +1,13 @@
-"""RATTLE for constant masses: the multipliers of a step by themselves, without a matrix of positions and velocities.
+"""Multipliers by themselves, for constant masses: no matrix of positions and velocities. SVI(1) is RATTLE.
 
-SVI(1) with its two points of Lobatto's is RATTLE. Where masses are constant and diagonal and forces depend on positions
-and time, its velocity is explicit in the multipliers, and what is left are two systems of one equation a constraint,
+Where masses are constant and diagonal and forces depend on positions and time, positions at the s + 1 points of
+Lobatto's are explicit in forces and multipliers (Lobatto IIIA and IIIB), and what is left are s equations a constraint,
 
-    g(q0 + h M^-1 (p0 + h/2 (F0 + G0^T lambda_0))) = 0,                 G1 M^-1 (.. + h/2 G1^T lambda_1) + g_t = 0,
+    g(u_i) = 0,   u_i = q0 + h c_i M^-1 p0 + h^2 sum_n a_in M^-1 (F_n + G_n^T lambda_n),   i = 1 .. s, n = 0 .. s - 1,
 
-the first by Newton's iteration with the matrix G1 M^-1 G0^T, a band where constraints are a chain. With more points the
-forces between them would have to be iterated, too.
+then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved by Newton's
+iteration with the matrix h^2 a_in G_i M^-1 G_n^T, a band where constraints are a chain, factorised once a step. How
+forces and slopes change with positions is left to the iteration: what that neglects is of the order of h^2.
 
 Source: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983).
 """
@@ -14,31 +15,38 @@ Source: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (19
 from __future__ import annotations
 
 from scvi_codegen.ir.constraints import Rattle
+from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
 from scvi_codegen.mechanics.constraints import constraint_slopes, velocities_held
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.tables.basis import matrix_product, transpose
 
 __all__ = ["rattle_of"]
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     """What such steps need; ``None`` for others."""
-    forms, shape = forms_of(system), stages.shape
-    if not system.constraints or any(velocities_held(system)) or not forms.separable:
-        return None
-    if not isinstance(shape, Velocities) or shape.abscissae != (0, 1) or len(shape.blocks) != 1:
+    forms, tables = forms_of(system), velocity_tables(stages.shape)
+    if not system.constraints or any(velocities_held(system)) or not forms.separable or tables is None:
         return None
     slopes = list(constraint_slopes(system))
     at: dict[int, list[int]] = {}
     for e, (_, i) in enumerate(slopes):
         at.setdefault(i, []).append(e)
     products = tuple((e, f) for own in at.values() for e in own for f in own)
+    position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
     return Rattle(
         force=system_kernel(system, "held_force", forms.force, of=system.coordinates, purpose="L_q at u = q."),
         mass=system_kernel(system, "held_mass", forms.mass.values(), of=(), purpose="The constant masses."),
         products=products,
         entries=tuple((slopes[e][0], slopes[f][0]) for e, f in products),
+        abscissae=lower_vector(tables.abscissae),
+        weights=lower_vector(tables.end_momentum),
+        position=lower_matrix(transpose(position)),
+        start=lower_vector(tuple(line[0] / tables.end_momentum[0] - 1 for line in momentum)),
+        momentum=lower_matrix(transpose(momentum)),
+        response=lower_matrix(transpose(matrix_product(position, momentum))),
     )

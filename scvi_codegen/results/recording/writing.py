@@ -86,7 +86,7 @@ def record_run(
     target = Path(folder)
     if run.steps:
         raise StateError(f"a run is recorded from its start, but this one has {run.steps} steps: start another")
-    run.check_inputs()
+    _check_inputs(run)
     manifest = Manifest(
         source=run.stepper.source,
         fallback=run.stepper.fallback,
@@ -282,6 +282,17 @@ class _Recorder:
             f"{self.run.steps - self.written} steps done since are not in it. Once it can be written, go on with "
             f"'scvi-codegen run --resume {shlex.quote(str(self.folder))}' or resume_run"
         )
+
+
+def _check_inputs(run: Run) -> None:
+    """Inputs of a run in a folder are held: it does not keep how pieces of data change h and parameters on the way."""
+    try:
+        run.check_inputs()
+    except StateError as error:
+        raise StateError(
+            f"{error}. A folder records a run whose inputs are held at numbers; one that follows data is kept in "
+            "memory and written to a file: stepper.drive(...).save('run.npz')"
+        ) from error
 
 
 def _checked_steps(run: Run, steps: int | None) -> int | None:

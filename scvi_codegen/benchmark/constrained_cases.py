@@ -1,0 +1,85 @@
+"""Masses on rods, from rest: held by constraints in their places, and in the angles of the rods, as peers have them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+from scvi_codegen.benchmark.cases import Array, Case, Formulation, scaled, second_order
+from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.contenders.ours import our_contenders
+from scvi_codegen.benchmark.hanging_rods import angles_of, places_of, rod_accelerations, rods_in_angles, rods_in_places
+from scvi_codegen.methods import as_method
+
+__all__ = ["CONSTRAINED_CASES", "ConstrainedCase", "constrained_contenders"]
+
+LARGEST_IN_ANGLES = 8
+"""Rods beyond which this project's mass matrix in angles, full and of n^2 terms, takes long to derive."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConstrainedCase:
+    """One motion twice.
+
+    Attributes:
+        angles: the case for peers, whose final q errors are measured in.
+        places: the case with constraints.
+        methods: of the constraints.
+    """
+
+    angles: Case
+    places: Case
+    methods: tuple[str, ...]
+
+    def shortened(self, share: float) -> ConstrainedCase:
+        """With a part of the span."""
+        span = share * self.angles.span
+        return replace(self, angles=replace(self.angles, span=span), places=replace(self.places, span=span))
+
+
+def constrained_contenders(both: ConstrainedCase, *, quick: bool) -> list[Contender]:
+    """By constraints, then, where there are few rods, in their angles."""
+    methods = [as_method(name, both.places.system) for name in both.methods[: 1 if quick else None]]
+    held = [_told_in_angles(each) for each in our_contenders(both.places, methods=methods, quick=quick)]
+    few = both.angles.dimension <= LARGEST_IN_ANGLES
+    return [*held, *(_named_angles(each) for each in our_contenders(both.angles, quick=quick) if few)]
+
+
+def _told_in_angles(contender: Contender) -> Contender:
+    """Its final places as angles, which takes no time of a step."""
+
+    def prepare(index: int) -> Callable[[], Array]:
+        integrate = contender.prepare(index)
+        return lambda: angles_of(integrate())
+
+    return replace(contender, prepare=prepare, momenta=None)
+
+
+def _named_angles(contender: Contender) -> Contender:
+    return replace(contender, method=f"{contender.method}, angles", momenta=None)
+
+
+def _rods(name: str, n: int, start: float, *, methods: tuple[str, ...], span: float, fine: float) -> ConstrainedCase:
+    q = scaled((start,) * n, 0.05)
+    angles = Case(
+        name=f"constrained:{name}",
+        system=rods_in_angles(n),
+        formulations=(Formulation(name="tensions of the rods", rates=second_order(rod_accelerations)),),
+        q=q,
+        velocity=0.0 * q,
+        span=span,
+        step=fine,
+        fine=fine,
+    )
+    places = replace(angles, system=rods_in_places(n), formulations=(), q=places_of(q), velocity=0.0 * places_of(q))
+    return ConstrainedCase(angles=angles, places=places, methods=methods)
+
+
+CONSTRAINED_CASES: Mapping[str, Callable[[], ConstrainedCase]] = {
+    "pendulum": partial(_rods, "pendulum", 1, 0.5, methods=("svi:6", "svi:8"), span=1000.0, fine=0.25),
+    "double-pendulum": partial(_rods, "double-pendulum", 2, 0.5, methods=("svi:6", "svi:8"), span=200.0, fine=0.125),
+    "chain:5": partial(_rods, "chain:5", 5, 0.3, methods=("svi:6",), span=100.0, fine=0.125),
+    "chain:20": partial(_rods, "chain:20", 20, 0.3, methods=("svi:6",), span=50.0, fine=0.0625),
+}
+"""By the name after ``constrained:``."""

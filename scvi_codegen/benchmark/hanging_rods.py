@@ -1,0 +1,109 @@
+"""Equal masses m on rods of length l, one below the other: in the angles of the rods, and in the places of the masses.
+
+Accelerations of the angles are hand-solved by the tensions T of the rods, whose equations are tridiagonal: with e along
+a rod, n across, and couples C on the rods (the forces C n / l at their lower ends and -C n / l at the upper ones)
+
+    m x''_k = m g - T_k e_k + T_(k+1) e_(k+1) + (C_k n_k - C_(k+1) n_(k+1)) / l,
+
+l e_k = x_k - x_(k-1) has the acceleration -l a_k'^2 along the rod, which gives T, and l a_k'' across. That is O(n);
+solving with the mass matrix of the angles is O(n^3). We know of nothing quicker in angles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import Array, Vector
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+
+__all__ = ["angles_of", "places_of", "rod_accelerations", "rods_in_angles", "rods_in_places"]
+
+UNITS = {"m": 1.0, "l": 1.0, "g": 1.0}
+
+
+def rods_in_angles(
+    n: int,
+    *,
+    parameters: Mapping[str, float] | None = None,
+    forces: Mapping[str, str] | None = None,
+    dissipation: str | None = None,
+) -> LagrangianSystem:
+    """In the angles a0, a1, .. from the vertical, nothing to hold, with forces of further parameters."""
+    terms = []
+    for last in range(1, n + 1):
+        speeds = (" + ".join(f"{turn}(a{k})*a{k}_dot" for k in range(last)) for turn in ("cos", "sin"))
+        terms.append("m*l**2/2*(" + " + ".join(f"({speed})**2" for speed in speeds) + ")")
+    terms += [f"{n - k}*m*g*l*cos(a{k})" for k in range(n)]
+    return LagrangianSystem.from_text(
+        name=f"{n} rods in angles",
+        coordinates=[f"a{k}" for k in range(n)],
+        lagrangian=" + ".join(terms),
+        parameters={**UNITS, **(parameters or {})},
+        forces=forces,
+        dissipation=dissipation,
+    )
+
+
+def rods_in_places(n: int) -> LagrangianSystem:
+    """In the places (x0, y0, x1, ..) of the masses, held at their distances."""
+    kinetic = " + ".join(f"x{k}_dot**2 + y{k}_dot**2" for k in range(n))
+    rods = [f"(x{k} - x{k - 1})**2 + (y{k} - y{k - 1})**2 = l**2" for k in range(1, n)]
+    return LagrangianSystem.from_text(
+        name=f"{n} rods",
+        coordinates=[f"{axis}{k}" for k in range(n) for axis in "xy"],
+        lagrangian=f"m*({kinetic})/2 - m*g*({' + '.join(f'y{k}' for k in range(n))})",
+        parameters=UNITS,
+        constraints=["x0**2 + y0**2 = l**2", *rods],
+    )
+
+
+def rod_accelerations(
+    q: Vector, v: Vector, of: Mapping[str, Any], functions: Any, couples: Sequence[Any] = ()
+) -> list[Any]:
+    """Of the angles, by the tensions of the rods over m; couples on each rod."""
+    n, length, g = len(q), of["l"], of["g"]
+    sines = [functions.sin(after - before) for before, after in pairwise(q)]
+    cosines = [functions.cos(after - before) for before, after in pairwise(q)]
+    turning = [couple / (of["m"] * length) for couple in couples]
+    along = [length * (speed * speed) for speed in v]
+    across = [0.0 * angle for angle in q] if not turning else [2.0 * couple for couple in turning]
+    along[0] = along[0] + g * functions.cos(q[0])
+    across[0] = (turning[0] if turning else 0.0) - g * functions.sin(q[0])
+    for k, (sine, cosine) in enumerate(zip(sines, cosines, strict=True) if turning else ()):
+        along[k], along[k + 1] = along[k] + turning[k + 1] * sine, along[k + 1] - turning[k] * sine
+        across[k] = across[k] - turning[k + 1] * cosine
+        across[k + 1] = across[k + 1] - turning[k] * cosine
+    tensions = _tridiagonal([1.0] + [2.0] * (n - 1), cosines, along)
+    for k, sine in enumerate(sines):
+        across[k] = across[k] + tensions[k + 1] * sine
+        across[k + 1] = across[k + 1] - tensions[k] * sine
+    return [each / length for each in across]
+
+
+def _tridiagonal(diagonal: Sequence[float], beside: Vector, right: Vector) -> list[Any]:
+    """X with diagonal_k x_k - beside_k x_(k+1) - beside_(k-1) x_(k-1) = right_k, eliminated from the end."""
+    pivots, values = [diagonal[-1]], [right[-1]]
+    for d, b, r in zip(diagonal[-2::-1], reversed(beside), right[-2::-1], strict=True):
+        share = b / pivots[-1]
+        pivots.append(d - share * b)
+        values.append(r + share * values[-1])
+    x = [values.pop() / pivots.pop()]
+    for b, pivot, value in zip(beside, reversed(pivots), reversed(values), strict=True):
+        x.append((value + b * x[-1]) / pivot)
+    return x
+
+
+def places_of(angles: Array, length: float = 1.0) -> Array:
+    """(.., 2 n) places of (.., n) angles."""
+    steps = length * np.stack([np.sin(angles), -np.cos(angles)], axis=-1)
+    return np.cumsum(steps, axis=-2).reshape(*angles.shape[:-1], -1)
+
+
+def angles_of(places: Array) -> Array:
+    """The (.., n) angles, between -pi and pi, of (.., 2 n) places."""
+    x, y = (np.diff(places[..., axis::2], axis=-1, prepend=0.0) for axis in (0, 1))
+    return np.arctan2(x, -y)
