@@ -37,7 +37,7 @@ def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> An
         states off them are taken as they are, and the first step leads to them.
 
     Raises:
-        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MethodError: in transformed time, and where a monitor chooses the steps.
         MissingLibraryError: without CasADi (extra ``casadi``).
         StateError: for steps that are no multiple of ``every``.
     """

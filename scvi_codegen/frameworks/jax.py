@@ -35,7 +35,7 @@ def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFl
         every: keep every so-many-th state and the initial one; by default that at the end alone.
 
     Raises:
-        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MethodError: in transformed time, and where a monitor chooses the steps.
         MissingLibraryError: without JAX (extra ``jax``).
         StateError: for steps that are no multiple of ``every``.
     """
