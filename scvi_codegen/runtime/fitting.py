@@ -23,7 +23,7 @@ from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.runtime.driven import checked_inputs
 from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
 from scvi_codegen.runtime.measurements import Measurements, distinct, state_names
-from scvi_codegen.runtime.segments import LOOSE, TIGHT, Chain, chained, joined
+from scvi_codegen.runtime.segments import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Fit", "fit"]
@@ -160,8 +160,6 @@ def fit(
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not tell {len(model.names)} unknowns")
     chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
-    if bounds and len(chain.parts) > 1:
-        raise StateError("bounds are those of a fit in one segment: leave one of the two out")
     chain, x, held, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
     if told := _told_by_steps(chain, fitted, x, ~held):
@@ -175,7 +173,8 @@ def _solved(
     """The segments as they join, the unknowns, which of them a bound holds, and how many motions that took."""
     from scipy.optimize import least_squares  # here: slow to import
 
-    limits = [np.append(own, np.full(len(x) - len(own), free)) for own, free in model.bounded(bounds)]
+    own, count = model.bounded(bounds), len(x) - len(model.names)
+    limits = np.append(own[0], np.full(count, -np.inf)), np.append(own[1], np.full(count, np.inf))
     several = len(chain.parts) > 1
     if several:
         chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
@@ -186,7 +185,7 @@ def _solved(
     _check_told(model.names, found.jac, held)
     if not several:
         return chain, found.x, held, found.nfev
-    x, more = joined(chain, found.x)
+    x, held, more = joined(chain, found.x, limits)
     return replace(chain, jump=TIGHT), x, held, found.nfev + more
 
 
@@ -244,8 +243,8 @@ class _Model:
         """(k,) to begin with."""
         return self.known[self.places]
 
-    def bounded(self, given: Mapping[str, tuple[float, float]]) -> tuple[tuple[Array, float], tuple[Array, float]]:
-        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given, as beside each."""
+    def bounded(self, given: Mapping[str, tuple[float, float]]) -> Limits:
+        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given."""
         low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for name, ends in given.items():
             if name not in self.names:
@@ -258,7 +257,7 @@ class _Model:
             if not pair[0] < self.guess[k] < pair[1]:
                 raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
             low[k], high[k] = pair
-        return (low, -np.inf), (high, np.inf)
+        return low, high
 
     def fit(self, chain: Chain, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
         """What was found; ``held``: (unknowns,) by a bound."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scvi_codegen.runtime.driven import parameters_at
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.measurements import Measurements
 
-__all__ = ["LOOSE", "TIGHT", "Chain", "chained", "joined"]
+__all__ = ["LOOSE", "TIGHT", "Chain", "Limits", "chained", "joined"]
 
 LOOSE, TIGHT = 0.1, 1e-9
 """Of the size of states: what jump weighs as much as the residual of a measurement, at first and once all joins."""
@@ -35,8 +36,14 @@ NEAR = 1e-5
 """Of jumps and of such changes: rounding hides what is downhill, and iterations are taken whole."""
 SMALL = 1e-6
 """Of the size of measurements: residuals that are smaller are as good as none."""
+BOUNDED, RELEASED = 8, 1e-9
+"""Updates of the set of bounds that hold an unknown, beside three a bound; beside the steepest slope, what lets go."""
 BESIDE = 3
 """Measurements before and after a node, through which a parabola is laid."""
+
+
+Limits: TypeAlias = tuple[Array, Array]
+"""The least and the greatest of all unknowns, infinite where there is no bound."""
 
 
 @dataclass(eq=False)
@@ -181,24 +188,61 @@ def chained(whole: Measurements, known: Array, places: NDArray[np.intp], count: 
     return Chain(parts, known, places, sizes), np.concatenate([known[places], nodes.ravel()])
 
 
-def joined(chain: Chain, x: Array) -> tuple[Array, int]:
-    """The unknowns with which the parts join, and after how many iterations; near those that leave jumps.
+def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bool_], int]:
+    """The unknowns with which the parts join, which of them a bound holds, and after how many iterations.
+
+    Near those that leave jumps, and within their bounds.
 
     Raises:
         FitError: where no iteration leads downhill, or too many are made.
     """
     whole = replace(chain, jump=1.0, unit=1.0)
+    low, high = limits
     for iteration in range(1, MOST + 1):
         found, slopes = whole.evaluated(x)
         rows = len(found) - whole.jumps.size
-        update, multipliers = _constrained(slopes, found, rows)
+        update, multipliers, held = _within(slopes, found, rows, (low - x, high - x))
         moved, size = (float(np.linalg.norm(each)) for each in (slopes[:rows] @ update, found[:rows]))
         jump, moved = float(np.abs(found[rows:]).max()), moved / max(size, SMALL)
         if jump < JOINED and moved <= SETTLED:
-            return x, iteration
+            return x, held, iteration
         near = jump < NEAR and moved < NEAR
-        x = x + (1.0 if near else _part_of(whole, x, update, 2.0 * float(np.abs(multipliers).max()))) * update
+        part = 1.0 if near else _part_of(whole, x, update, 2.0 * float(np.abs(multipliers).max()))
+        x = np.clip(x + part * update, low, high)
     raise FitError(f"the segments do not join within {MOST} iterations: give a nearer first guess, or more of them")
+
+
+def _within(slopes: Array, found: Array, rows: int, limits: Limits) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """The update that makes the first rows least and the others zero, of all that bounds allow, and their multipliers.
+
+    By an active set: from no update towards the one wanted, as far as the first bound in the way, which then holds its
+    unknown; one is let go where that leads downhill (Nocedal & Wright, *Numerical Optimization*, 16.5).
+
+    Returns:
+        The update, the multipliers of the other rows, and which unknowns a bound holds.
+    """
+    low, high = limits
+    update, held = np.zeros(slopes.shape[1]), np.zeros(slopes.shape[1], dtype=bool)
+    for _ in range(BOUNDED + 3 * int(np.isfinite(np.concatenate(limits)).sum())):
+        wanted, multipliers = update.copy(), np.zeros(len(found) - rows)
+        rest = found + slopes[:, held] @ update[held]
+        wanted[~held], multipliers = _constrained(slopes[:, ~held], rest, rows)
+        beyond, bound = (wanted < low) | (wanted > high), np.where(wanted < low, low, high)
+        if beyond.any():
+            parts = np.full(len(update), np.inf)
+            parts[beyond] = (bound - update)[beyond] / (wanted - update)[beyond]
+            first = int(np.argmin(parts))
+            update = np.clip(update + parts[first] * (wanted - update), low, high)
+            update[first], held[first] = bound[first], True
+            continue
+        update = wanted
+        residuals = found[:rows] + slopes[:rows] @ update
+        uphill = slopes[:rows].T @ residuals - slopes[rows:].T @ multipliers
+        inward = np.where(held, np.where(update <= low, -uphill, uphill), 0.0)
+        if not (inward > RELEASED * np.abs(uphill).max(initial=0.0)).any():
+            break
+        held[int(np.argmax(inward))] = False
+    return update, multipliers, held
 
 
 def _part_of(chain: Chain, x: Array, update: Array, weight: float) -> float:
