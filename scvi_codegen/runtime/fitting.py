@@ -29,11 +29,11 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["Fit", "fit"]
 
 SAME = 1e-10
-"""Beside slopes of size 1: what is smaller tells nothing but rounding."""
+"""Beside the largest change that an unknown makes by its own size: what is smaller tells nothing but rounding."""
 NEARER = 4
 """Iterations of Gauss and Newton from what was found by steps half as long."""
 NOTICED = 1e-6
-"""Beside the largest unknown: by how much steps half as long may move one of which nothing is said."""
+"""Of its size: by how much steps half as long may move one of which nothing is said."""
 SHARE = 0.1
 """Of a direction that changes nothing: an unknown with less of it is not named."""
 
@@ -182,7 +182,7 @@ def _solved(
     if not found.success:
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
     held = found.active_mask != 0
-    _check_told(model.names, found.jac, held)
+    _check_told(model.names, found.jac, chain.typical_unknowns(found.x), held)
     if not several:
         return chain, found.x, held, found.nfev
     x, held, more = joined(chain, found.x, limits)
@@ -291,12 +291,12 @@ class _Model:
 def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_]) -> str:
     """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
 
-    What moves by less than a millionth of the largest unknown is left alone: data without noise have no errors.
+    What moves by less than a millionth of its size is left alone: data without noise have no errors.
     """
     finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
     count, found = len(fitted.names), x.copy()
     errors, told = np.sqrt(np.diag(fitted.covariance)), free[:count]
-    noticed = np.maximum(errors, NOTICED * np.abs(fitted.values).max(initial=0.0))
+    noticed = np.maximum(errors, NOTICED * chain.typical_unknowns(x)[:count])
     with suppress(StepFailedError):
         for _ in range(NEARER):
             scaled, slopes = finer.evaluated(found)
@@ -317,22 +317,26 @@ def _of_inputs(stepper: Stepper) -> set[str]:
     return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
 
 
-def _check_told(names: Sequence[str], slopes: Array, held: NDArray[np.bool_]) -> None:
+def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray[np.bool_]) -> None:
     """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is.
+
+    Each by its own size, so that units do not matter.
 
     Args:
         names: of the first unknowns; states at later nodes have none.
         slopes: (rows, unknowns).
+        sizes: (unknowns,) of each, 0 where it is not known.
         held: (unknowns,) by a bound.
     """
     if held.all():
         return
     own = [*names, *[""] * (len(held) - len(names))]
-    free, slopes = [name for name, at in zip(own, held, strict=True) if not at], slopes[:, ~held]
-    sizes = np.sqrt((slopes**2).sum(axis=0))
-    if nothing := np.flatnonzero(sizes <= SAME * sizes.max(initial=0.0)).tolist():
+    free, slopes, sizes = [name for name, at in zip(own, held, strict=True) if not at], slopes[:, ~held], sizes[~held]
+    lengths = np.linalg.norm(slopes, axis=0)
+    changes = lengths * sizes
+    if nothing := np.flatnonzero((lengths == 0.0) | ((sizes > 0.0) & (changes <= SAME * changes.max()))).tolist():
         raise FitError(f"these measurements do not tell {free[nothing[0]]}: they do not depend on it. Take it as known")
-    singular, directions = np.linalg.svd(slopes / sizes)[1:]
+    singular, directions = np.linalg.svd(slopes / lengths)[1:]
     if singular[-1] > SAME * singular[0]:
         return
     shares = np.abs(directions[-1])

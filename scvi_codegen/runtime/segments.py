@@ -101,6 +101,14 @@ class Chain:
         sizes = [np.nanmax(np.abs(part.measured / part.deviations)) for part in self.parts if part.used.any()]
         return max(float(np.sqrt(np.mean(scaled**2))), SMALL * float(max(sizes, default=1.0)), 1e-300)
 
+    def typical_unknowns(self, x: Array) -> Array:
+        """(unknowns,) sizes: of parameters theirs, of states at least that of the motion; 0 where there is none."""
+        guess, sizes = self.known[self.places], np.zeros(len(self.known))
+        sizes[: self.state] = self.sizes
+        own = np.where(guess != 0.0, np.maximum(np.abs(guess), np.abs(x[: len(guess)])), 0.0)
+        first = np.maximum(own, sizes[self.places])
+        return np.concatenate([first, np.tile(self.sizes, len(self.parts) - 1)])
+
     def evaluated(self, x: Array) -> tuple[Array, Array]:
         """Both, of one computation of the motion."""
         if self.at is None or not np.array_equal(x, self.at):
@@ -183,9 +191,20 @@ def chained(whole: Measurements, known: Array, places: NDArray[np.intp], count: 
     """So many parts, and a first guess of all unknowns."""
     parts = whole.cut(count) if count > 1 else (whole,)
     nodes = _states_told(whole, parts, known)
-    spread = np.ptp(np.concatenate([known[np.newaxis, : nodes.shape[1]], nodes]), axis=0)
-    sizes = np.where(spread > 0.0, spread, spread.max(initial=0.0) or 1.0)
+    sizes = _sizes(parts, known, nodes)
     return Chain(parts, known, places, sizes), np.concatenate([known[places], nodes.ravel()])
+
+
+def _sizes(parts: Sequence[Measurements], known: Array, nodes: Array) -> Array:
+    """(2m,) by how much each number of a state changes from node to node; those at rest as the most of their kind."""
+    size = nodes.shape[1]
+    states = np.concatenate([known[np.newaxis, :size], nodes])
+    if len(states) == 1:
+        end = parts[0].motion(known[:size], np.zeros((0, parts[0].stepper.given)), known[size:])[2]
+        states = np.stack([states[0], end])
+    kinds = np.ptp(states, axis=0).reshape(2, -1)
+    largest = kinds.max(axis=1, keepdims=True)
+    return np.where(kinds > 0.0, kinds, np.where(largest > 0.0, largest, 1.0)).ravel()
 
 
 def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bool_], int]:

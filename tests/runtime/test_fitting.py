@@ -1,5 +1,6 @@
 """Parameters and initial states from measurements: against DOP853 and curve_fit, and errors that mean what they say."""
 
+import warnings
 from functools import cache, partial
 from itertools import product
 
@@ -373,6 +374,35 @@ def test_least_squares_with_equations_and_bounds():
             if (low <= other + 1e-12).all() and (other <= high + 1e-12).all():
                 best = min(best, float(np.linalg.norm(slopes[:rows] @ other + found[:rows])))
         assert np.linalg.norm(slopes[:rows] @ update + found[:rows]) == pytest.approx(best, rel=1e-10)
+
+
+@cache
+def kepler():
+    system = LagrangianSystem.from_text(
+        name="Kepler and a spring",
+        coordinates=["x", "y", "z"],
+        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + mu/sqrt(x**2 + y**2) - k*z**2/2",
+        parameters={"mu": 1.0, "k": 1.0},
+    )
+    return compile_stepper(system, SVI(8), flags=QUICK_FLAGS)
+
+
+@pytest.mark.parametrize("segments", [1, 3])
+@pytest.mark.parametrize(("length", "time"), [(1.0, 1.0), (1e6, 1e-6), (1e-6, 1e6), (1e6, 1e6), (1e-6, 1e-6)])
+def test_what_is_told_does_not_depend_on_units(length, time, segments):
+    """Not even where slopes by mu, q and p are 10^30 apart; nor are data without noise a fault of the steps."""
+    units = [length**3 / time**2, 1 / time**2, *[length] * 3, *[length / time] * 3]
+    true = np.array([1.0, 1.0, 1.0, 0.0, 0.2, 0.0, 0.8, 0.1])
+    mu, k, *state = (true * units).tolist()
+    motion = kepler().integrate(state[:3], state[3:], h=0.05 * time, steps=120, parameters=[mu, k])
+    guess = {"q": state[:3], "p": state[3:], "h": 0.05 * time, "start": 0.0, "segments": segments}
+    t, q = motion.t[5::5], motion.q[5::5]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AccuracyWarning)
+        found = fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
+    assert_allclose(found.values / units, true, atol=1e-8)
+    with pytest.raises(FitError, match=r"do not tell (k|z|p_z)"):
+        fit(kepler(), t, q[:, :2], observed=["x", "y"], parameters=[1.01 * mu, k], **guess)
 
 
 def test_what_segments_do_not_have():
