@@ -32,11 +32,11 @@ class ArrayFlow(Flow):
 
     @property
     @abstractmethod
-    def arrays(self) -> Arrays:
+    def _arrays(self) -> Arrays:
         """Those of the framework."""
 
     @abstractmethod
-    def along(self, x: Any) -> Any:
+    def _along(self, x: Any) -> Any:
         """(.., kept, 2m) states of the flows from (.., given) numbers each."""
 
     def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
@@ -64,16 +64,16 @@ class ArrayFlow(Flow):
             else [self._vector(values, count, "parameters")]
         )
         ends = [self._number(t, "t"), self._number(h, "h")]
-        found = self.along(self._beside(self._vector(q, m, "q"), self._vector(p, m, "p"), *given, *ends))
+        found = self._along(self._beside(self._vector(q, m, "q"), self._vector(p, m, "p"), *given, *ends))
         found = found if self.every else found[..., -1, :]
         return found[..., :m], found[..., m:]
 
     def _number(self, value: Any, name: str) -> Any:
         """(.., 1)."""
-        return self.arrays.binary64(value, name)[..., None]
+        return self._arrays.binary64(value, name)[..., None]
 
     def _vector(self, value: Any, length: int, name: str) -> Any:
-        array = self.arrays.binary64(value, name)
+        array = self._arrays.binary64(value, name)
         if tuple(array.shape[-1:]) != (length,):
             raise StateError(f"{name} must have shape (.., {length}), not {tuple(array.shape)}")
         return array
@@ -84,4 +84,4 @@ class ArrayFlow(Flow):
             batch = np.broadcast_shapes(*(tuple(part.shape[:-1]) for part in parts))
         except ValueError as error:
             raise StateError(f"the leading axes of q, p, parameters, t and h do not fit: {error}") from error
-        return self.arrays.joined([self.arrays.expanded(part, (*batch, part.shape[-1])) for part in parts])
+        return self._arrays.joined([self._arrays.expanded(part, (*batch, part.shape[-1])) for part in parts])

@@ -49,12 +49,12 @@ class JaxFlow(ArrayFlow):
     """The states of a motion, as a function that JAX differentiates."""
 
     @property
-    def arrays(self) -> Arrays:
-        """See :attr:`ArrayFlow.arrays`."""
+    def _arrays(self) -> Arrays:
+        """See :attr:`ArrayFlow._arrays`."""
         return _JaxArrays()
 
-    def along(self, x: Any) -> Any:
-        """See :meth:`ArrayFlow.along`."""
+    def _along(self, x: Any) -> Any:
+        """See :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.jax_primitives import states_along
 
         size = 2 * self.stepper.dimension

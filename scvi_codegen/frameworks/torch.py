@@ -42,12 +42,12 @@ class TorchFlow(FlowOfRows, ArrayFlow):
     """The states of a motion, as a function that PyTorch differentiates."""
 
     @property
-    def arrays(self) -> Arrays:
-        """See :attr:`ArrayFlow.arrays`."""
+    def _arrays(self) -> Arrays:
+        """See :attr:`ArrayFlow._arrays`."""
         return _Tensors()
 
-    def along(self, x: Any) -> Any:
-        """See :meth:`ArrayFlow.along`."""
+    def _along(self, x: Any) -> Any:
+        """See :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.torch_functions import StatesAlong
 
         return StatesAlong.apply(x, self)

@@ -30,8 +30,9 @@ LEAST_PART = 1e-4
 """Of an iteration, which is halved as long as it leads uphill."""
 ENOUGH = 1e-4
 """Of the descent that slopes promise: what an iteration must bring."""
-JOINED, SETTLED = 1e-10, 1e-9
-"""Jumps of no size; beside the residuals, by how much an iteration that is the last changes them."""
+JOINED, SETTLED, LEFT = 1e-10, 1e-9, 1e-12
+"""Jumps of no size; by how much the last iteration changes residuals, beside these, or, by rounding, beside all that is
+measured, by rounding."""
 NEAR = 1e-5
 """Of jumps and of such changes: rounding hides what is downhill, and iterations are taken whole."""
 SMALL = 1e-6
@@ -100,6 +101,11 @@ class Chain:
         scaled = self.scaled(x)
         sizes = [np.nanmax(np.abs(part.measured / part.deviations)) for part in self.parts if part.used.any()]
         return max(float(np.sqrt(np.mean(scaled**2))), SMALL * float(max(sizes, default=1.0)), 1e-300)
+
+    @property
+    def measured(self) -> float:
+        """The norm of all that is measured, in standard deviations."""
+        return float(np.sqrt(sum(np.nansum((part.measured / part.deviations) ** 2) for part in self.parts)))
 
     def typical_unknowns(self, x: Array) -> Array:
         """(unknowns,) sizes: of parameters theirs, of states at least that of the motion; 0 where there is none."""
@@ -215,14 +221,14 @@ def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bo
     Raises:
         FitError: where no iteration leads downhill, or too many are made.
     """
-    whole = replace(chain, jump=1.0, unit=1.0)
-    low, high = limits
+    whole, (low, high) = replace(chain, jump=1.0, unit=1.0), limits
+    rounding = LEFT * whole.measured
     for iteration in range(1, MOST + 1):
         found, slopes = whole.evaluated(x)
         rows = len(found) - whole.jumps.size
         update, multipliers, held = _within(slopes, found, rows, (low - x, high - x))
         moved, size = (float(np.linalg.norm(each)) for each in (slopes[:rows] @ update, found[:rows]))
-        jump, moved = float(np.abs(found[rows:]).max()), moved / max(size, SMALL)
+        jump, moved = float(np.abs(found[rows:]).max()), moved / max(size, rounding / SETTLED)
         if jump < JOINED and moved <= SETTLED:
             return x, held, iteration
         near = jump < NEAR and moved < NEAR

@@ -387,8 +387,9 @@ def kepler():
     return compile_stepper(system, SVI(8), flags=QUICK_FLAGS)
 
 
-@pytest.mark.parametrize("segments", [1, 3])
-@pytest.mark.parametrize(("length", "time"), [(1.0, 1.0), (1e6, 1e-6), (1e-6, 1e6), (1e6, 1e6), (1e-6, 1e-6)])
+@pytest.mark.parametrize(
+    ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]
+)
 def test_what_is_told_does_not_depend_on_units(length, time, segments):
     """Not even where slopes by mu, q and p are 10^30 apart; nor are data without noise a fault of the steps."""
     units = [length**3 / time**2, 1 / time**2, *[length] * 3, *[length / time] * 3]
@@ -396,7 +397,7 @@ def test_what_is_told_does_not_depend_on_units(length, time, segments):
     mu, k, *state = (true * units).tolist()
     motion = kepler().integrate(state[:3], state[3:], h=0.05 * time, steps=120, parameters=[mu, k])
     guess = {"q": state[:3], "p": state[3:], "h": 0.05 * time, "start": 0.0, "segments": segments}
-    t, q = motion.t[5::5], motion.q[5::5]
+    t, q = motion.t[2::2], motion.q[2::2]
     with warnings.catch_warnings():
         warnings.simplefilter("error", AccuracyWarning)
         found = fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
