@@ -177,9 +177,9 @@ class _Texts:
     def tangent(self, *, second: bool = False) -> Source | None:
         """With derivatives of steps by all they start from, the second ones, too.
 
-        None in transformed time; of damped systems no second ones.
+        In transformed time, and of damped systems, there are no second ones.
         """
-        if self.system.integrands or (second and self.system.damping):
+        if second and (self.system.integrands or self.system.damping):
             return None
         found = self.program(fallback=True)
         if not found.newton:  # explicit steps

@@ -24,6 +24,7 @@ from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem
 from scvi_codegen.tables.precision import Number, mp
 
@@ -67,6 +68,7 @@ class DerivedStep:
             for family, own in zip(stages.families, symbols, strict=True)
         ]
         self.damping = Tape([stages.damping], system.parameters)
+        self.rate = Tape([system.clock.rate], symbols[0]) if system.clock else None
         self.blocks = _slices(stages.block_sizes(system.dimension))
         self.rows = _slices(stages.row_sizes(system.dimension))
         self.arguments = [_slices([len(gather.arguments) for gather in family.gathers]) for family in stages.families]
@@ -122,6 +124,20 @@ class DerivedStep:
             update = update + inverse @ (rows - matrix @ update)
         z = z - update
         return self._end(z, self._rows(z, known), known)
+
+    def duration(self, solved: SolvedStep, q: Any, p: Any, h: Any) -> Number:
+        """What of time a step lasts: the rate of the clock, summed along its curve by the method's own quadrature.
+
+        Raises:
+            StateError: where time is not transformed.
+        """
+        shape = self.stages.shape
+        if self.rate is None or not isinstance(shape, Velocities):
+            raise StateError(f"the time of '{self.system.name}' is not transformed")
+        known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.zero)
+        family, z = self.stages.families[0], np.array(solved.unknowns, dtype=object)
+        rates = [self.rate(self._point(family, n, own, known))[0] for n, own in enumerate(self._arguments(0, z, known))]
+        return known.h * mp.fdot(shape.weights, rates)
 
     def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
         """(m,) and (unknowns,) derivatives of the generating function by q0 and the unknowns, by central differences.

@@ -6,7 +6,7 @@ from typing import Any
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import Flow, imported
-from scvi_codegen.kinds import of, takes
+from scvi_codegen.kinds import SWITCH, of, takes
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.stepper import Stepper
@@ -16,19 +16,20 @@ __all__ = ["casadi_flow"]
 ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 
-@takes(StateError, stepper=of("a compiled stepper", Stepper))
-def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Any:
+@takes(StateError, stepper=of("a compiled stepper", Stepper), hessian=SWITCH)
+def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None, hessian: bool = False) -> Any:
     """So many steps of a stepper as a ``casadi.Function``.
 
     It is an external function in compiled C, which CasADi calls without Python, with its Jacobian and its adjoint by
     CasADi's naming convention: ``jacobian``, ``gradient``, ``jtimes``, ``map`` and nonlinear programs take it like any
-    other. Derivatives are exact, those of the computed map. There are no second ones: give IPOPT
+    other. Derivatives are exact, those of the computed map. Second ones are there with ``hessian``; without, give IPOPT
     ``{"ipopt.hessian_approximation": "limited-memory"}``, or steps as constraints (:func:`optimal_control`).
 
     Args:
         stepper: system and method.
         steps: how many.
         every: keep every so-many-th state and the initial one; by default that at the end alone.
+        hessian: with second derivatives, exact, too, whose kernels are then derived and compiled.
 
     Returns:
         A ``casadi.Function`` of q (m), p (m), parameters (k), such as ``stepper.defaults``, t and h, by place or by
@@ -37,13 +38,14 @@ def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> An
         states off them are taken as they are, and the first step leads to them.
 
     Raises:
-        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MethodError: in transformed time, and where a monitor chooses the steps; for second derivatives with damping.
         MissingLibraryError: without CasADi (extra ``casadi``).
         StateError: for steps that are no multiple of ``every``.
     """
     flow = Flow.checked(stepper, steps, every)
     ca = imported("casadi", "casadi")
-    source = with_casadi_flow(flow.derivatives, flow.steps, flow.spacing)
+    derivatives = flow.second_derivatives if hessian else flow.derivatives
+    source = with_casadi_flow(derivatives, flow.steps, flow.spacing, second=hessian)
     library = building.load(source, flags=stepper.flags)
     name, m = casadi_name(source.prefix), stepper.dimension
     sizes = (m, m, len(stepper.parameters), 1, 1)

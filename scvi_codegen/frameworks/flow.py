@@ -63,8 +63,7 @@ class Flow:
 
     @property
     def derivatives(self) -> Source:
-        """The C text with derivatives of steps; MethodError in transformed time."""
-        self.stepper.tangent  # noqa: B018  (it says what is missing)
+        """The C text with derivatives of steps."""
         source = self.stepper.derivatives
         assert source is not None
         return source

@@ -7,7 +7,8 @@ from functools import cached_property
 from typing import Any
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.frameworks.flow import Flow, imported
+from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
 from scvi_codegen.kinds import of, takes
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND, with_xla_flow
@@ -35,7 +36,7 @@ def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFl
         every: keep every so-many-th state and the initial one; by default that at the end alone.
 
     Raises:
-        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MethodError: in transformed time, and where a monitor chooses the steps.
         MissingLibraryError: without JAX (extra ``jax``).
         StateError: for steps that are no multiple of ``every``.
     """
@@ -44,40 +45,20 @@ def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFl
     return flow
 
 
-class JaxFlow(Flow):
+class JaxFlow(ArrayFlow):
     """The states of a motion, as a function that JAX differentiates."""
 
-    def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
-        """States at the end, or where every so-many-th is kept, at these.
+    @property
+    def _arrays(self) -> Arrays:
+        """See :attr:`ArrayFlow._arrays`."""
+        return _JaxArrays()
 
-        Args:
-            q, p: (.., m) initial positions and momenta. Leading axes are broadcast against each other. Where there are
-                constraints, states off them are taken as they are, and the first step leads to them.
-            h: (..) step.
-            t: (..) initial time.
-            parameters: by name, (..) each, others keeping their defaults; or (.., k) in order.
-
-        Returns:
-            (q, p), (.., m) each; with ``every`` (.., n, m). A step that fails raises JAX's error, with its time.
-
-        Raises:
-            StateError: for wrong shapes and names, and for anything but binary64.
-        """
-        import jax.numpy as jnp
-
+    def _along(self, x: Any) -> Any:
+        """See :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.jax_primitives import states_along
 
-        m, count = self.stepper.dimension, len(self.stepper.parameters)
-        values = self.parameter_values(parameters)
-        if isinstance(values, list):
-            each = jnp.broadcast_arrays(*(_binary64(value, "a parameter") for value in values)) if values else []
-            values = jnp.stack(each, -1) if each else jnp.zeros(0)
-        vectors = [_vector(q, m, "q"), _vector(p, m, "p"), _vector(values, count, "parameters")]
-        numbers = [jnp.expand_dims(_binary64(t, "t"), -1), jnp.expand_dims(_binary64(h, "h"), -1)]
-        x = _beside(*vectors, *numbers)
-        found = states_along(x, target=self._target, steps=self.steps, every=self.spacing, size=2 * m)
-        found = found if self.every else found[..., -1, :]
-        return found[..., :m], found[..., m:]
+        size = 2 * self.stepper.dimension
+        return states_along(x, target=self._target, steps=self.steps, every=self.spacing, size=size)
 
     @cached_property
     def _target(self) -> str:
@@ -112,32 +93,31 @@ class JaxFlow(Flow):
         return name
 
 
-def _binary64(value: Any, name: str) -> Any:
-    """An array of JAX; StateError for numbers of fewer digits, to which a flow would be rounded without a word."""
-    import jax
-    import jax.numpy as jnp
+class _JaxArrays:
+    """Arrays of JAX."""
 
-    if not jax.config.jax_enable_x64:
-        raise StateError("a flow is computed in binary64: call jax.config.update('jax_enable_x64', True) at the start")
-    array = jnp.asarray(value)
-    if array.dtype != jnp.float64 and jnp.issubdtype(array.dtype, jnp.inexact):
-        raise StateError(f"{name} is {array.dtype}, but a flow is computed in binary64: give float64")
-    return array.astype(jnp.float64)
+    def binary64(self, value: Any, name: str) -> Any:
+        """See :meth:`Arrays.binary64`."""
+        import jax
+        import jax.numpy as jnp
 
+        if not jax.config.jax_enable_x64:
+            raise StateError(
+                "a flow is computed in binary64: call jax.config.update('jax_enable_x64', True) at the start"
+            )
+        array = jnp.asarray(value)
+        if array.dtype != jnp.float64 and jnp.issubdtype(array.dtype, jnp.inexact):
+            raise StateError(f"{name} is {array.dtype}, but a flow is computed in binary64: give float64")
+        return array.astype(jnp.float64)
 
-def _vector(value: Any, length: int, name: str) -> Any:
-    array = _binary64(value, name)
-    if array.shape[-1:] != (length,):
-        raise StateError(f"{name} must have shape (.., {length}), not {array.shape}")
-    return array
+    def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
+        """See :meth:`Arrays.expanded`."""
+        import jax.numpy as jnp
 
+        return jnp.broadcast_to(array, shape)
 
-def _beside(*parts: Any) -> Any:
-    """(.., n) arrays, one behind the other."""
-    import jax.numpy as jnp
+    def joined(self, parts: Sequence[Any]) -> Any:
+        """See :meth:`Arrays.joined`."""
+        import jax.numpy as jnp
 
-    try:
-        batch = jnp.broadcast_shapes(*(part.shape[:-1] for part in parts))
-    except ValueError as error:
-        raise StateError(f"the leading axes of q, p, parameters, t and h do not fit: {error}") from error
-    return jnp.concatenate([jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1)
+        return jnp.concatenate(parts, axis=-1)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import imported
+from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
 from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.kinds import of, takes
 from scvi_codegen.runtime.stepper import Stepper
@@ -27,7 +29,7 @@ def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Tor
         every: keep every so-many-th state and the initial one; by default that at the end alone.
 
     Raises:
-        MethodError: for a stepper that has no derivatives (in transformed time), or whose steps a monitor chooses.
+        MethodError: in transformed time, and where a monitor chooses the steps.
         MissingLibraryError: without PyTorch (extra ``torch``).
         StateError: for steps that are no multiple of ``every``.
     """
@@ -36,66 +38,43 @@ def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Tor
     return flow
 
 
-class TorchFlow(FlowOfRows):
+class TorchFlow(FlowOfRows, ArrayFlow):
     """The states of a motion, as a function that PyTorch differentiates."""
 
-    def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
-        """States at the end, or where every so-many-th is kept, at these; as of :meth:`JaxFlow.__call__`.
+    @property
+    def _arrays(self) -> Arrays:
+        """See :attr:`ArrayFlow._arrays`."""
+        return _Tensors()
 
-        Args:
-            q, p: (.., m) initial positions and momenta. Leading axes are broadcast against each other.
-            h: (..) step.
-            t: (..) initial time.
-            parameters: by name, (..) each, others keeping their defaults; or (.., k) in order.
-
-        Returns:
-            (q, p), (.., m) each; with ``every`` (.., n, m).
-
-        Raises:
-            StateError: for wrong shapes and names, and for anything but binary64.
-            StepFailedError: if a step fails.
-        """
-        import torch
-
+    def _along(self, x: Any) -> Any:
+        """See :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.torch_functions import StatesAlong
 
-        m, count = self.stepper.dimension, len(self.stepper.parameters)
-        values = self.parameter_values(parameters)
-        if isinstance(values, list):
-            each = torch.broadcast_tensors(*(_binary64(value, "a parameter") for value in values)) if values else []
-            values = torch.stack(each, -1) if values else torch.zeros(0, dtype=torch.float64)
-        vectors = [_vector(q, m, "q"), _vector(p, m, "p"), _vector(values, count, "parameters")]
-        numbers = [_binary64(t, "t").unsqueeze(-1), _binary64(h, "h").unsqueeze(-1)]
-        found = StatesAlong.apply(_beside(*vectors, *numbers), self)
-        found = found if self.every else found[..., -1, :]
-        return found[..., :m], found[..., m:]
+        return StatesAlong.apply(x, self)
 
 
-def _binary64(value: Any, name: str) -> Any:
-    """A tensor; StateError for numbers of fewer digits, to which a flow would be rounded without a word."""
-    import torch
+class _Tensors:
+    """Tensors of PyTorch."""
 
-    tensor = torch.as_tensor(value, dtype=None if isinstance(value, torch.Tensor) else torch.float64)
-    if tensor.device.type != "cpu":
-        raise StateError(f"{name} is on the device {tensor.device}, but a flow is computed on processors: {name}.cpu()")
-    if tensor.is_floating_point() and tensor.dtype != torch.float64:
-        raise StateError(f"{name} is {tensor.dtype}, but a flow is computed in binary64: give torch.float64")
-    return tensor.to(torch.float64)
+    def binary64(self, value: Any, name: str) -> Any:
+        """See :meth:`Arrays.binary64`."""
+        import torch
 
+        tensor = torch.as_tensor(value, dtype=None if isinstance(value, torch.Tensor) else torch.float64)
+        if tensor.device.type != "cpu":
+            raise StateError(
+                f"{name} is on the device {tensor.device}, but a flow is computed on processors: {name}.cpu()"
+            )
+        if tensor.is_floating_point() and tensor.dtype != torch.float64:
+            raise StateError(f"{name} is {tensor.dtype}, but a flow is computed in binary64: give torch.float64")
+        return tensor.to(torch.float64)
 
-def _vector(value: Any, length: int, name: str) -> Any:
-    tensor = _binary64(value, name)
-    if tensor.shape[-1:] != (length,):
-        raise StateError(f"{name} must have shape (.., {length}), not {tuple(tensor.shape)}")
-    return tensor
+    def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
+        """See :meth:`Arrays.expanded`."""
+        return array.expand(shape)
 
+    def joined(self, parts: Sequence[Any]) -> Any:
+        """See :meth:`Arrays.joined`."""
+        import torch
 
-def _beside(*parts: Any) -> Any:
-    """(.., n) tensors, one behind the other."""
-    import torch
-
-    try:
-        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-    except RuntimeError as error:
-        raise StateError(f"the leading axes of q, p, parameters, t and h do not fit: {error}") from error
-    return torch.cat([part.expand(*batch, part.shape[-1]) for part in parts], dim=-1)
+        return torch.cat(list(parts), dim=-1)

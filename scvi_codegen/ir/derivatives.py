@@ -8,7 +8,7 @@ from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 
-__all__ = ["Derivatives", "GivenSlopes"]
+__all__ = ["Derivatives", "GivenSlopes", "LinearClock"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +25,22 @@ class GivenSlopes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LinearClock:
+    """Of transformed time: how the time that a step takes, and the energy on whose level it is taken, change.
+
+    Attributes:
+        entries: of each non-zero slope of the rate of time: the argument of the first points, or, behind these, the
+            parameter.
+        kernel: the rate at u, then these slopes.
+        level: slopes of the energy of a state by q, p and parameters, at u as of the Legendre transform.
+    """
+
+    entries: tuple[int, ...]
+    kernel: Kernel
+    level: Kernel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Derivatives:
     """Steps of a program with their derivative by all they start from.
 
@@ -35,6 +51,7 @@ class Derivatives:
             they depend on, y = (u, parameters, time): at (u, multipliers mu of phi, changes dy) the slopes of mu . phi
             by y, as they change along dy; ``None`` where phi is linear.
         damping: slopes of the rate of a damping, by parameters.
+        clock: of time where it is transformed.
         lanes: changes that are carried along at a time.
     """
 
@@ -42,6 +59,7 @@ class Derivatives:
     by_given: tuple[GivenSlopes, ...]
     curvatures: tuple[Kernel | None, ...] = ()
     damping: GivenSlopes | None = None
+    clock: LinearClock | None = None
     lanes: int = 8
 
     @property
@@ -54,7 +72,8 @@ class Derivatives:
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that the program lacks."""
         given = (*self.by_given, *((self.damping,) if self.damping else ()))
-        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures) if each)
+        clock = (self.clock.kernel, self.clock.level) if self.clock else ()
+        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock) if each)
 
     @property
     def bent(self) -> tuple[int, int]:

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from sympy import Add, Expr, Mul, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient, jacobian
-from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes
+from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes, LinearClock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem
 
@@ -31,6 +32,7 @@ def derivatives_of(
         by_given=given,
         curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
         damping=_given_slopes(system, "damping", (stages.damping,), ()) if program.damping else None,
+        clock=_linear_clock(system, stages.families[0].arguments) if system.clock else None,
     )
 
 
@@ -48,6 +50,43 @@ def _given_slopes(
         purpose="The non-zero derivatives with respect to parameters and time.",
     )
     return GivenSlopes(entries=tuple(entries), kernel=kernel)
+
+
+def _linear_clock(system: MechanicalSystem, arguments: Sequence[Symbol]) -> LinearClock:
+    assert system.clock is not None
+    rate = system.clock.rate
+    slopes = gradient(rate, (*arguments, *system.parameters))
+    return LinearClock(
+        entries=tuple(slopes),
+        kernel=system_kernel(
+            system,
+            "rate_slopes",
+            (rate,),
+            of=arguments,
+            slopes=slopes.values(),
+            purpose="The rate of time and its non-zero slopes by arguments and parameters.",
+        ),
+        level=_level_slopes(system),
+    )
+
+
+def _level_slopes(system: MechanicalSystem) -> Kernel:
+    """Of the energy E of a state: K = rate (H - E) is 0 on its level, so that E changes by the change of K / rate."""
+    assert system.clock is not None
+    m, energy = system.dimension, system.clock.energy
+    slopes = gradient(system.formula, (*system.coordinates, *system.parameters))
+    sign = 1 if system.auxiliaries else -1
+    by_others = [sign * slopes.get(j, S.Zero) for j in range(m + len(system.parameters))]
+    by_others[m + system.parameters.index(energy)] = S.Zero
+    by_p = forms_of(system).legendre if system.auxiliaries else system.velocities
+    return system_kernel(
+        system,
+        "level_slopes",
+        [slope / system.clock.rate for slope in (*by_others[:m], *by_p, *by_others[m:])],
+        of=forms_of(system).legendre_arguments,
+        purpose="Slopes of the energy by q, p and parameters, at u on its level: "
+        f"u = (q, {'p' if system.auxiliaries else 'v'}).",
+    )
 
 
 def _curvature(system: MechanicalSystem, family: PointFamily) -> Kernel | None:

@@ -59,13 +59,18 @@ def casadi_name(prefix: str) -> str:
     return f"{prefix}_flow"
 
 
-def with_casadi_flow(derivatives: Source, steps: int, every: int) -> Source:
-    """A text with derivatives of steps, and the flow of so many, with its own, by CasADi's naming convention."""
+def with_casadi_flow(derivatives: Source, steps: int, every: int, *, second: bool = False) -> Source:
+    """A text with derivatives of steps, and the flow of so many, with its own, by CasADi's naming convention.
+
+    Args:
+        derivatives: the text.
+        steps: how many; every: so many from one kept state to the next.
+        second: whether the text has second derivatives, for the Jacobian of the adjoint.
+    """
     name = casadi_name(derivatives.prefix)
     fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {every}\n}};\n\n"
-    return _behind(
-        derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", ("flow", "casadi_flow"), ""
-    )
+    headers = ("flow", "casadi_flow", *(("flow_second", "casadi_second") if second else ()))
+    return _behind(derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "")
 
 
 def _behind(source: Source, text: str, headers: Sequence[str], declarations: str) -> Source:

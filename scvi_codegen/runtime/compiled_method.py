@@ -93,12 +93,12 @@ class CompiledMethod:
 
     @property
     def derivatives(self) -> Source | None:
-        """The C text with the derivatives of steps, derived when first asked for; ``None`` in transformed time."""
+        """The C text with the derivatives of steps, derived when first asked for."""
         return self._tangent()
 
     @property
     def second_derivatives(self) -> Source | None:
-        """The same with second derivatives, derived when first asked for."""
+        """The same with second derivatives, derived when first asked for; ``None`` where there are none."""
         self._second = self._curvature()
         return self._second
 
@@ -120,14 +120,14 @@ class CompiledMethod:
 
     @property
     def tangent(self) -> Binding:
-        """The library with derivatives of steps, compiled when first asked for; MethodError where there is none."""
+        """The library with derivatives of steps, compiled when first asked for."""
         if self._with_tangent is None:
             self._with_tangent = self._linearised(self.derivatives, "derivatives")
         return self._with_tangent
 
     @property
     def curvature(self) -> Binding:
-        """The library with second derivatives, too; as :attr:`tangent`."""
+        """The library with second derivatives, too; MethodError where there are none."""
         if self._with_curvature is None:
             self._with_curvature = self._linearised(self.second_derivatives, "second derivatives")
         return self._with_curvature
@@ -145,8 +145,8 @@ class CompiledMethod:
                 "they were asked for (its second_derivatives) before it was pickled"
             )
         return (
-            ": in transformed time the energy of the start is a parameter of every step, and time an integral along "
-            "them. Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
+            ": in transformed time, whose steps begin on a level of the energy, there are first derivatives alone. "
+            "Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
         )
 
     def _load_fallback(self) -> building.Library:

@@ -23,17 +23,17 @@ from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.runtime.driven import checked_inputs
 from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
 from scvi_codegen.runtime.measurements import Measurements, distinct, state_names
-from scvi_codegen.runtime.segments import LOOSE, TIGHT, Chain, chained, joined
+from scvi_codegen.runtime.segments import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["Fit", "fit"]
 
 SAME = 1e-10
-"""Beside slopes of size 1: what is smaller tells nothing but rounding."""
+"""Beside the largest change that an unknown makes by its own size: what is smaller tells nothing but rounding."""
 NEARER = 4
 """Iterations of Gauss and Newton from what was found by steps half as long."""
 NOTICED = 1e-6
-"""Beside the largest unknown: by how much steps half as long may move one of which nothing is said."""
+"""Of its size: by how much steps half as long may move one of which nothing is said."""
 SHARE = 0.1
 """Of a direction that changes nothing: an unknown with less of it is not named."""
 
@@ -160,8 +160,6 @@ def fit(
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not tell {len(model.names)} unknowns")
     chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
-    if bounds and len(chain.parts) > 1:
-        raise StateError("bounds are those of a fit in one segment: leave one of the two out")
     chain, x, held, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
     if told := _told_by_steps(chain, fitted, x, ~held):
@@ -175,7 +173,8 @@ def _solved(
     """The segments as they join, the unknowns, which of them a bound holds, and how many motions that took."""
     from scipy.optimize import least_squares  # here: slow to import
 
-    limits = [np.append(own, np.full(len(x) - len(own), free)) for own, free in model.bounded(bounds)]
+    own, count = model.bounded(bounds), len(x) - len(model.names)
+    limits = np.append(own[0], np.full(count, -np.inf)), np.append(own[1], np.full(count, np.inf))
     several = len(chain.parts) > 1
     if several:
         chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
@@ -183,10 +182,10 @@ def _solved(
     if not found.success:
         raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
     held = found.active_mask != 0
-    _check_told(model.names, found.jac, held)
+    _check_told(model.names, found.jac, chain.typical_unknowns(found.x), held)
     if not several:
         return chain, found.x, held, found.nfev
-    x, more = joined(chain, found.x)
+    x, held, more = joined(chain, found.x, limits)
     return replace(chain, jump=TIGHT), x, held, found.nfev + more
 
 
@@ -244,8 +243,8 @@ class _Model:
         """(k,) to begin with."""
         return self.known[self.places]
 
-    def bounded(self, given: Mapping[str, tuple[float, float]]) -> tuple[tuple[Array, float], tuple[Array, float]]:
-        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given, as beside each."""
+    def bounded(self, given: Mapping[str, tuple[float, float]]) -> Limits:
+        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given."""
         low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for name, ends in given.items():
             if name not in self.names:
@@ -258,7 +257,7 @@ class _Model:
             if not pair[0] < self.guess[k] < pair[1]:
                 raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
             low[k], high[k] = pair
-        return (low, -np.inf), (high, np.inf)
+        return low, high
 
     def fit(self, chain: Chain, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
         """What was found; ``held``: (unknowns,) by a bound."""
@@ -292,12 +291,12 @@ class _Model:
 def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_]) -> str:
     """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
 
-    What moves by less than a millionth of the largest unknown is left alone: data without noise have no errors.
+    What moves by less than a millionth of its size is left alone: data without noise have no errors.
     """
     finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
     count, found = len(fitted.names), x.copy()
     errors, told = np.sqrt(np.diag(fitted.covariance)), free[:count]
-    noticed = np.maximum(errors, NOTICED * np.abs(fitted.values).max(initial=0.0))
+    noticed = np.maximum(errors, NOTICED * chain.typical_unknowns(x)[:count])
     with suppress(StepFailedError):
         for _ in range(NEARER):
             scaled, slopes = finer.evaluated(found)
@@ -318,26 +317,35 @@ def _of_inputs(stepper: Stepper) -> set[str]:
     return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
 
 
-def _check_told(names: Sequence[str], slopes: Array, held: NDArray[np.bool_]) -> None:
+def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray[np.bool_]) -> None:
     """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is.
+
+    Each by its own size, so that units do not matter.
 
     Args:
         names: of the first unknowns; states at later nodes have none.
         slopes: (rows, unknowns).
+        sizes: (unknowns,) of each, 0 where it is not known.
         held: (unknowns,) by a bound.
     """
     if held.all():
         return
     own = [*names, *[""] * (len(held) - len(names))]
-    free, slopes = [name for name, at in zip(own, held, strict=True) if not at], slopes[:, ~held]
-    sizes = np.sqrt((slopes**2).sum(axis=0))
-    if nothing := np.flatnonzero(sizes <= SAME * sizes.max(initial=0.0)).tolist():
+    free, slopes, sizes = [name for name, at in zip(own, held, strict=True) if not at], slopes[:, ~held], sizes[~held]
+    lengths = np.linalg.norm(slopes, axis=0)
+    changes = lengths * sizes
+    if nothing := np.flatnonzero((lengths == 0.0) | ((sizes > 0.0) & (changes <= SAME * changes.max()))).tolist():
         raise FitError(f"these measurements do not tell {free[nothing[0]]}: they do not depend on it. Take it as known")
-    singular, directions = np.linalg.svd(slopes / sizes)[1:]
+    singular, directions = np.linalg.svd(slopes / lengths)[1:]
     if singular[-1] > SAME * singular[0]:
         return
     shares = np.abs(directions[-1])
     told = [free[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist() if free[k]]
+    if len(told) < 2:
+        raise FitError(
+            f"these measurements do not tell {' '.join(told) or 'the states of segments'}: changed together with states "
+            "of later segments, it leaves all that is measured as it is. Take more as known"
+        )
     raise FitError(
         f"these measurements do not tell {', '.join(told[:-1])} and {told[-1]} apart: changed together, they leave all "
         "that is measured as it is. Take one of them as known"

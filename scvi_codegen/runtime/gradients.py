@@ -18,6 +18,7 @@ from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.kept_states import KeptStates
+from scvi_codegen.runtime.levels import time_of
 from scvi_codegen.runtime.linearised import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.retaken import refuse_strays, steps_between
@@ -74,7 +75,7 @@ def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
     size = 2 * states.stepper.dimension
     given = np.eye(size) if directions is None else finite(directions, "directions")
     found, _ = forward(states, changes_of(states.stepper, given))
-    return found.reshape(len(states), size, *given.shape[1:])
+    return found[:, :size].reshape(len(states), size, *given.shape[1:])
 
 
 def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
@@ -109,32 +110,38 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
 
 
 def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
-    """(n, c, given) from (n, 2m) or (n, 2m, c)."""
-    size = 2 * stepper.dimension
+    """(n, c, given) from (n, 2m) or (n, 2m, c), or, of times, too, (n, 2m + 1) or (n, 2m + 1, c)."""
+    size = slopes.shape[1]
     seeds = np.zeros((len(slopes), slopes[0].size // size, stepper.given))
-    seeds[:, :, :size] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
+    seeds[:, :, stepper.told[:size]] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
     return seeds
 
 
 def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
     """(c, given) slopes at the start, from those by each state and, now, by all that is behind the last."""
+    time = time_of(states)
+    states, by_ends = time.states, time.seeded(seeds)
     for first, last in reversed(list(pieces(states))):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
         kept = np.flatnonzero(numbers[1:] > 0) + 1
-        vectors[kept] = seeds[numbers[kept]]
+        vectors[kept] = by_ends[numbers[kept]]
         vectors[-1] += now
         carry(states, starts, numbers, vectors, back=True)
         now = vectors[0]
-    start: Array = now + seeds[0]
-    return start
+    return time.pulled(now + by_ends[0], seeds)
 
 
 def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
-    """(n, 2m) or (n, 2m, c) as they are; StateError for another shape than of so many states."""
+    """(n, 2m) or (n, 2m, c) as they are, in transformed time also with a slope by t behind those by (q, p).
+
+    Raises:
+        StateError: for another shape than of so many states.
+    """
     size, slopes = 2 * stepper.dimension, finite(cotangents, "cotangents")
-    if slopes.ndim not in (2, 3) or slopes.shape[:2] != (count, size):
-        shape = f"({count}, {size})"
+    sizes = {size, len(stepper.told)}
+    if slopes.ndim not in (2, 3) or slopes.shape[0] != count or slopes.shape[1] not in sizes:
+        shape = f"({count}, {size})" + f", or ({count}, {size + 1}) with those by t," * (len(sizes) - 1)
         raise StateError(
             f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
         )
@@ -162,19 +169,20 @@ def finite(given: ArrayLike, name: str) -> Array:
 
 
 def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
-    """(n, 2m, count) what becomes of (count, given) changes at the start, and (count, given) at the end."""
-    size = 2 * states.stepper.dimension
-    found = np.empty((len(states), size, len(changes)))
-    found[0] = changes[:, :size].T
+    """(n, told, count) what becomes of (count, given) changes at the start, and (count, given) at the end."""
+    time, told = time_of(states), states.stepper.told
+    states, now = time.states, time.begun(changes)
+    found = np.empty((len(states), len(told), len(now)))
+    found[0] = now[:, told].T
     for first, last in pieces(states):
         starts, numbers = starts_of(states, first, last)
-        vectors = np.zeros((len(numbers), *changes.shape))
-        vectors[0] = changes
+        vectors = np.zeros((len(numbers), *now.shape))
+        vectors[0] = now
         carry(states, starts, numbers, vectors, back=False)
         kept = np.flatnonzero(numbers[1:] > 0) + 1
-        found[numbers[kept]] = vectors[kept, :, :size].transpose(0, 2, 1)
-        changes = vectors[-1]
-    return found, changes
+        found[numbers[kept]] = vectors[kept][:, :, told].transpose(0, 2, 1)
+        now = vectors[-1]
+    return time.ended(found, now, changes)
 
 
 def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
@@ -186,7 +194,7 @@ def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors
 
 def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
     """First and last number of kept states: with no steps between them but those that are kept, or just two."""
-    spans, lengths = np.diff(states.t), states.lengths[:-1]
+    spans, lengths = np.diff(states.stepped), states.lengths[:-1]
     several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
     first = 0
     while first < len(spans):
@@ -200,10 +208,10 @@ def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
 
 def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
     """The steps of a piece, and (steps + 1,) the number of the kept state at each of their ends, -1 where none is."""
-    length, span = float(states.lengths[first]), float(states.t[last] - states.t[first])
+    length, span = float(states.lengths[first]), float(states.stepped[last] - states.stepped[first])
     count = steps_between(length, span) if last == first + 1 else 1
     if count == 1:
-        spans, lengths = np.diff(states.t[first : last + 1]), states.lengths[first:last]
+        spans, lengths = np.diff(states.stepped[first : last + 1]), states.lengths[first:last]
         h = np.where(np.abs(spans - lengths) < SAME_LENGTH * np.abs(lengths), lengths, spans)
         of = slice(first, last + 1)
         starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())
@@ -219,9 +227,12 @@ def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArra
         parameters=states.parameters,
         options=states.options,
     )
-    status, report = run.advance(count, 1, np.empty(count), starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
+    times = np.empty(count)
+    status, report = run.advance(count, 1, times, starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
     if status:
         raise step_failure(status, report, step=run.steps, h=length)
+    if states.tau is not None:
+        starts.t[1:] = times[:-1]
     numbers = np.full(count + 1, -1)
     numbers[[0, -1]] = first, last
     starts.q[-1], starts.p[-1] = states.q[last], states.p[last]
@@ -232,6 +243,6 @@ def _has_one_length(states: KeptStates) -> bool:
     """Whether all steps are of h."""
     if states.goal is not None:
         return False
-    spans = np.diff(states.t)
+    spans = np.diff(states.stepped)
     steps = np.rint(spans / states.h)
     return bool((np.abs(spans - steps * states.h) <= SAME_LENGTH * abs(states.h) * np.maximum(1.0, steps)).all())

@@ -38,6 +38,7 @@ def hessian_product(
     """
     slopes, bends = checked_function(states.stepper, len(states), cotangents, curvatures)
     given = finite(directions, "directions")
+    states.stepper.curvature  # noqa: B018  (where there is none, it says why)
     changes = changes_of(states.stepper, given)
     found = bent_back(states, slopes, bends, changes, np.zeros((2, *changes.shape)))
     return gradient_of(states, found[1].T.reshape(states.stepper.given, *given.shape[1:]))

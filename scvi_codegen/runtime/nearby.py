@@ -24,17 +24,18 @@ class NearbyMotions(KeptStates):
     """:class:`KeptStates` with the exact derivatives of the computed map, lengths of steps held.
 
     They stand at whole steps: states of ``t_eval`` have none. The last step of a run that a terminal event ended is
-    that to the time of the crossing, which is held, too: how it would move is not told.
+    that to the time of the crossing, which is held, too: how it would move is not told. In transformed time lengths are
+    of tau, and the times of states move; but where a run ends, at t_end or an event, its time is held.
     """
 
     def tangent(self, directions: ArrayLike | None = None) -> Array:
         """(n, 2m, k) what becomes of (2m, k) directions of (q, p) at the first state; all 2m without any.
 
         The exact derivative of the computed states, lengths of steps held (:meth:`Stepper.jacobian`). Directions may
-        be (2m + parameters + 2, k), too, of (q, p, parameters, t, h).
+        be (2m + parameters + 2, k), too, of (q, p, parameters, t, h). In transformed time the energy is that of the
+        first state, and moves with it; one among the parameters is what is added to it.
 
         Raises:
-            MethodError: in transformed time.
             StateError: for directions of another shape, and states that do not stand at whole steps.
         """
         return carried(self, directions)
@@ -43,7 +44,8 @@ class NearbyMotions(KeptStates):
         """Derivatives of all states by the initial state, the parameters, the initial time and h, lengths held.
 
         Of steps solved anew from the kept states, exact to round-off. For a few functions of the states
-        :meth:`pullback` costs less. Raises as :meth:`tangent`.
+        :meth:`pullback` costs less. In transformed time ``times`` tells of the times of the states. Raises as
+        :meth:`tangent`.
         """
         return sensitivity(self)
 
@@ -54,10 +56,10 @@ class NearbyMotions(KeptStates):
         states. Where not all states are kept (``every``) the steps between them are taken again.
 
         Args:
-            cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions.
+            cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions. In
+                transformed time also (n, 2m + 1) or (n, 2m + 1, c), with those by the time of each.
 
         Raises:
-            MethodError: in transformed time.
             StateError: for another shape, and states that do not stand at whole steps.
         """
         return pulled_back(self, cotangents)
@@ -79,7 +81,7 @@ class NearbyMotions(KeptStates):
             A :class:`Gradient`, (m,) or (m, k) and so on: its changes along the directions.
 
         Raises:
-            MethodError: in transformed time.
+            MethodError: in transformed time, and with damping.
             StateError: for another shape, and states that do not stand at whole steps.
         """
         return hessian_product(self, cotangents, directions, curvatures)

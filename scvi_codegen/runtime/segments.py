@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scvi_codegen.runtime.driven import parameters_at
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.measurements import Measurements
 
-__all__ = ["LOOSE", "TIGHT", "Chain", "chained", "joined"]
+__all__ = ["LOOSE", "TIGHT", "Chain", "Limits", "chained", "joined"]
 
 LOOSE, TIGHT = 0.1, 1e-9
 """Of the size of states: what jump weighs as much as the residual of a measurement, at first and once all joins."""
@@ -29,14 +30,21 @@ LEAST_PART = 1e-4
 """Of an iteration, which is halved as long as it leads uphill."""
 ENOUGH = 1e-4
 """Of the descent that slopes promise: what an iteration must bring."""
-JOINED, SETTLED = 1e-10, 1e-9
-"""Jumps of no size; beside the residuals, by how much an iteration that is the last changes them."""
+JOINED, SETTLED, LEFT = 1e-10, 1e-9, 1e-12
+"""Jumps of no size; by how much the last iteration changes residuals, beside these, or, by rounding, beside all that is
+measured, by rounding."""
 NEAR = 1e-5
 """Of jumps and of such changes: rounding hides what is downhill, and iterations are taken whole."""
 SMALL = 1e-6
 """Of the size of measurements: residuals that are smaller are as good as none."""
+BOUNDED, RELEASED = 8, 1e-9
+"""Updates of the set of bounds that hold an unknown, beside three a bound; beside the steepest slope, what lets go."""
 BESIDE = 3
 """Measurements before and after a node, through which a parabola is laid."""
+
+
+Limits: TypeAlias = tuple[Array, Array]
+"""The least and the greatest of all unknowns, infinite where there is no bound."""
 
 
 @dataclass(eq=False)
@@ -93,6 +101,19 @@ class Chain:
         scaled = self.scaled(x)
         sizes = [np.nanmax(np.abs(part.measured / part.deviations)) for part in self.parts if part.used.any()]
         return max(float(np.sqrt(np.mean(scaled**2))), SMALL * float(max(sizes, default=1.0)), 1e-300)
+
+    @property
+    def measured(self) -> float:
+        """The norm of all that is measured, in standard deviations."""
+        return float(np.sqrt(sum(np.nansum((part.measured / part.deviations) ** 2) for part in self.parts)))
+
+    def typical_unknowns(self, x: Array) -> Array:
+        """(unknowns,) sizes: of parameters theirs, of states at least that of the motion; 0 where there is none."""
+        guess, sizes = self.known[self.places], np.zeros(len(self.known))
+        sizes[: self.state] = self.sizes
+        own = np.where(guess != 0.0, np.maximum(np.abs(guess), np.abs(x[: len(guess)])), 0.0)
+        first = np.maximum(own, sizes[self.places])
+        return np.concatenate([first, np.tile(self.sizes, len(self.parts) - 1)])
 
     def evaluated(self, x: Array) -> tuple[Array, Array]:
         """Both, of one computation of the motion."""
@@ -176,29 +197,77 @@ def chained(whole: Measurements, known: Array, places: NDArray[np.intp], count: 
     """So many parts, and a first guess of all unknowns."""
     parts = whole.cut(count) if count > 1 else (whole,)
     nodes = _states_told(whole, parts, known)
-    spread = np.ptp(np.concatenate([known[np.newaxis, : nodes.shape[1]], nodes]), axis=0)
-    sizes = np.where(spread > 0.0, spread, spread.max(initial=0.0) or 1.0)
+    sizes = _sizes(parts, known, nodes)
     return Chain(parts, known, places, sizes), np.concatenate([known[places], nodes.ravel()])
 
 
-def joined(chain: Chain, x: Array) -> tuple[Array, int]:
-    """The unknowns with which the parts join, and after how many iterations; near those that leave jumps.
+def _sizes(parts: Sequence[Measurements], known: Array, nodes: Array) -> Array:
+    """(2m,) by how much each number of a state changes from node to node; those at rest as the most of their kind."""
+    size = nodes.shape[1]
+    states = np.concatenate([known[np.newaxis, :size], nodes])
+    if len(states) == 1:
+        end = parts[0].motion(known[:size], np.zeros((0, parts[0].stepper.given)), known[size:])[2]
+        states = np.stack([states[0], end])
+    kinds = np.ptp(states, axis=0).reshape(2, -1)
+    largest = kinds.max(axis=1, keepdims=True)
+    return np.where(kinds > 0.0, kinds, np.where(largest > 0.0, largest, 1.0)).ravel()
+
+
+def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bool_], int]:
+    """The unknowns with which the parts join, which of them a bound holds, and after how many iterations.
+
+    Near those that leave jumps, and within their bounds.
 
     Raises:
         FitError: where no iteration leads downhill, or too many are made.
     """
-    whole = replace(chain, jump=1.0, unit=1.0)
+    whole, (low, high) = replace(chain, jump=1.0, unit=1.0), limits
+    rounding = LEFT * whole.measured
     for iteration in range(1, MOST + 1):
         found, slopes = whole.evaluated(x)
         rows = len(found) - whole.jumps.size
-        update, multipliers = _constrained(slopes, found, rows)
+        update, multipliers, held = _within(slopes, found, rows, (low - x, high - x))
         moved, size = (float(np.linalg.norm(each)) for each in (slopes[:rows] @ update, found[:rows]))
-        jump, moved = float(np.abs(found[rows:]).max()), moved / max(size, SMALL)
+        jump, moved = float(np.abs(found[rows:]).max()), moved / max(size, rounding / SETTLED)
         if jump < JOINED and moved <= SETTLED:
-            return x, iteration
+            return x, held, iteration
         near = jump < NEAR and moved < NEAR
-        x = x + (1.0 if near else _part_of(whole, x, update, 2.0 * float(np.abs(multipliers).max()))) * update
+        part = 1.0 if near else _part_of(whole, x, update, 2.0 * float(np.abs(multipliers).max()))
+        x = np.clip(x + part * update, low, high)
     raise FitError(f"the segments do not join within {MOST} iterations: give a nearer first guess, or more of them")
+
+
+def _within(slopes: Array, found: Array, rows: int, limits: Limits) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """The update that makes the first rows least and the others zero, of all that bounds allow, and their multipliers.
+
+    By an active set: from no update towards the one wanted, as far as the first bound in the way, which then holds its
+    unknown; one is let go where that leads downhill (Nocedal & Wright, *Numerical Optimization*, 16.5).
+
+    Returns:
+        The update, the multipliers of the other rows, and which unknowns a bound holds.
+    """
+    low, high = limits
+    update, held = np.zeros(slopes.shape[1]), np.zeros(slopes.shape[1], dtype=bool)
+    for _ in range(BOUNDED + 3 * int(np.isfinite(np.concatenate(limits)).sum())):
+        wanted, multipliers = update.copy(), np.zeros(len(found) - rows)
+        rest = found + slopes[:, held] @ update[held]
+        wanted[~held], multipliers = _constrained(slopes[:, ~held], rest, rows)
+        beyond, bound = (wanted < low) | (wanted > high), np.where(wanted < low, low, high)
+        if beyond.any():
+            parts = np.full(len(update), np.inf)
+            parts[beyond] = (bound - update)[beyond] / (wanted - update)[beyond]
+            first = int(np.argmin(parts))
+            update = np.clip(update + parts[first] * (wanted - update), low, high)
+            update[first], held[first] = bound[first], True
+            continue
+        update = wanted
+        residuals = found[:rows] + slopes[:rows] @ update
+        uphill = slopes[:rows].T @ residuals - slopes[rows:].T @ multipliers
+        inward = np.where(held, np.where(update <= low, -uphill, uphill), 0.0)
+        if not (inward > RELEASED * np.abs(uphill).max(initial=0.0)).any():
+            break
+        held[int(np.argmax(inward))] = False
+    return update, multipliers, held
 
 
 def _part_of(chain: Chain, x: Array, update: Array, weight: float) -> float:

@@ -105,6 +105,7 @@ def along(states: KeptStates, changes: Changes) -> Deviations:
     def carried(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
         carry(states, steps, numbers, vectors, back=False)
 
+    states.stepper.check_own_time("what nearby motions do")
     first = states.q[0], states.p[0], float(states.lengths[0]), float(states.t[0])
     spreading = _Spreading(changes.at(*first, states.parameters, states.options), states.stepper.given, states.t)
     spreading.follow((starts_of(states, first, last) for first, last in pieces(states)), carried)

@@ -1,4 +1,4 @@
-"""The derivative of the compiled step by all it starts from, and its transpose."""
+"""The derivative of the compiled step by all it starts from, its transpose, and second derivatives."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 BOUND = 1e-10
 """Of the change of the end in parts of its size; of the products compared, to their largest terms."""
 WIDTH = mp.mpf(10) ** -15
+MOST_BENT = 4
+"""Coordinates of systems whose second derivatives are derived and compiled for this: of more it takes long."""
 
 
 def derivative_checks(subject: Subject) -> Iterator[Check]:
@@ -28,6 +30,9 @@ def derivative_checks(subject: Subject) -> Iterator[Check]:
     promise = "a step changes by its start, parameters, time and h as its equations do (differences in 60 digits)"
     yield from checked("derivatives", promise, partial(_derivative, subject))
     yield from checked("adjoint", "the transposed derivative is that", partial(_transpose, subject))
+    promise = "the slopes of a function of the end change as the equations bend (differences in 60 digits)"
+    yield from checked("second derivatives", promise, partial(_second, subject))
+    yield from checked("Hessian", "second derivatives are the same in either order", partial(_symmetry, subject))
 
 
 def _derivative(subject: Subject) -> Finding | None:
@@ -63,11 +68,73 @@ def _differentiable(subject: Subject) -> bool:
         return False
 
 
-def _direction(subject: Subject, state: State) -> Array:
+def _second(subject: Subject) -> Finding | None:
+    """How the end bends along two directions at once."""
+    if not _bends(subject):
+        return None
+    state = subject.states[0]
+    u, v = _direction(subject, state), _direction(subject, state, 2.3)
+    bent = _hessian(subject, state)
+    exact = _bent_by_differences(subject, state, u, v)
+    size = np.abs(u) @ np.abs(bent) @ np.abs(v)
+    return Finding(float(abs(u @ bent @ v - exact) / size) if size else 0.0, BOUND, "relative, along two directions")
+
+
+def _symmetry(subject: Subject) -> Finding | None:
+    """Of all entries, each beside the largest of its row and column, in sizes of what is given."""
+    if not _bends(subject):
+        return None
+    state = subject.states[0]
+    sizes = np.abs(_direction(subject, state))
+    bent = _hessian(subject, state) * np.outer(sizes, sizes)
+    return Finding(float(np.abs(bent - bent.T).max() / (np.abs(bent).max() or 1.0)), BOUND, "relative, all entries")
+
+
+def _bends(subject: Subject) -> bool:
+    """Whether the artefact has second derivatives, of few coordinates."""
+    if not _differentiable(subject) or subject.system.dimension > MOST_BENT:
+        return False
+    try:
+        subject.stepper.curvature  # noqa: B018
+    except MethodError:
+        return False
+    return True
+
+
+def _weights(subject: Subject, state: State) -> Array:
+    """(2m,) of the function of the end, all parts of which count alike."""
+    scales = subject.scales(state)
+    weights: Array = (1.3 + np.cos(2.0 + np.arange(len(scales)))) / scales
+    return weights
+
+
+def _hessian(subject: Subject, state: State) -> Array:
+    """(given, given) of the weighted sum of the end, compiled."""
+    stepper, parameters = subject.stepper, np.array(list(subject.parameters.values()))
+    starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
+    size = stepper.given
+    changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
+    changes[0], vectors[1, 0, :, : 2 * len(state.q)] = np.eye(size), _weights(subject, state)
+    stepper.linearise(starts, changes, parameters, None, chained=True)
+    stepper.bend(starts, changes, vectors, parameters, None)
+    bent: Array = vectors[0, 1]
+    return bent
+
+
+def _bent_by_differences(subject: Subject, state: State, u: Array, v: Array) -> float:
+    """The second derivative of the same along two directions, of the equations in 60 digits."""
+    weights = [mp.mpf(weight) for weight in _weights(subject, state)]
+    total = mp.zero
+    for sign, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        total += sign * other * mp.fdot(weights, _end(subject, state, (sign * u + other * v) * WIDTH))
+    return float(total / (4 * WIDTH**2))
+
+
+def _direction(subject: Subject, state: State, phase: float = 1.0) -> Array:
     """Of (q, p, parameters, t, h), each in parts of its size."""
     values = np.array(list(subject.parameters.values()))
     sizes = np.concatenate([subject.scales(state), np.where(values, values, 1.0), [state.h, state.h]])
-    direction: Array = sizes * (1.5 + np.sin(1.0 + 1.7 * np.arange(len(sizes))))
+    direction: Array = sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes))))
     return direction
 
 
@@ -83,12 +150,15 @@ def _carried(subject: Subject, state: State, vector: Array, *, back: bool) -> Ar
 
 def _by_differences(subject: Subject, state: State, direction: Array) -> Array:
     """Of the equations in 60 digits."""
-    step, m = subject.derived(), len(state.q)
-    given = np.array([mp.mpf(x) for x in (*state.z, *subject.parameters.values(), state.t, state.h)], dtype=object)
-    ends = []
-    for sign in (1, -1):
-        moved = given + direction * (sign * WIDTH)
-        end = step.with_parameters(moved[2 * m : -2])(moved[:m], moved[m : 2 * m], moved[-1], moved[-2])
-        ends.append(np.array([*end.q, *end.p], dtype=object))
+    ends = [_end(subject, state, direction * (sign * WIDTH)) for sign in (1, -1)]
     slope: Array = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
     return slope
+
+
+def _end(subject: Subject, state: State, change: Array) -> Array:
+    """(2m,) where the step leads from what is given, changed, in 60 digits."""
+    step, m = subject.derived(), len(state.q)
+    given = np.array([mp.mpf(x) for x in (*state.z, *subject.parameters.values(), state.t, state.h)], dtype=object)
+    moved = (given + change).tolist()
+    end = step.with_parameters(moved[2 * m : -2])(moved[:m], moved[m : 2 * m], moved[-1], moved[-2])
+    return np.array([*end.q, *end.p], dtype=object)

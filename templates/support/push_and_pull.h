@@ -1,22 +1,6 @@
 /* The derivative of steps, and its transpose, exact: those of the map which the solved equations define. Before it:
- * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated; where DAMPED,
- * growth_wide, from what is given to gamma h. */
-
-enum {
-  COUNT_OF_FAMILIES = sizeof FAMILIES / sizeof *FAMILIES
-};
-
-/* What one step is linearised by: the solved step; its slopes at points; room for what changes. */
-typedef struct {
-  const step_data *step;
-  newton_data data;
-  band shape;
-  real *slopes;
-  wide *v, *dz, *rows, *x, *points;
-  wide *grown; /* changes of gamma h; NULL without damping */
-  real growth; /* gamma h */
-  real p1[M];
-} linearised_step;
+ * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated; linearised.h;
+ * where DAMPED, growth_wide, from what is given to gamma h; end_time, how the time at the end depends on all. */
 
 static linearised_step linearised_in(const step_data *step, real *workspace)
 {
@@ -152,9 +136,9 @@ static void push_step(const linearised_step *at)
   through_points(at, 0, at->v, NULL);
   solve_forward(at);
   through_points(at, 0, NULL, at->dz);
+  end_time(at, 0);
   end_position(at, 0);
   end_momentum(at, 0);
-  flow(0, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
 }
 
 /* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): its transpose. In dz stand
@@ -165,9 +149,9 @@ static void pull_on(const linearised_step *at)
 #ifdef DAMPED
   memset(at->grown, 0, sizeof(wide));
 #endif
-  flow(1, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);
   end_momentum(at, 1);
   end_position(at, 1);
+  end_time(at, 1);
   through_points(at, 1, NULL, at->dz);
   solve_back(at);
   through_points(at, 1, at->v, NULL);

@@ -240,6 +240,36 @@ C_TEXT = (
         "position.lane[0]",
     ),
 )
+SECOND = (
+    text(
+        "the end position does not bend", case("kepler/svi-3"), r"bend_end_position\(to\);", "(void)bend_end_position;"
+    ),
+    text(
+        "second derivatives at the start of the step",
+        case("driven/svi"),
+        r"f->curvature\(given, time_of\(f, step, n\),",
+        "f->curvature(given, step->t,",
+    ),
+    text(
+        "arguments that h moves bend once too often",
+        case("kepler/svi-3"),
+        r"add_product\(by, -by_h\[k\] / h, to->pulled \+ k, dh\);",
+        "add_product(by, by_h[k] / h, to->pulled + k, dh);",
+    ),
+    text(
+        "multipliers that do not change with unknowns",
+        case("pendulum/hermite"),
+        r"memcpy\(at->dz, to->by_dz, sizeof\(wide\) \* N\);",
+        "memset(at->dz, 0, sizeof(wide) * N);",
+    ),
+    here(
+        "a second derivative off by 1e-6",
+        case("double/svi"),
+        lowered_derivatives,
+        "gradient",
+        changed_result(lambda found: found | {k: found[k] * sympy.Rational(1000001, 10**6) for k in list(found)[:1]}),
+    ),
+)
 BESIDE = (
     *FORCES_AND_INPUTS,
     *DAMPING,
@@ -253,5 +283,6 @@ BESIDE = (
         "jacobian",
         changed_result(lambda found: found | {k: found[k] * sympy.Rational(1000001, 10**6) for k in list(found)[:1]}),
     ),
+    *SECOND,
     *(text(f"{what}, {where}", case(where), *edit, within=within) for what, where, within, *edit in C_TEXT),
 )

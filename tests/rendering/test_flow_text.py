@@ -49,6 +49,13 @@ def test_flows_of_rows_compile_without_a_warning(tmp_path):
         compile_with("gcc", ["-Wno-missing-prototypes"], source.amalgamated(), tmp_path)
 
 
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_second_derivatives_compile_without_a_warning(compiler, tmp_path):
+    source = with_casadi_flow(compile_stepper(*CASES["kepler"]).second_derivatives, 10, 5, second=True).amalgamated()
+    check_style(source.code)
+    compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
+
+
 def test_compiles_with_the_interface_of_xla(tmp_path):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
     stepper, flags = compile_stepper(*CASES["kepler"]), ["-isystem", jax.ffi.include_dir()]

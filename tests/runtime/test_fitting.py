@@ -1,6 +1,8 @@
 """Parameters and initial states from measurements: against DOP853 and curve_fit, and errors that mean what they say."""
 
+import warnings
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from scvi_codegen import (
     compile_stepper,
     fit,
 )
+from scvi_codegen.runtime.segments import _constrained, _within
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
 NOISE = 0.01
@@ -332,9 +335,78 @@ def test_segments_with_a_known_start_and_inputs():
     assert_allclose(found.values, [1.5, 2.0], rtol=1e-7)
 
 
+BOUNDS = [{"delta": (0.25, 0.5)}, {"delta": (0.0, 1.0)}, {"alpha": (-0.95, 0.0), "x": (0.6, 0.75)}]
+
+
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_segments_with_bounds_find_what_one_with_them_finds(bounds):
+    one = fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, **GUESS)
+    parts = fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, segments=4, **GUESS)
+    assert parts.at_bounds == one.at_bounds == tuple(name for name in bounds if bounds[name] != (0.0, 1.0))
+    free = [k for k, name in enumerate(one.names) if name not in one.at_bounds]
+    errors = np.sqrt(np.diag(one.covariance))[free]
+    assert (np.abs(parts.values - one.values)[free] < 0.01 * errors).all()
+    for name, (low, high) in bounds.items():
+        assert low <= parts.values[parts.names.index(name)] <= high
+    assert np.abs(parts.jumps).max() < 1e-9
+    assert_allclose(np.sqrt(np.diag(parts.covariance))[free], errors, rtol=1e-2)
+
+
+def test_least_squares_with_equations_and_bounds():
+    """Beside the best of all choices of unknowns that a bound holds."""
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        slopes, found, rows = rng.normal(size=(9, 5)), rng.normal(size=9), 7
+        low, high = np.full(5, -np.inf), np.full(5, np.inf)
+        low[:3], high[:3] = -rng.uniform(0.01, 0.2, 3), rng.uniform(0.01, 0.2, 3)
+        update, _, held = _within(slopes, found, rows, (low, high))
+        assert np.abs(slopes[rows:] @ update + found[rows:]).max() < 1e-12
+        assert (low <= update).all()
+        assert (update <= high).all()
+        assert ((update == low) | (update == high))[held].all()
+        best = np.inf
+        for choice in product((None, low, high), repeat=3):
+            fixed = np.array([k for k, bound in enumerate(choice) if bound is not None], dtype=int)
+            other = np.zeros(5)
+            other[fixed] = [choice[k][k] for k in fixed]
+            free = np.setdiff1d(np.arange(5), fixed)
+            other[free] = _constrained(slopes[:, free], found + slopes @ other, rows)[0]
+            if (low <= other + 1e-12).all() and (other <= high + 1e-12).all():
+                best = min(best, float(np.linalg.norm(slopes[:rows] @ other + found[:rows])))
+        assert np.linalg.norm(slopes[:rows] @ update + found[:rows]) == pytest.approx(best, rel=1e-10)
+
+
+@cache
+def kepler():
+    system = LagrangianSystem.from_text(
+        name="Kepler and a spring",
+        coordinates=["x", "y", "z"],
+        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + mu/sqrt(x**2 + y**2) - k*z**2/2",
+        parameters={"mu": 1.0, "k": 1.0},
+    )
+    return compile_stepper(system, SVI(8), flags=QUICK_FLAGS)
+
+
+@pytest.mark.parametrize(
+    ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]
+)
+def test_what_is_told_does_not_depend_on_units(length, time, segments):
+    """Not even where slopes by mu, q and p are 10^30 apart; nor are data without noise a fault of the steps."""
+    units = [length**3 / time**2, 1 / time**2, *[length] * 3, *[length / time] * 3]
+    true = np.array([1.0, 1.0, 1.0, 0.0, 0.2, 0.0, 0.8, 0.1])
+    mu, k, *state = (true * units).tolist()
+    motion = kepler().integrate(state[:3], state[3:], h=0.05 * time, steps=120, parameters=[mu, k])
+    guess = {"q": state[:3], "p": state[3:], "h": 0.05 * time, "start": 0.0, "segments": segments}
+    t, q = motion.t[2::2], motion.q[2::2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AccuracyWarning)
+        found = fit(kepler(), t, q, parameters=[1.01 * mu, 0.99 * k], **guess)
+    assert_allclose(found.values / units, true, atol=1e-8)
+    with pytest.raises(FitError, match=r"do not tell (k|z|p_z)"):
+        fit(kepler(), t, q[:, :2], observed=["x", "y"], parameters=[1.01 * mu, k], **guess)
+
+
 def test_what_segments_do_not_have():
-    with pytest.raises(StateError, match="bounds are those of a fit in one segment"):
-        fit(oscillator(), TIMES, recorded()[0], segments=3, bounds={"delta": (0.0, 1.0)}, unknown=SOME, **GUESS)
     with pytest.raises(StateError, match="segments"):
         fit(oscillator(), TIMES, recorded()[0], segments=0, unknown=SOME, **GUESS)
     with pytest.raises(FitError, match=r"do not come to join: .* fewer unknowns"):

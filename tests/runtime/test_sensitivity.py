@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from sabotage import Case
 from samples import QUICK_FLAGS
 
-from scvi_codegen import SVI, LagrangianSystem, MethodError, StateError, compile_stepper, problem, reparametrise
+from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, problem
 from scvi_codegen.exact.step import DerivedStep
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.method import is_symplectic
@@ -237,10 +237,6 @@ def test_what_has_no_gradient():
         run.pullback(np.full((61, 2), np.nan))
     with pytest.raises(StateError, match="whole steps"):
         driven(steps=9, t=0.0, t_eval=[0.03, 0.1])[1].sensitivity()
-    kepler = problem("kepler")
-    clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4), flags=QUICK_FLAGS)
-    with pytest.raises(MethodError, match="no derivatives"):
-        clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).sensitivity()
 
 
 def test_a_state_that_the_steps_do_not_lead_to_is_no_base_of_derivatives():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from scvi_codegen import SVI, MethodError, StateError, compile_stepper, problem, reparametrise
+from scvi_codegen import SVI, StateError, compile_stepper, problem
 
 
 def test_runs_carry_directions():
@@ -64,6 +64,3 @@ def test_what_has_no_derivative():
     elsewhere[2] += 0.01
     with pytest.raises(StateError, match=r"t = 0\.05, taken again, does not lead where it led"):
         replace(run, q=elsewhere).tangent()
-    clocked = compile_stepper(reparametrise(kepler.system, "frequency"), SVI(4))
-    with pytest.raises(MethodError, match=r"no derivatives .* the energy of the start is a parameter"):
-        clocked.jacobian(kepler.q, [0.0, 1.0], 0.1)

@@ -1,0 +1,77 @@
+/* The Jacobian of the adjoint of a flow, as CasADi finds it: second derivatives, exact. Before it: casadi_flow.h,
+ * flow_second.h. */
+
+static const casadi_int NO_GIVEN_SHAPE[2 + 1 + 1] = {GIVEN, 1};
+static const casadi_int HESSIAN_SHAPE[] = {GIVEN, GIVEN, 1};
+static const casadi_int NO_JACOBIAN_SHAPE[2 + FLOW_STATE * FLOW_COLUMNS + 1] = {GIVEN, FLOW_STATE * FLOW_COLUMNS};
+static const casadi_int TRANSPOSED_SHAPE[] = {GIVEN, FLOW_STATE * FLOW_COLUMNS, 1};
+
+/* The slopes, and how they change with each number that is given, column by column. */
+static int external_hessian(const double *x, const double *slopes, double *found)
+{
+  enum { VALUES = FLOW_STATE * FLOW_COLUMNS };
+  flow_way way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = GIVEN};
+  double each[GIVEN * GIVEN] = {0}, *same = malloc(sizeof(double) * (size_t)VALUES * GIVEN);
+  solver_report report;
+  int status = FLOW_NO_MEMORY;
+  for (int i = 0; same && i < GIVEN; i++) {
+    each[i * GIVEN + i] = 1;
+    memcpy(same + i * VALUES, slopes, sizeof(double) * VALUES);
+  }
+  if (same)
+    status = bend_rows(&way, 1, x, same, each, found, &report);
+  free(same);
+  return status;
+}
+
+/* The transposed Jacobian, column by column: each is what the slope of one value makes of all that is given. */
+static int external_transposed(const double *x, double *found)
+{
+  enum { VALUES = FLOW_STATE * FLOW_COLUMNS };
+  double *each = calloc((size_t)VALUES * VALUES, sizeof(double));
+  int status = FLOW_NO_MEMORY;
+  for (int i = 0; each && i < VALUES; i++)
+    each[i * VALUES + i] = 1;
+  if (each)
+    status = external_flow(FLOW_PULL, VALUES, x, each, found);
+  free(each);
+  return status;
+}
+
+int EXTERNAL(jac_adj1_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
+{
+  int status = OK;
+  (void)iw, (void)w, (void)mem;
+  if (res[0] && !arg[2])
+    memset(res[0], 0, sizeof(double) * GIVEN * GIVEN);
+  if (res[0] && arg[2])
+    status = external_hessian(arg[0], arg[2], res[0]);
+  if (res[2] && status == OK)
+    status = external_transposed(arg[0], res[2]);
+  return status != OK;
+}
+
+casadi_int EXTERNAL(jac_adj1_, _n_in)(void)
+{
+  return 4;
+}
+
+casadi_int EXTERNAL(jac_adj1_, _n_out)(void)
+{
+  return 3;
+}
+
+const casadi_int *EXTERNAL(jac_adj1_, _sparsity_in)(casadi_int i)
+{
+  return i == 0 ? GIVEN_SHAPE : i == 1 ? NO_STATES_SHAPE
+      : i == 2                         ? STATES_SHAPE
+      : i == 3                         ? NO_GIVEN_SHAPE
+                                       : NULL;
+}
+
+const casadi_int *EXTERNAL(jac_adj1_, _sparsity_out)(casadi_int i)
+{
+  return i == 0 ? HESSIAN_SHAPE : i == 1 ? NO_JACOBIAN_SHAPE
+      : i == 2                           ? TRANSPOSED_SHAPE
+                                         : NULL;
+}
