@@ -45,4 +45,4 @@ def held_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[str, N
     columns = np.zeros(run.pairs + 1, dtype=np.int32)
     run.columns = binding.pointer(columns)
     binding.function("constraint_pairs")(run, problem)
-    return {"places": places, "columns": columns, "held": aligned(10 * count + 2 * (entries + run.pairs))}
+    return {"places": places, "columns": columns, "held": aligned(11 * count + 2 * (entries + run.pairs))}

@@ -36,6 +36,7 @@ ADVICE = {
     "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
     "or solver='newton' where the fast motions are stiff bonds at rest",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
+    "singular": "constraints contradict each other there, or say the same",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
 }
 NEWTON_ADVICE = {**ADVICE, "not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"}

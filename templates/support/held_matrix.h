@@ -1,19 +1,21 @@
 /* The matrix G M^-1 G^T of constraints, and systems with it by conjugate gradients, preconditioned by its incomplete
- * factors L D L^T without fill. Of a chain or a tree whose rods are given from an end on these are the whole ones. What
- * constraints say twice does not matter. Before it: held_pattern.h.
+ * factors L D L^T without fill. Of a chain or a tree whose rods are given from an end on these are the whole ones. Where
+ * constraints say a thing twice the matrix is singular, which is refused. Before it: held_pattern.h.
  *
  * J. A. Meijerink, H. A. van der Vorst, Math. Comp. 31 (1977). */
 
 #define LEAST_PIVOT 1e-3 /* beside the diagonal: less is what incomplete factors have lost */
+#define DEPENDENT 1e-13 /* of the matrix beside L D L^T: what is as good as 0 in a direction */
+#define GRAINS 4096.0 /* of rounding: what may be left where positions rest */
 #define SPARE_PRODUCTS 100 /* beyond as many as there are constraints, for rounding */
 
 /* The parts of held: a number a constraint each (g, g_t, multipliers, and of a system its right-hand side, which becomes
- * the residual, its solution, three directions, the diagonals of the matrix and of D inverted), a number an entry
+ * the residual, its solution, three directions, its rounding, the diagonals of the matrix and of D inverted), a number an entry
  * (slopes at the state and at another), and one a pair (the matrix, L). */
 typedef struct {
   pattern of;
   long long count, entries;
-  double *g, *rate, *lambda, *right, *change, *near, *way, *image, *diagonal, *pivot;
+  double *g, *rate, *lambda, *right, *change, *near, *way, *image, *grain, *diagonal, *pivot;
   double *slope, *next;
   double *entry, *factor;
 } held;
@@ -22,7 +24,7 @@ static held held_of(const run_memory *run, long long n)
 {
   held found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
   double **const vectors[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.near, &found.way,
-      &found.image, &found.diagonal, &found.pivot};
+      &found.image, &found.grain, &found.diagonal, &found.pivot};
   double *numbers = run->held;
   for (size_t k = 0; k < sizeof vectors / sizeof *vectors; k++, numbers += found.count)
     *vectors[k] = numbers;
@@ -135,37 +137,64 @@ static double product_of(const double *x, const double *y, long long n)
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-/* change = (G M^-1 G^T)^-1 right, but for that part of right; OK, or why not. */
+/* What rounding may make of so many times G x, a constraint each. */
+static void find_grain(const held *held, const double *slope, const double *x, double scale)
+{
+  for (long long k = 0; k < held->count; k++) {
+    double terms = 0.0;
+    for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
+      terms += fabs(slope[e] * x[held->of.place[e]]);
+    held->grain[k] = DBL_EPSILON * fabs(scale) * terms;
+  }
+}
+
+/* Whether some of what is left on the right is more than its grain. */
+static int is_beyond_grain(const held *held)
+{
+  int found = 0;
+  for (long long k = 0; k < held->count; k++)
+    found |= !(fabs(held->right[k]) <= held->grain[k]);
+  return found;
+}
+
+/* right -= step image and change += step way; returned is the size of what is left, squared. */
+static double move_on(const held *held, double step)
+{
+  for (long long k = 0; k < held->count; k++) {
+    held->change[k] += step * held->way[k];
+    held->right[k] -= step * held->image[k];
+  }
+  return product_of(held->right, held->right, held->count);
+}
+
+/* change = (G M^-1 G^T)^-1 right, but for that part of right, or its grain; OK, or why there is more left. */
 static int solve_held(const held *held, double tolerance, solver_report *report)
 {
   const long long n = held->count;
-  double size = product_of(held->right, held->right, n), slope;
+  double size = product_of(held->right, held->right, n), slope, length; /* of the way, by L D L^T, squared */
   const double least = tolerance * tolerance * size;
   memset(held->change, 0, sizeof(double) * (size_t)n);
   if (!(size < INFINITY))
     return NOT_FINITE;
   precondition(held, held->right, held->near);
   memcpy(held->way, held->near, sizeof(double) * (size_t)n);
-  slope = product_of(held->right, held->near, n);
-  for (long long k = 0; size > least; k++) {
-    double curve, step, last = slope;
+  length = slope = product_of(held->right, held->near, n);
+  for (long long k = 0; size > least && is_beyond_grain(held); k++) {
+    double curve, again, last = slope;
     if (k >= n + SPARE_PRODUCTS)
       return NOT_CONVERGED;
     multiply(held, held->way, held->image);
     report->products++;
     curve = product_of(held->way, held->image, n);
-    if (!(curve > 0.0))
+    if (!(curve > DEPENDENT * length))
       return SINGULAR;
-    step = slope / curve;
-    for (long long i = 0; i < n; i++) {
-      held->change[i] += step * held->way[i];
-      held->right[i] -= step * held->image[i];
-    }
-    size = product_of(held->right, held->right, n);
+    size = move_on(held, slope / curve);
     precondition(held, held->right, held->near);
     slope = product_of(held->right, held->near, n);
+    again = slope / last;
+    length = slope + again * again * length; /* what is left is at right angles to the way */
     for (long long i = 0; i < n; i++)
-      held->way[i] = held->near[i] + slope / last * held->way[i];
+      held->way[i] = held->near[i] + again * held->way[i];
   }
   return OK;
 }

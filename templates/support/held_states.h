@@ -2,6 +2,7 @@
  * indexed_run.h. */
 
 #define REFINEMENTS 3
+#define REFINED 1e-6 /* what each is to leave of what was left */
 
 /* Positions on to g = 0, the nearest in the metric of the masses: q0 + M^-1 G^T lambda with the slopes there. */
 static int project_positions(const held_run *of)
@@ -18,16 +19,15 @@ static int project_positions(const held_run *of)
     find_conditions(of->given, parts->Y, run->t, held->g, held->rate, held->slope);
     if (!assemble(held, run->inverse_mass))
       return SINGULAR;
-    if (now.status)
-      return now.status < 0 ? failure_of(&now) : OK;
     find_reactions(held, held->lambda, parts->R, of->n);
-    for (long long k = 0; k < held->count; k++) {
-      held->right[k] = -held->g[k];
-      for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++) {
-        const int i = held->of.place[e];
-        held->right[k] += held->slope[e] * ((parts->Y[i] - run->q[i]) - run->inverse_mass[i] * parts->R[i]);
-      }
-    }
+    for (long long i = 0; i < of->n; i++)
+      parts->D[i] = (run->q[i] - parts->Y[i]) + run->inverse_mass[i] * parts->R[i];
+    for (long long i = 0; i < of->n; i++)
+      parts->X[i] = fabs(run->q[i]) + fabs(parts->Y[i]);
+    find_right(held, held->g, parts->D, 1.0);
+    find_grain(held, held->slope, parts->X, 1.0);
+    if (now.status)
+      return end_of(&now, held);
     status = solve_held(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
@@ -57,8 +57,8 @@ int NAME(project)(run_memory *run, const problem *given, const solver_options *o
     return status;
   memset(of.parts.dp, 0, sizeof(double) * (size_t)of.n);
   for (long long i = 0; i < of.n; i++) {
-    const double v = run->inverse_mass[i] * run->p[i];
-    size += v * v;
+    of.parts.X[i] = fabs(run->inverse_mass[i] * run->p[i]);
+    size += of.parts.X[i] * of.parts.X[i];
   }
   status = turn(&of, 1.0, 1.0, size);
   if (status != OK)
@@ -85,23 +85,24 @@ int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
   solver_report report = {0};
   const held_run of = held_run_of(run, given, NULL, &report);
   const held *held = &of.held;
-  double *F = of.parts.D, *v = of.parts.Y;
+  double *F = of.parts.D, *pulled = of.parts.Y;
   int status = run->guess ? OK : begin(&of);
-  find_forces(&of, run->q, run->t, F);
+  if (status != OK)
+    return status;
   for (long long i = 0; i < of.n; i++)
-    v[i] = run->inverse_mass[i] * run->p[i];
-  find_bends(given, run->q, v, run->t, held->g);
+    pulled[i] = run->inverse_mass[i] * run->p[i];
+  find_bends(given, run->q, pulled, run->t, held->g);
+  find_forces(&of, run->q, run->t, F);
   memset(lambda, 0, sizeof(double) * (size_t)held->count);
   for (int round = 0; status == OK && round < REFINEMENTS; round++) {
     find_reactions(held, lambda, of.parts.R, of.n);
-    for (long long k = 0; k < held->count; k++) {
-      held->right[k] = -held->g[k];
-      for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++) {
-        const int i = held->of.place[e];
-        held->right[k] -= held->slope[e] * (run->inverse_mass[i] * (F[i] + of.parts.R[i]));
-      }
-    }
-    status = solve_held(held, NEAR_ENOUGH * NEAR_ENOUGH, &report);
+    for (long long i = 0; i < of.n; i++)
+      pulled[i] = run->inverse_mass[i] * (F[i] + of.parts.R[i]);
+    find_right(held, held->g, pulled, 1.0);
+    for (long long i = 0; i < of.n; i++)
+      pulled[i] = run->inverse_mass[i] * (fabs(F[i]) + fabs(of.parts.R[i]));
+    find_grain(held, held->slope, pulled, 1.0);
+    status = solve_held(held, REFINED, &report);
     add_to(lambda, held->change, 1.0, held->count);
   }
   return status;

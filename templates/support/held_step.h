@@ -3,8 +3,8 @@
 
 #define NEAR_ENOUGH 1e-3 /* of a system: corrections are to make what is left less than that */
 
-/* The parts of work: where forces are taken; forces; increments of positions and momenta; reactions; increments to be
- * tried, and where they lead. */
+/* The parts of work: sizes of what is rounded; forces; increments of positions and
+ * momenta; reactions; increments to be tried, and where they lead. */
 typedef struct {
   double *X, *F, *dq, *dp, *R, *D, *Y;
 } parts_of_work;
@@ -58,24 +58,24 @@ static void find_forces(const held_run *of, const double *X, double t, double *F
 /* Forces, slopes and their matrix at the state. */
 static int begin(const held_run *of)
 {
-  memcpy(of->parts.X, of->run->q, sizeof(double) * (size_t)of->n);
-  find_forces(of, of->parts.X, of->run->t, of->parts.F);
-  find_conditions(of->given, of->parts.X, of->run->t, of->held.g, of->held.rate, of->held.slope);
+  find_forces(of, of->run->q, of->run->t, of->parts.F);
+  find_conditions(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.slope);
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
 
-/* The increments that reactions lead to, and the positions; returned is the size of the coordinates, squared. */
+/* The increments that reactions lead to, the positions, and sizes of what these are sums of; returned is the size of the coordinates, squared. */
 static double lead(const held_run *of, double h)
 {
   const run_memory *run = of->run;
   const parts_of_work *parts = &of->parts;
   double size = 0.0;
   for (long long i = 0; i < of->n; i++) {
-    const double p = (run->p[i] + parts->dp[i]) + h / 2 * parts->R[i], drift = h * (run->inverse_mass[i] * p);
-    const double of_one = fabs(run->q[i]) + fabs(drift);
+    const double p = run->p[i] + parts->dp[i], pushed = h / 2 * parts->R[i];
+    const double drift = h * (run->inverse_mass[i] * (p + pushed));
     parts->D[i] = parts->dq[i] + drift;
     parts->Y[i] = run->q[i] + parts->D[i];
-    size += of_one * of_one;
+    parts->X[i] = fabs(run->q[i]) + fabs(h * run->inverse_mass[i]) * (fabs(p) + fabs(pushed));
+    size += parts->X[i] * parts->X[i];
   }
   return size;
 }
@@ -92,6 +92,17 @@ static double push(double *x, const double *y, double by, const double *inverse_
   return size;
 }
 
+/* What is said of corrections that came to an end; constraints that are not met where positions rest contradict each
+ * other. */
+static int end_of(const iteration *now, const held *held)
+{
+  const double left = product_of(held->right, held->right, held->count);
+  const double grain = product_of(held->grain, held->grain, held->count);
+  if (now->status < 0)
+    return failure_of(now);
+  return left <= GRAINS * GRAINS * grain ? OK : SINGULAR;
+}
+
 /* Reactions at the beginning that lead to g = 0 at the end, and the slopes there; increments are to be tried. */
 static int meet(const held_run *of, double h, double t, double *size)
 {
@@ -104,10 +115,11 @@ static int meet(const held_run *of, double h, double t, double *size)
     double moved;
     *size = lead(of, h);
     find_conditions(of->given, parts->Y, t, held->g, held->rate, held->next);
-    if (now.status)
-      return now.status < 0 ? failure_of(&now) : OK;
     for (long long k = 0; k < held->count; k++)
       held->right[k] = -2.0 / (h * h) * held->g[k];
+    find_grain(held, held->next, parts->X, 2.0 / (h * h));
+    if (now.status)
+      return end_of(&now, held);
     status = solve_held(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
@@ -118,23 +130,33 @@ static int meet(const held_run *of, double h, double t, double *size)
   }
 }
 
-/* Momenta on to G M^-1 p + g_t = 0, by reactions that push by so much; velocities are judged in units of the size. */
+/* right = - so many times (rate + G x). */
+static void find_right(const held *held, const double *rate, const double *x, double scale)
+{
+  for (long long k = 0; k < held->count; k++) {
+    double sum = rate[k];
+    for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
+      sum += held->slope[e] * x[held->of.place[e]];
+    held->right[k] = -scale * sum;
+  }
+}
+
+/* Momenta on to G M^-1 p + g_t = 0, by reactions that push by so much; velocities are judged in units of the size. X
+ * has sizes of what these are sums of. */
 static int turn(const held_run *of, double by, double unit, double size)
 {
   const held *held = &of->held;
   const run_memory *run = of->run;
   iteration now = at_its_start();
-  while (now.status == 0) {
+  for (;;) {
     int status;
     double moved;
-    for (long long k = 0; k < held->count; k++) {
-      double rate = held->rate[k];
-      for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++) {
-        const int i = held->of.place[e];
-        rate += held->slope[e] * (run->inverse_mass[i] * (run->p[i] + of->parts.dp[i]));
-      }
-      held->right[k] = -1.0 / by * rate;
-    }
+    for (long long i = 0; i < of->n; i++)
+      of->parts.D[i] = run->inverse_mass[i] * (run->p[i] + of->parts.dp[i]);
+    find_right(held, held->rate, of->parts.D, 1.0 / by);
+    find_grain(held, held->slope, of->parts.X, 1.0 / by);
+    if (now.status)
+      return now.status < 0 ? failure_of(&now) : OK;
     status = solve_held(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
@@ -142,7 +164,6 @@ static int turn(const held_run *of, double by, double unit, double size)
     moved = unit * by * (unit * by) * push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
     judge(&now, beside_state(moved, size, of->options), of->options, of->report);
   }
-  return now.status < 0 ? failure_of(&now) : OK;
 }
 
 /* A part of a step, of h to t. */
@@ -150,7 +171,7 @@ static int hold(const held_run *of, double h, double t)
 {
   const parts_of_work *parts = &of->parts;
   const held *held = &of->held;
-  const size_t bytes = sizeof(double) * (size_t)of->n;
+  const run_memory *run = of->run;
   double size;
   int status;
   add_to(parts->dp, parts->F, h / 2, of->n);
@@ -158,15 +179,17 @@ static int hold(const held_run *of, double h, double t)
   if (status != OK)
     return status;
   add_to(parts->dp, parts->R, h / 2, of->n);
-  memcpy(parts->dq, parts->D, bytes);
-  memcpy(parts->X, parts->Y, bytes);
+  memcpy(parts->dq, parts->D, sizeof(double) * (size_t)of->n);
   memcpy(held->slope, held->next, sizeof(double) * (size_t)held->entries);
-  if (!assemble(held, of->run->inverse_mass))
+  if (!assemble(held, run->inverse_mass))
     return SINGULAR;
-  find_forces(of, parts->X, t, parts->F);
+  find_forces(of, parts->Y, t, parts->F);
   find_reactions(held, held->lambda, parts->R, of->n);
-  add_to(parts->dp, parts->F, h / 2, of->n);
-  add_to(parts->dp, parts->R, h / 2, of->n);
+  for (long long i = 0; i < of->n; i++) {
+    parts->dp[i] += h / 2 * (parts->F[i] + parts->R[i]);
+    parts->X[i] = run->inverse_mass[i] *
+        (fabs(run->p[i] + parts->dp[i]) + fabs(h / 2) * (fabs(parts->F[i]) + fabs(parts->R[i])));
+  }
   return turn(of, h / 2, h, size);
 }
 
