@@ -6,16 +6,15 @@ system of one coordinate serve all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
-from sympy import Add, Expr, S, Symbol
+from sympy import Add, S, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.indexed_forces import IndexedForce
-from scvi_codegen.indices import Access
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.indexed_constraints import held_steps

@@ -57,8 +57,8 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
     if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
         return (mp.one,)
     raise MethodError(
-        f"{method.name} does not keep the constraints of sums over indices: take 'stoermer-verlet', which is RATTLE, as "
-        "is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
+        f"{method.name} does not keep the constraints of sums over indices: take 'stoermer-verlet', which is "
+        "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
     )
 
 

@@ -21,7 +21,8 @@ from scvi_codegen.rendering.target import DOUBLE
 __all__ = ["render_indexed", "render_indexed_example"]
 
 EXPLICIT_VECTORS, HELD_VECTORS, SWEEP_VECTORS = 4, 7, 4
-"""Of work: positions, forces, increments; of steps that constraints hold reactions and trial positions, too; positions at the points, forces in this step and two before."""
+"""Of work: positions, forces, increments; where constraints hold steps reactions and what is tried, too; positions at
+the points, forces in this step and two before."""
 NEWTON_VECTORS = 4 + 17
 """Beside these residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
 
@@ -75,7 +76,7 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
     Args:
         prefix: of the C names.
         start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
-            moving ("p", "velocity" or nothing), run (t, h, steps, every).
+            moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, every).
     """
     environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, **start}
     templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}

@@ -28,7 +28,7 @@ def constraint_values(run: IndexedRun) -> tuple[tuple[Numbers, ...], tuple[Numbe
 
 
 def multipliers(run: IndexedRun) -> tuple[Numbers, ...]:
-    """lambda of the forces G^T lambda that keep the state on each constraint, an array over its loops."""
+    """Multipliers lambda of the forces G^T lambda that keep the state on each constraint, an array over its loops."""
     found = np.zeros(_count(run))
     if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
         raise StateError(f"the constraints of {run.interface.system} leave no forces here ({STATUS[status]})")
@@ -49,8 +49,8 @@ def consistent(run: IndexedRun) -> None:
         return
     largest = [max(float(np.abs(each).max(initial=0.0)) for each in values) for values in (g, rate)]
     said = (
-        f"the initial state is {max(moved):.1e} (relative) off the constraints: they are up to {largest[0]:.3g}, their rates "
-        f"up to {largest[1]:.3g}, not 0"
+        f"the initial state is {max(moved):.1e} (relative) off the constraints: they are up to {largest[0]:.3g}, "
+        f"their rates up to {largest[1]:.3g}, not 0"
     )
     if max(moved) > NEAR:
         raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
@@ -66,7 +66,8 @@ def project(run: IndexedRun) -> tuple[Numbers, tuple[float, float]]:
     before, report = run.state.copy(), run.problem.binding.new("report *")
     status = run.call("project", run.problem.struct, run.problem.binding.options(run.options), report)
     if status:
-        hint = "; do constraints say the same there, or contradict each other?" if "singular" in STATUS[status] else ""
+        same = "do constraints say the same there, or contradict each other?"
+        hint = f"; {same if 'singular' in STATUS[status] else 'give positions that are nearer to them'}"
         raise StateError(f"the constraints of {run.interface.system} cannot be met near there ({STATUS[status]}{hint})")
     half = len(before) // 2
     return before, (_relative(before[:half], run.state[:half]), _relative(before[half:], run.state[half:]))
@@ -78,8 +79,8 @@ def check_reachable(run: IndexedRun) -> None:
     if moved > TYPED:
         run.state[:] = before
         raise StateError(
-            f"at t = {run.t:g} the constraints jump by {moved:.1e} (relative), which positions cannot follow: parameters "
-            "of constraints change without jumps"
+            f"at t = {run.t:g} the constraints jump by {moved:.1e} (relative), which positions cannot follow: "
+            "parameters of constraints change without jumps"
         )
     run.state[: len(before) // 2] = before[: len(before) // 2]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,10 +13,19 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.indexed_interface import Numbers
 
-__all__ = ["aligned", "held_memory"]
+__all__ = ["IndexedMark", "aligned", "held_memory"]
 
 ALIGNMENT = 64
 """Bytes: those of the widest vector."""
+
+
+@dataclass(frozen=True, slots=True)
+class IndexedMark:
+    """A state of a run: its arrays, its numbers, sweeps up to it."""
+
+    arrays: Mapping[str, Numbers]
+    moments: Mapping[str, Any]
+    iterations: int
 
 
 def aligned(count: int) -> Numbers:
@@ -38,7 +49,7 @@ def held_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[str, N
     binding.function("constraint_sizes")(problem, run)
     count, entries = run.constraints, run.entries
     if not 0 <= count <= entries < 2**31:
-        raise StateError(f"{count} constraints on {entries} coordinates: there are too many, or a loop ends before it begins")
+        raise StateError(f"{count} constraints on {entries} coordinates: too many, or a loop ends early")
     places = np.zeros(3 * (count + entries) + n + 3, dtype=np.int32)
     run.places = binding.pointer(places)
     run.pairs = binding.function("constraint_pairs")(run, problem)

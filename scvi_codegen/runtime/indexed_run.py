@@ -6,7 +6,6 @@ import io
 import time
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -26,11 +25,11 @@ from scvi_codegen.runtime.indexed_interface import (
     read_state,
 )
 from scvi_codegen.runtime.indexed_maps import momentum_of
-from scvi_codegen.runtime.indexed_memory import aligned, held_memory
+from scvi_codegen.runtime.indexed_memory import IndexedMark, aligned, held_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.portions import SLICE_SECONDS
 
-__all__ = ["IndexedMark", "IndexedRun"]
+__all__ = ["IndexedRun"]
 
 ADVICE = {
     "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
@@ -46,15 +45,6 @@ MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOI
 """Of a run, beside its arrays."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of numbers that change from step to step, but for what guesses are made of."""
-
-
-@dataclass(frozen=True, slots=True)
-class IndexedMark:
-    """A state of a run: its arrays, its numbers, sweeps up to it."""
-
-    arrays: Mapping[str, Numbers]
-    moments: Mapping[str, Any]
-    iterations: int
 
 
 class IndexedRun:

@@ -140,9 +140,7 @@ class IndexedStepper:
         project(run)
         return run.q, run.p
 
-    def _given(
-        self, q: Any, p: Any, velocity: Any, parameters: Any, tables: Any
-    ) -> tuple[RunArrays, tuple[Any, str]]:
+    def _given(self, q: Any, p: Any, velocity: Any, parameters: Any, tables: Any) -> tuple[RunArrays, tuple[Any, str]]:
         """Arrays of a run, and what it begins with beside positions."""
         if velocity is not None and self.interface.momenta:
             raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")

@@ -2,7 +2,7 @@
 
     m q'' = F + G^T lambda,        g(q, t) = 0,        G = g_q,        hidden in it G v + g_t = 0
 
-with a multiplier lambda for every element. Rods between the places of a net, as ``bonds[b, 0]`` and ``bonds[b, 1]``, are
+with a multiplier lambda for every element. Rods between the places ``bonds[b, 0]`` and ``bonds[b, 1]`` of a net are
 ``sum(k in 3, (r[bonds[b, 0], k] - r[bonds[b, 1], k])**2) = l[b]**2 for b in B``. Each is of few entries, so that
 G M^-1 G^T is a sparse matrix, whose pattern is that of the net: known when a run begins.
 """

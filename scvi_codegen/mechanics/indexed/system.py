@@ -133,8 +133,8 @@ class IndexedSystem:
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
             inputs: names of functions of time that are given as data with each run
                 (:mod:`scvi_codegen.formulas.inputs`).
-            constraints: formulas in coordinates and time that stay 0, or equations, with the loops behind that they hold
-                for, as ``"(r[i+1] - r[i])**2 = l[i]**2 for i in 0..N-2"`` (:mod:`scvi_codegen.formulas.indexed_constraints`).
+            constraints: formulas in coordinates and time that stay 0, or equations, and behind them the loops for which
+                they do, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
 
         Raises:
             SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
