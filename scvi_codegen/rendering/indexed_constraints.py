@@ -73,5 +73,5 @@ def _places(program: IndexedProgram, looped: LoopedKernel) -> str:
 
 
 def _function(nest: Nest, name: str, arguments: Sequence[str], lines: Sequence[str], values: int) -> str:
-    text = nest.text(prepare=lambda k: [], innermost=lines, finish=lambda k: [])
+    text = ["(void)given;", *nest.text(prepare=lambda k: [], innermost=lines, finish=lambda k: [])]
     return nest.function(f"static void {name}", arguments, text, values=f"double value[{values}]" if values else "")
