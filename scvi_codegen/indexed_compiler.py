@@ -85,7 +85,10 @@ class _IndexedTexts:
     @property
     def interface(self) -> IndexedInterface:
         """What a caller must know."""
-        return replace(_interface(self.system, self.method, self.prefix), solver=self.solver)
+        return replace(
+            _interface(self.system, self.method, self.prefix),
+            solver="rattle" if self.system.constraints else self.solver,
+        )
 
     @cached_property
     def program(self) -> IndexedProgram:

@@ -18,12 +18,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
-from scvi_codegen.runtime.indexed_interface import (
-    IndexedInterface,
-    Numbers,
-    read_arrays,
-    read_state,
-)
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_arrays, read_state
 from scvi_codegen.runtime.indexed_maps import momentum_of
 from scvi_codegen.runtime.indexed_memory import IndexedMark, aligned, held_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
@@ -38,7 +33,11 @@ ADVICE = {
     "singular": "constraints contradict each other there, or say the same",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
 }
-NEWTON_ADVICE = {**ADVICE, "not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"}
+ADVICE_BY_SOLVER = {
+    "fixed-point": ADVICE,
+    "newton": ADVICE | {"not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"},
+    "rattle": ADVICE | {"not converged": "constraints turn too far in a step to be met at its end: try a smaller h"},
+}
 CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
 """Of steps that choose their length."""
 MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOICE)
@@ -378,8 +377,7 @@ class IndexedRun:
             done += report.steps
             self.iterations += report.iterations
             if status:
-                h = 0.0 if self.goal else self.h
-                advice = NEWTON_ADVICE if self.interface.solver == "newton" else ADVICE
+                h, advice = 0.0 if self.goal else self.h, ADVICE_BY_SOLVER[self.interface.solver]
                 raise step_failure(status, report, step=self.steps, h=h, advice=advice)
             if progress is not None:
                 progress(self.steps)

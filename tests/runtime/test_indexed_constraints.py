@@ -1,10 +1,13 @@
 """Constraints of sums over indices: rods and pins over tables, beside the system written out, and SciPy."""
 
+import subprocess
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 import scvi_codegen as sc
+from scvi_codegen.derivation.indexed import derive_sums
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, StepFailedError, SystemDefinitionError
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
@@ -203,6 +206,40 @@ def test_constraints_move_in_time():
     exact = sc.compile_stepper(angle, "svi:8").integrate([0.0], velocity=[0.0], h=0.05, steps=40)
     place = [np.sin(6.0) / 10 + np.sin(exact.q[-1, 0]), -np.cos(exact.q[-1, 0])]
     assert np.abs(run.q["r"][-1, 0] - place).max() < 1e-9
+
+
+MODEL = """
+[system]
+name = "chain"
+coordinates = ["r[N, 2]"]
+lagrangian = "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - g*r[i, 1])"
+constraints = ["r[0, 0] = 0", "r[0, 1] = 0", "sum(a in 2, (r[i+1, a] - r[i, a])**2) = 1/100 for i in 0..N-2"]
+[sizes]
+N = 6
+[parameters]
+g = 9.81
+[initial]
+q = "i*(1-j)/10"
+[method]
+method = "stoermer-verlet"
+[run]
+step = 0.01
+steps = 20
+"""
+
+
+def test_model_files_and_the_programs_made_of_them_have_constraints(tmp_path):
+    (tmp_path / "chain.toml").write_text(MODEL)
+    model = sc.load_indexed_model(tmp_path / "chain.toml")
+    run = model.integrate()
+    folder = sc.generate_package(model, tmp_path / "chain_c")
+    made = subprocess.run(["make", "run"], cwd=folder, capture_output=True, text=True, check=True)
+    assert "warning" not in made.stderr
+    end = np.loadtxt(folder / "end.txt")
+    assert np.abs(end[:12] - run.q["r"][-1].ravel()).max() < 1e-12
+    assert "lambda*(2*r[i+1, 0] - 2*r[i, 0])" in derive_sums(model.system, model.method)
+    with pytest.raises(MethodError, match="expand_sums"):
+        sc.verify_indexed(model.system, model.method, model.q, h=0.01)
 
 
 @pytest.mark.parametrize(
