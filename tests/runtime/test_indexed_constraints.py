@@ -9,6 +9,7 @@ from scipy.optimize import minimize
 import scvi_codegen as sc
 from scvi_codegen.derivation.indexed import derive_sums
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, StepFailedError, SystemDefinitionError
+from scvi_codegen.models.indexed_package import generate_sums
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
 ROUNDING = 2.0**-52
@@ -232,7 +233,7 @@ def test_model_files_and_the_programs_made_of_them_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
     model = sc.load_indexed_model(tmp_path / "chain.toml")
     run = model.integrate()
-    folder = sc.generate_package(model, tmp_path / "chain_c")
+    folder = generate_sums(model, tmp_path / "chain_c")
     made = subprocess.run(["make", "run"], cwd=folder, capture_output=True, text=True, check=True)
     assert "warning" not in made.stderr
     end = np.loadtxt(folder / "end.txt")
