@@ -1,6 +1,6 @@
 /* The matrix G M^-1 G^T of constraints, and systems with it by conjugate gradients, preconditioned by its incomplete
- * factors L D L^T without fill. Of a chain or a tree whose rods are given from an end on these are the whole ones. Where
- * constraints say a thing twice the matrix is singular, which is refused. Before it: held_pattern.h.
+ * factors L D L^T without fill. Of a chain or a tree whose rods are given from an end on these are the whole ones.
+ * Where constraints say a thing twice the matrix is singular, which is refused. Before it: held_pattern.h.
  *
  * J. A. Meijerink, H. A. van der Vorst, Math. Comp. 31 (1977). */
 
@@ -9,9 +9,9 @@
 #define GRAINS 4096.0 /* of rounding: what may be left where positions rest */
 #define SPARE_PRODUCTS 100 /* beyond as many as there are constraints, for rounding */
 
-/* The parts of held: a number a constraint each (g, g_t, multipliers, and of a system its right-hand side, which becomes
- * the residual, its solution, three directions, its rounding, the diagonals of the matrix and of D inverted), a number an entry
- * (slopes at the state and at another), and one a pair (the matrix, L). */
+/* The parts of held: a number a constraint each (g, g_t, multipliers, and of a system its right-hand side, which
+ * becomes the residual, its solution, three directions, its rounding, the diagonals of the matrix and of D
+ * inverted), a number an entry (slopes at the state and at another), and one a pair (the matrix, L). */
 typedef struct {
   pattern of;
   long long count, entries;
@@ -23,11 +23,11 @@ typedef struct {
 static held held_of(const run_memory *run, long long n)
 {
   held found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
-  double **const vectors[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.near, &found.way,
+  double **const each[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.near, &found.way,
       &found.image, &found.grain, &found.diagonal, &found.pivot};
   double *numbers = run->held;
-  for (size_t k = 0; k < sizeof vectors / sizeof *vectors; k++, numbers += found.count)
-    *vectors[k] = numbers;
+  for (size_t k = 0; k < sizeof each / sizeof *each; k++, numbers += found.count)
+    *each[k] = numbers;
   found.slope = numbers;
   found.next = found.slope + found.entries;
   found.entry = found.next + found.entries;

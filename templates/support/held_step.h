@@ -63,7 +63,8 @@ static int begin(const held_run *of)
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
 
-/* The increments that reactions lead to, the positions, and sizes of what these are sums of; returned is the size of the coordinates, squared. */
+/* The increments that reactions lead to, the positions, and sizes of what these are sums of; returned is the size of
+ * the coordinates, squared. */
 static double lead(const held_run *of, double h)
 {
   const run_memory *run = of->run;
