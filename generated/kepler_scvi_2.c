@@ -390,6 +390,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 }
 
 #include "support/contraction.h"
+#include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
 #include "support/diagonal_mass.h"
 #include "support/unknown_velocity.h"

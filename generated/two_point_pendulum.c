@@ -184,6 +184,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 }
 
 #include "support/contraction.h"
+#include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
 #include "support/separable_sweep.h"
 #include "support/newton_fallback.h"

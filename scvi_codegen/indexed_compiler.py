@@ -85,7 +85,10 @@ class _IndexedTexts:
     @property
     def interface(self) -> IndexedInterface:
         """What a caller must know."""
-        return replace(_interface(self.system, self.method, self.prefix), solver=self.solver)
+        return replace(
+            _interface(self.system, self.method, self.prefix),
+            solver="rattle" if self.system.constraints else self.solver,
+        )
 
     @cached_property
     def program(self) -> IndexedProgram:
@@ -131,4 +134,5 @@ def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInt
         accesses=system.accesses,
         depends_on_time=system.depends_on_time,
         inputs=system.inputs,
+        constraints=tuple(term.loops for term in system.constraints),
     )

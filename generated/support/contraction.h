@@ -40,16 +40,6 @@ static inline int sweep_status(double change, double last, const solver_options 
   return change < INFINITY ? (small | stopped ? 1 : -slow) : -1;
 }
 
-/* 1 / (size + a little of the largest), so that a coordinate that rests at 0 has a size too; or what makes changes of x
- * changes of q. An infinite size gives NaN. */
-static inline void invert_sizes(const solver_options *options, double absolute, number *size)
-{
-  const number largest = largest_number(size);
-  for (int i = 0; i < M; i++)
-    size[i] =
-        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
-}
-
 /* From how many steps the next guess is best continued: a polynomial of high degree through two is the better one while
  * guesses are good, and the worse one when the steps are long. */
 static inline long long steps_to_continue(long long steps, double first_change)

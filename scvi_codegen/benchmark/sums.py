@@ -1,4 +1,4 @@
-"""Sums over indices: time at equal error beside hand-written C, SciPy and REBOUND; how time grows with their number."""
+"""Sums over indices: time at equal error beside C by hand, SciPy, REBOUND, OpenMM; how time grows with their number."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 
 from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.benchmark.contenders.contenders import OURS
+from scvi_codegen.benchmark.contenders.molecules import PLATFORMS, openmm_run
 from scvi_codegen.benchmark.curves import Point, time_at
 from scvi_codegen.benchmark.machine_limits import machine_limits
 from scvi_codegen.benchmark.plan import Plan, Say
@@ -42,6 +43,8 @@ GROWTH = (10**3, 10**4, 10**5, 10**6)
 SIDE = 512
 """Of the field."""
 SEED = 20261121
+SPACING = 0.98 * 2 ** (2 / 3)
+"""Of an argon crystal, in diameters of its atoms: neighbours stand a little closer than two atoms at rest would."""
 PATIENCE = 0.3
 """Seconds beyond which a setting is timed twice only."""
 
@@ -150,11 +153,41 @@ def bodies(count: int, span: float) -> Lattice:
     )
 
 
+def atoms(cells: int, span: float) -> Lattice:
+    """A crystal of argon (face-centred cubic, free surfaces), slightly compressed, whose atoms move at random."""
+    corner = np.array([[0.0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
+    q = SPACING * np.concatenate([corner + np.array(cell) for cell in np.ndindex(cells, cells, cells)])
+
+    def accelerations(r: Array) -> Array:
+        d = r[np.newaxis] - r[:, np.newaxis]
+        square = np.sum(d**2, axis=-1)
+        np.fill_diagonal(square, np.inf)
+        found: Array = -np.einsum("ij,ijk->ik", 24.0 * (2.0 * square**-7 - square**-4), d)
+        return found
+
+    return Lattice(
+        name="atoms",
+        system=IndexedSystem.from_text(
+            name="atoms",
+            coordinates=["r[N, 3]"],
+            lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(i < j in N, "
+            "4/sum(a in 3, (r[i, a] - r[j, a])**2)**6 - 4/sum(a in 3, (r[i, a] - r[j, a])**2)**3)",
+        ),
+        q=q,
+        v=0.5 * np.random.default_rng(SEED).normal(size=q.shape),
+        span=span,
+        longest=0.05,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={},
+    )
+
+
 def lattices(plan: Plan) -> tuple[Lattice, ...]:
     """All problems, or small ones."""
     if plan.quick:
-        return (ring(64, 2.0), field(16, 0.5), bodies(8, 1.0))
-    return (ring(1000, 20.0), ring(100_000, 2.0), field(256, 2.0), bodies(256, 2.0))
+        return (ring(64, 2.0), field(16, 0.5), bodies(8, 1.0), atoms(1, 0.5))
+    return (ring(1000, 20.0), ring(100_000, 2.0), field(256, 2.0), bodies(256, 2.0), atoms(4, 1.0))
 
 
 @unwarned()
@@ -166,7 +199,7 @@ def run_sums(plan: Plan, say: Say) -> ResultTable:
         reference, doubt = _reference(each, plan)
         curves = _curves(_contenders(each, plan), reference, plan)
         rows += [_row(each, error, curves, doubt) for error in ERRORS]
-    names = (OWN, "leapfrog", "order_8", "DOP853", "IAS15", "REBOUND_leapfrog")
+    names = (OWN, "leapfrog", "order_8", "DOP853", "IAS15", "REBOUND_leapfrog", *PLATFORMS)
     return ResultTable(
         name="sums",
         title="time at equal error, and how many times as long others take",
@@ -178,7 +211,7 @@ def run_sums(plan: Plan, say: Say) -> ResultTable:
             "ours: the fastest of SVI(2), (4), (6), (8); composition: ours of order 8; leapfrog, order 8: C by hand,",
             "the second the same composition; below 1 another is faster than the first. Error: root mean square of",
             "positions over that of the positions at the end; doubt: how far apart SVI(10), by which it is measured,",
-            "and a composition of order 10 are.",
+            "and a composition of order 10 are. OpenMM_CPU: single precision, one thread; OpenMM_double: Reference.",
         ),
     )
 
@@ -246,6 +279,9 @@ def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]
             _rebound(each, "leapfrog", _count(each, each.longest / 2**k)) for k in range(2, 12)
         ]
         found["IAS15"] = [_rebound(each, "ias15", None)]
+    if each.name == "atoms" and "openmm" in plan.peers and find_spec("openmm"):
+        for name in PLATFORMS:
+            found[name] = [_openmm(name, each, _count(each, each.longest / 2**k)) for k in range(1, 10)]
     return found
 
 
@@ -295,6 +331,10 @@ def _dop853(each: Lattice, tolerance: float) -> Callable[[], Array]:
         return end
 
     return run
+
+
+def _openmm(name: str, each: Lattice, steps: int) -> Callable[[], Array]:
+    return openmm_run(name, each.q, each.v, each.accelerations, each.span, steps)
 
 
 def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], Array]:

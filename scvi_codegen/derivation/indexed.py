@@ -8,10 +8,11 @@ from sympy import Expr, latex
 
 from scvi_codegen.formulas.indexed_latex import latex_entry, latex_sums
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.indexed import HeldSteps, IndexedProgram
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 from scvi_codegen.lowering.indexed import lower_indexed
+from scvi_codegen.mechanics.indexed.constraints import constraint_text, held_slots, slopes_of
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
@@ -46,6 +47,12 @@ def _text(system: IndexedSystem) -> Iterator[str]:
     if system.forces:
         yield "Forces beside:"
         yield from (f"  {force}" for force in system.forces)
+    if system.constraints:
+        yield "Constraints, each with what it adds to the forces:"
+    for term in system.constraints:
+        yield f"  {constraint_text(term)}"
+        pushed = zip(held_slots(system, term), slopes_of(system, term), strict=False)
+        yield from (f"    on {access}: lambda*({slope})" for (_, access), slope in pushed)
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
@@ -67,12 +74,21 @@ def _latex(system: IndexedSystem) -> Iterator[str]:
 
 def _step(program: IndexedProgram, method: Method) -> Iterator[str]:
     yield f"A step of h by {method.title}, from q, p to q', p', the same for every coordinate"
-    if program.splitting:
+    if program.held:
+        yield from _held(program.held)
+    elif program.splitting:
         yield from _splitting(program.splitting)
     elif isinstance(program.sweep, SeparableSweep):
         yield from _separable(program.sweep)
     elif program.sweep:
         yield from _hamiltonian(program.sweep)
+
+
+def _held(of: HeldSteps) -> Iterator[str]:
+    yield "(m its mass, F the force on it, G the slopes of the constraints g, q, p going on from part to part):"
+    for part in of.parts:
+        yield f"  p = p + {_number(part)}*h/2 (F + G^T lambda),  q = q + {_number(part)}*h p/m  with  g(q) = 0"
+        yield f"  p = p + {_number(part)}*h/2 (F + G^T mu)  with  G p/m + g_t = 0"
 
 
 def _splitting(of: Splitting) -> Iterator[str]:

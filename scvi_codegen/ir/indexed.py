@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 
-__all__ = ["IndexedProgram", "LoopedKernel"]
+__all__ = ["HeldSteps", "IndexedProgram", "LoopedKernel"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +40,21 @@ class LoopedKernel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class HeldSteps:
+    """Steps that constraints hold, by RATTLE.
+
+    Attributes:
+        conditions: values g, g_t and the slopes of g by each slot, at every element.
+        bends: along velocities, d^2 g / dt^2 of a straight motion.
+        parts: of a step, each of which is one of RATTLE.
+    """
+
+    conditions: tuple[LoopedKernel, ...]
+    bends: tuple[LoopedKernel, ...]
+    parts: tuple[Number, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedProgram:
     """An integrator of any number of coordinates, without syntax.
 
@@ -53,6 +69,7 @@ class IndexedProgram:
         forces, masses: loops.
         sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
         splitting: the kicks and drifts that replace it where the method is explicit.
+        held: what replaces both where there are constraints.
         control: steps that choose their length, if they are wanted.
         products, diagonals: the derivatives of the forces times a direction, and their diagonals, where Newton's
             iteration takes the place of the sweeps.
@@ -75,6 +92,7 @@ class IndexedProgram:
     sweep: SeparableSweep | HamiltonianSweep | None
     splitting: Splitting | None
     control: Control | None = None
+    held: HeldSteps | None = None
     products: tuple[LoopedKernel, ...] = ()
     diagonals: tuple[LoopedKernel, ...] = ()
 

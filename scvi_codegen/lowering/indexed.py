@@ -6,20 +6,19 @@ system of one coordinate serve all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
-from sympy import Add, Expr, S, Symbol
+from sympy import Add, S, Symbol
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.indexed_forces import IndexedForce
-from scvi_codegen.indices import Access
-from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
-from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
+from scvi_codegen.lowering.indexed_constraints import held_steps
+from scvi_codegen.lowering.indexed_kernels import given_of, kernel_of
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.choice import sweep_of
@@ -52,7 +51,8 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
         MethodError: for a method that solves its equations neither explicitly nor by sweeps over positions.
     """
     one = one_coordinate(system)
-    splitting = splitting_of(one, method)
+    held = held_steps(system, discretise(one, method), method) if system.constraints else None
+    splitting = None if held else splitting_of(one, method)
     if splitting and system.velocities:
         raise MethodError(
             f"{method.name} is explicit for forces of positions and time: for those of velocities take an SVI or a "
@@ -62,12 +62,12 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
     kernels += [_pushing(system, force, number) for number, force in enumerate(system.forces, len(kernels))]
     forces = tuple(kernels)
     products, diagonals = curvature(system) if newton else ((), ())
-    if newton and (splitting or system.momenta or system.velocities or not products):
+    if newton and (splitting or held or system.momenta or system.velocities or not products):
         raise MethodError(
             "Newton's iteration is there for Lagrangians of sums over indices with curved potentials, forces of "
             "positions and time, and methods that are not explicit: leave out solver='newton'"
         )
-    sweep = None if splitting else _sweep(one, method, velocities=bool(system.velocities))
+    sweep = None if splitting or held else _sweep(one, method, velocities=bool(system.velocities))
     return IndexedProgram(
         prefix=prefix,
         title=comment_text(f"{system.name}: {method.title}"),
@@ -85,6 +85,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
         masses=tuple(_mass(system, term, number) for number, term in enumerate(system.masses)),
         sweep=sweep,
         splitting=splitting,
+        held=held,
         products=products,
         diagonals=diagonals,
     )
@@ -120,10 +121,10 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
         loops=term.loops,
         slots=tuple(arrays[slot] for slot in u),
         targets=tuple(arrays[slot] for slot in u),
-        given=_given(term.slots, u),
-        kernel=_kernel(system, f"force_{number}", values, term.slots, u, "Derivatives by its coordinates."),
+        given=given_of(term.slots, u),
+        kernel=kernel_of(system, f"force_{number}", values, term.slots, u, "Derivatives by its coordinates."),
     )
-    scalar = _kernel(system, f"term_{number}", [term.formula], term.slots, u, "The term.")
+    scalar = kernel_of(system, f"term_{number}", [term.formula], term.slots, u, "The term.")
     return replace(looped, scalar=scalar)
 
 
@@ -137,8 +138,8 @@ def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedK
         loops=force.loops,
         slots=tuple(access for slot, access in force.slots if slot in u),
         targets=tuple(access for access, _ in force.targets),
-        given=_given(force.slots, u),
-        kernel=_kernel(system, f"force_{number}", values, force.slots, u, "Forces."),
+        given=given_of(force.slots, u),
+        kernel=kernel_of(system, f"force_{number}", values, force.slots, u, "Forces."),
     )
 
 
@@ -172,7 +173,7 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         for row, (access, _) in zip(rows, force.targets, strict=True)
     ]
     accesses, targets = tuple(access for _, access in moving), tuple(access for access, _ in force.targets)
-    given, text = _given(force.slots, u), comment_text(f"derivatives of {force}")
+    given, text = given_of(force.slots, u), comment_text(f"derivatives of {force}")
     both = [*force.slots, *zip(w, accesses, strict=True)]
     product = LoopedKernel(
         text=text,
@@ -180,7 +181,7 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         slots=(*accesses, *accesses),
         targets=targets,
         given=given,
-        kernel=_kernel(system, f"product_{number}", along, both, [*u, *w], "Forces along a direction."),
+        kernel=kernel_of(system, f"product_{number}", along, both, [*u, *w], "Forces along a direction."),
         along=len(accesses),
     )
     diagonal = LoopedKernel(
@@ -189,7 +190,7 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         slots=accesses,
         targets=targets,
         given=given,
-        kernel=_kernel(system, f"diagonal_{number}", own, force.slots, u, "By the coordinate itself."),
+        kernel=kernel_of(system, f"diagonal_{number}", own, force.slots, u, "By the coordinate itself."),
     )
     return product, diagonal
 
@@ -200,29 +201,6 @@ def _mass(system: IndexedSystem, term: MassTerm, number: int) -> LoopedKernel:
         loops=term.loops,
         slots=(),
         targets=(term.access,),
-        given=_given(term.slots, ()),
-        kernel=_kernel(system, f"mass_{number}", [term.formula], term.slots, (), "A mass."),
+        given=given_of(term.slots, ()),
+        kernel=kernel_of(system, f"mass_{number}", [term.formula], term.slots, (), "A mass."),
     )
-
-
-def _given(slots: Sequence[tuple[Symbol, Access]], u: Sequence[Symbol]) -> tuple[Access, ...]:
-    return tuple(access for slot, access in slots if slot not in u)
-
-
-def _kernel(
-    system: IndexedSystem,
-    name: str,
-    values: Sequence[Expr],
-    slots: Sequence[tuple[Symbol, Access]],
-    u: Sequence[Symbol],
-    purpose: str,
-) -> Kernel:
-    kernel = lower_kernel(
-        name,
-        arguments=tuple(u),
-        time=system.time,
-        parameters=(*system.parameters, *(slot for slot, _ in slots if slot not in u)),
-        values=tuple(values),
-        slopes=(),
-    )
-    return replace(kernel, purpose=purpose)

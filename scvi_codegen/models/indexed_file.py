@@ -5,6 +5,7 @@
     coordinates = ["q[N]"]                              # "r[N, 3]", "u[NX, NY]", several arrays
     lagrangian = "sum(i in N, m[i]*q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)"
     # dissipation = "sum(i in N, c*q_dot[i]**2/2)"      # Rayleigh's function
+    # constraints = ["(q[i+1] - q[i])**2 = 1 for i in 0..N-2"]
 
     [forces]                                            # on coordinates, at every place or at one; left out: 0
     # "q[i]" = "-c*q_dot[i]"
@@ -72,14 +73,14 @@ from scvi_codegen.models.sections import (
 __all__ = ["read_indexed"]
 
 KEYS = {
-    "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation"),
+    "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "constraints"),
     "initial": ("q", "p", "q_dot", "t"),
     "run": ("step", "span", "steps", "every"),
 }
 SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
 OTHERS = {
     "": ("inputs",),
-    "system": ("constraints", "inputs", "catalogue", "monitor"),
+    "system": ("inputs", "catalogue", "monitor"),
     "run": ("tolerance", "controller"),
 }
 """What other models have."""
@@ -183,6 +184,7 @@ def _read_system(document: Document) -> IndexedSystem:
         kind: text_of(section, kind, "[system]"),
         "forces": {key: text_of(document["forces"], key, "[forces]") for key in document.get("forces", {})},
         "dissipation": text_of(section, "dissipation", "[system]") if "dissipation" in section else None,
+        "constraints": names_of(section, "constraints") if "constraints" in section else (),
     }
     return in_section("[system]", lambda: IndexedSystem.from_text(**given))
 

@@ -130,7 +130,7 @@ def sweep_text(
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "contraction", meaning.memory, *sweep.parts, *solver),
+        support=(*meaning.before, "contraction", "inverse_sizes", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),
         highest=_groups("HIGHEST", sweep.guess.highest),
         next=_groups("NEXT", sweep.guess.next),

@@ -18,7 +18,8 @@ from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
 from scvi_codegen.runtime.events import Event
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, check_accesses
-from scvi_codegen.runtime.indexed_run import IndexedMark, IndexedRun
+from scvi_codegen.runtime.indexed_memory import IndexedMark
+from scvi_codegen.runtime.indexed_run import IndexedRun
 
 if TYPE_CHECKING:
     from scvi_codegen.formulas.indexed import IndexedTerm

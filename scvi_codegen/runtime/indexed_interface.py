@@ -41,6 +41,7 @@ class IndexedInterface:
         depends_on_time: whether energy is not conserved.
         inputs: names of functions of time given as data, each five of the parameters.
         solver: of the equations of a step, in a word.
+        constraints: the loops of each.
     """
 
     prefix: str
@@ -60,6 +61,7 @@ class IndexedInterface:
     depends_on_time: bool
     inputs: tuple[str, ...] = ()
     solver: str = "fixed-point"
+    constraints: tuple[tuple[Loop, ...], ...] = ()
     energy_parameter = ""
     """That of transformed time, which sums over indices do not have."""
 

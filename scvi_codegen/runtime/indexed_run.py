@@ -6,7 +6,6 @@ import io
 import time
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -14,47 +13,37 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
-from scvi_codegen.indices import IndexedMap
 from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, step_failure
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.indexed_interface import (
-    IndexedInterface,
-    Numbers,
-    read_arrays,
-    read_state,
-)
+from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_arrays, read_state
+from scvi_codegen.runtime.indexed_maps import momentum_of
+from scvi_codegen.runtime.indexed_memory import IndexedMark, aligned, held_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.portions import SLICE_SECONDS
 
-__all__ = ["IndexedMark", "IndexedRun"]
+__all__ = ["IndexedRun"]
 
 ADVICE = {
     "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
     "or solver='newton' where the fast motions are stiff bonds at rest",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
+    "singular": "constraints contradict each other there, or say the same",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
 }
-NEWTON_ADVICE = {**ADVICE, "not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"}
+ADVICE_BY_SOLVER = {
+    "fixed-point": ADVICE,
+    "newton": ADVICE | {"not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"},
+    "rattle": ADVICE | {"not converged": "constraints turn too far in a step to be met at its end: try a smaller h"},
+}
 CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
 """Of steps that choose their length."""
 MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOICE)
 """Of a run, beside its arrays."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of numbers that change from step to step, but for what guesses are made of."""
-
-ALIGNMENT = 64
-"""Bytes: those of the widest vector."""
-
-
-@dataclass(frozen=True, slots=True)
-class IndexedMark:
-    """A state of a run: its arrays, its numbers, sweeps up to it."""
-
-    arrays: Mapping[str, Numbers]
-    moments: Mapping[str, Any]
-    iterations: int
 
 
 class IndexedRun:
@@ -72,6 +61,7 @@ class IndexedRun:
     Attributes:
         problem: its parameters may change on the way.
         goal, options: as given.
+        state: positions and momenta of all coordinates, in a row.
         iterations: sweeps of all steps yet.
     """
 
@@ -106,8 +96,8 @@ class IndexedRun:
 
     def _start(self, state: Mapping[str, Numbers], moving: tuple[Any, str], h: float, t: float) -> None:
         n = self.problem.count
-        state_of, rest_of = aligned(2 * n), aligned(2 * n)  # of a Hamiltonian momenta stand behind positions
-        self._numbers = {"q": state_of[:n], "p": state_of[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
+        self.state, rest_of = aligned(2 * n), aligned(2 * n)  # of a Hamiltonian momenta stand behind positions
+        self._numbers = {"q": self.state[:n], "p": self.state[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
         self._numbers["inverse_mass"] = aligned(n)
         self._numbers["work"] = aligned(n * self._binding.constant("WORK"))
         self._find_masses()
@@ -122,6 +112,8 @@ class IndexedRun:
             self._numbers["p"][:] = flat if what == "momenta" else flat / self._numbers["inverse_mass"]
         self._run = self._binding.new("run *")
         self._run.t, self._run.h = t, h
+        if self.interface.constraints:
+            self._numbers |= held_memory(self._binding, self._run, self.problem.struct, n)
         for name in self._numbers:
             setattr(self._run, name, self._pointer(name))
 
@@ -147,15 +139,25 @@ class IndexedRun:
             StateError: for names, shapes and numbers that do not fit.
         """
         if parameters is not None:
-            self.problem = self.problem.with_parameters(parameters)
-            self._find_masses()
+            self._take(self.problem.with_parameters(parameters))
         if h is not None and checked_step(h) != self.h:
             self._run.h, self._run.guess = h, 0
         self.goal = goal or self.goal
 
+    def _take(self, problem: IndexedProblem) -> None:
+        """Go on with another of the same sizes, by forces of its own."""
+        former, self.problem, self._run.guess = self.problem, problem, 0
+        self._find_masses()
+        if self.interface.constraints:
+            try:
+                check_reachable(self)
+            except StateError:
+                self.problem = former
+                raise
+
     def hold(self, **inputs: float) -> None:
         """Go on with inputs held at numbers: between the samples of a controller."""
-        self.problem = self.problem.held(inputs)
+        self._take(self.problem.held(inputs))
 
     def apart(self, h: float, goal: Goal | None = None) -> IndexedRun:
         """A run of its own from the present state, to the last bit, by other steps."""
@@ -264,7 +266,21 @@ class IndexedRun:
     def momentum_maps(self) -> Numbers:
         """What symmetries conserve (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`), (count,)."""
         q, p = self.q, self.p
-        return np.array([_momentum(q[each.array], p[each.array], each) for each in self.interface.maps])
+        return np.array([momentum_of(q[each.array], p[each.array], each) for each in self.interface.maps])
+
+    @property
+    def multipliers(self) -> tuple[Numbers, ...]:
+        """The lambda with which G^T lambda keep the state on its constraints: of each as written, over its loops.
+
+        Raises:
+            MethodError: for a system without constraints.
+        """
+        return multipliers(self)
+
+    @property
+    def constraint_values(self) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
+        """How far the state is off: g, and its rate g_q v + g_t, as the multipliers; raises as these."""
+        return constraint_values(self)
 
     @property
     def step_error(self) -> float:
@@ -361,38 +377,20 @@ class IndexedRun:
             done += report.steps
             self.iterations += report.iterations
             if status:
-                h = 0.0 if self.goal else self.h
-                advice = NEWTON_ADVICE if self.interface.solver == "newton" else ADVICE
+                h, advice = 0.0 if self.goal else self.h, ADVICE_BY_SOLVER[self.interface.solver]
                 raise step_failure(status, report, step=self.steps, h=h, advice=advice)
             if progress is not None:
                 progress(self.steps)
             elapsed = max(time.perf_counter() - began, 1e-6)
             portion = max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed)))
 
+    def call(self, name: str, *arguments: Any) -> int:
+        """What a function of C says of the run."""
+        return int(self._binding.function(name)(self._run, *arguments) or 0)
+
     def _steps(self, size: int, report: Any) -> int:
         """The status of so many."""
         problem, goal = self.problem.struct, self.goal
         if goal is None:
-            return int(self._binding.function("advance")(self._run, problem, size, self._options, report))
-        to = (goal.t_end, goal.tolerance, size)
-        return int(self._binding.function("advance_to")(self._run, problem, *to, self._options, report))
-
-
-def aligned(count: int) -> Numbers:
-    """So many zeros, the first on the boundary of a vector."""
-    try:
-        memory = np.zeros(count + ALIGNMENT // 8)
-    except (MemoryError, ValueError) as error:
-        raise StateError(f"{count} numbers do not fit into the memory") from error
-    start = -memory.ctypes.data % ALIGNMENT // 8
-    return memory[start : start + count]
-
-
-def _momentum(q: Numbers, p: Numbers, of: IndexedMap) -> float:
-    if of.phase:
-        return float(np.sum(q**2 + p**2) / 2)
-    if of.component is None:
-        return float(np.sum(p))
-    if of.other is None:
-        return float(np.sum(p[..., of.component]))
-    return float(np.sum(q[..., of.component] * p[..., of.other] - q[..., of.other] * p[..., of.component]))
+            return self.call("advance", problem, size, self._options, report)
+        return self.call("advance_to", problem, goal.t_end, goal.tolerance, size, self._options, report)

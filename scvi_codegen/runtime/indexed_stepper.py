@@ -22,7 +22,8 @@ from scvi_codegen.runtime.compiled_method import no_text
 from scvi_codegen.runtime.driven import checked_inputs, end_of, entered, parameters_at, stretches
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, read_arrays
+from scvi_codegen.runtime.indexed_constraints import consistent, project
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, RunArrays, read_arrays
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
@@ -99,21 +100,54 @@ class IndexedStepper:
             StateError: on wrong names, shapes and numbers, and where an index would leave its array.
             MethodError: where steps have no error that would choose their length.
         """
-        goal = _goal(h, t_end, tolerance)
-        if velocity is not None and self.interface.momenta:
-            raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
-        if p is not None and velocity is not None:
-            raise StateError("give momenta p or the velocity, not both")
-        arrays = read_arrays(self.interface, q, parameters, tables)
-        return IndexedRun(
-            IndexedProblem(self.interface, self._controlled if goal else self._binding, arrays),
+        goal, binding = _goal(h, t_end, tolerance), self._binding if t_end is None else self._controlled
+        arrays, moving = self._given(q, p, velocity, parameters, tables)
+        length = 0.0 if h is None else checked_step(h)
+        run = IndexedRun(
+            IndexedProblem(self.interface, binding, arrays),
             arrays.state,
-            (p, "momenta") if velocity is None else (velocity, "velocities"),
-            h=0.0 if h is None else checked_step(h),
+            moving,
+            h=length,
             t=checked_number(t, "t"),
             goal=goal,
             options=options,
         )
+        if self.interface.constraints:
+            consistent(run)
+        return run
+
+    def project(
+        self,
+        q: ArrayLike | Mapping[str, ArrayLike],
+        p: ArrayLike | Mapping[str, ArrayLike] | None = None,
+        *,
+        velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
+        t: float = 0.0,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        tables: Mapping[str, ArrayLike] | None = None,
+    ) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+        """The nearest state (q, p) that meets the constraints, in the metric of the masses, by name of array.
+
+        Raises:
+            MethodError: for a system without constraints.
+            StateError: if none is found, or constraints depend on each other there.
+        """
+        if not self.interface.constraints:
+            raise MethodError(f"{self.interface.system} has no constraints")
+        arrays, moving = self._given(q, p, velocity, parameters, tables)
+        problem = IndexedProblem(self.interface, self._binding, arrays)
+        run = IndexedRun(problem, arrays.state, moving, h=0.0, t=checked_number(t, "t"))
+        project(run)
+        return run.q, run.p
+
+    def _given(self, q: Any, p: Any, velocity: Any, parameters: Any, tables: Any) -> tuple[RunArrays, tuple[Any, str]]:
+        """Arrays of a run, and what it begins with beside positions."""
+        if velocity is not None and self.interface.momenta:
+            raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
+        if p is not None and velocity is not None:
+            raise StateError("give momenta p or the velocity, not both")
+        moving = (p, "momenta") if velocity is None else (velocity, "velocities")
+        return read_arrays(self.interface, q, parameters, tables), moving
 
     def restore(
         self,

@@ -75,28 +75,23 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
 {
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
-  double largest = first_positions(run, &parts, &by, n, tables, *guess), size = 0.0, first = 0.0, last = INFINITY;
-  int status = 0;
+  iteration now = at_its_start();
+  double largest = first_positions(run, &parts, &by, n, tables, *guess), size = 0.0;
   improve_velocities(run, &parts, &by, n);
   forces_at_points(run, given, parts.X, parts.F, n);
-  for (int k = 0; status == 0; k++) {
-    double change = improve(run, &parts, &by, n, k == 0 ? &size : NULL);
+  while (now.status == 0) {
+    double change = improve(run, &parts, &by, n, now.count == 0 ? &size : NULL);
     change += improve_velocities(run, &parts, &by, n);
-    change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
     forces_at_points(run, given, parts.X, parts.F, n);
-    status = sweep_status(change, last, options, k);
-    first = k == 0 ? change : first;
-    last = change;
-    report->iterations++;
+    judge(&now, beside_state(change, size, options), options, report);
   }
-  report->change = sqrt(last);
-  if (status < 0)
-    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  if (now.status < 0)
+    return failure_of(&now);
   last_positions(run, &parts, &by, n);
   if (largest <= DBL_MIN)
     largest = largest_at_end(parts.X, n);
   improve_velocities(run, &parts, &by, n);
   forces_at_points(run, given, parts.X, parts.F, n);
-  *guess = steps_to_continue(*guess, first);
+  *guess = steps_to_continue(*guess, now.first);
   return examine(run, parts.F, &by, n, largest, error) ? OK : NOT_FINITE;
 }

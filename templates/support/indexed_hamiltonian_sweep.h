@@ -108,32 +108,27 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
     long long *guess, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
-  double first = 0.0, last = INFINITY, change = 0.0;
-  int status = 0;
+  iteration now = at_its_start();
+  double change = 0.0;
   if (*guess > 0)
     continue_slopes(&parts, n, tables, *guess);
   else
     memset(parts.G, 0, sizeof(lanes) * GROUPS * 2 * (size_t)n);
-  for (int k = 0; status == 0; k++) {
+  for (int k = 0; now.status == 0; k++) {
     const double of_q = improve(run, parts.X, parts.G + n, POSITION, POSITION_WEIGHT, 0, n, options->absolute);
     const double of_p = improve(run, parts.X, parts.G, MOMENTUM, MOMENTUM_WEIGHT, n, n, options->absolute);
     for (int g = 0; g < GROUPS; g++)
       forces(given, parts.X + g * 2 * n, run->t + run->h * ABSCISSA[g], parts.G + g * 2 * n, 2 * n);
     change = k % 2 ? of_q + of_p : change + of_q + of_p;
-    if (k == 0 || k % 2)
-      continue;
-    status = sweep_status(change, last, options, k / 2 - 1);
-    first = k == 2 ? change : first;
-    last = change;
-    report->iterations++;
+    if (k > 0 && k % 2 == 0)
+      judge(&now, change, options, report);
   }
-  report->change = sqrt(last);
-  if (status < 0)
-    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  if (now.status < 0)
+    return failure_of(&now);
   if (!finite_slopes(parts.G, n))
     return NOT_FINITE;
   *error = unresolved(run, parts.G + n, n);
-  *guess = steps_to_continue(*guess, first);
+  *guess = steps_to_continue(*guess, now.first);
   return OK;
 }
 

@@ -69,31 +69,26 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
 {
   const parts_of_work parts = divide(run, n);
   linear_system of = linear_of(run, given, &parts, n);
-  double largest = first_positions(run, &parts, &of.by, n, tables, *guess), first = 0.0, last = INFINITY;
-  int status = 0;
+  double largest = first_positions(run, &parts, &of.by, n, tables, *guess);
+  iteration now = at_its_start();
   forces_at_points(run, given, parts.X, parts.F, n);
   start_nearer(&of, &parts);
-  for (int k = 0; status == 0; k++) {
+  while (now.status == 0) {
     const double size = find_residual(&of, parts.X, parts.F);
     double change;
-    if (k == 0 || last > REFRESHED)
+    if (now.last > REFRESHED) /* as before the first */
       find_inverses(&of);
     find_correction(&of, report);
     for (long long i = 0; i < of.count; i++)
       parts.X[i] += of.correction[i];
     forces_at_points(run, given, parts.X, parts.F, n);
     change = inner_product(of.correction, of.correction, of.count);
-    change = options->absolute || size == 0.0 ? change + 0.0 * size : change / size;
-    status = sweep_status(change, last, options, k);
-    first = k == 0 ? change : first;
-    last = change;
-    report->iterations++;
+    judge(&now, beside_state(change, size, options), options, report);
   }
-  report->change = sqrt(last);
-  if (status < 0)
-    return last < INFINITY ? NOT_CONVERGED : NOT_FINITE;
+  if (now.status < 0)
+    return failure_of(&now);
   if (largest <= DBL_MIN)
     largest = largest_at_end(parts.X, n);
-  *guess = steps_to_continue(*guess, first);
+  *guess = steps_to_continue(*guess, now.first);
   return examine(run, parts.F, &of.by, n, largest, error) ? OK : NOT_FINITE;
 }

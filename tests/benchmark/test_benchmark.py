@@ -34,6 +34,7 @@ from scvi_codegen.benchmark import (
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders import held_bodies, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
@@ -589,6 +590,16 @@ class TestTables:
         )
         assert np.abs(by_hand - ours).max() < 1e-14
         assert np.abs(ours - lattice.q).max() > 0.01
+
+    @pytest.mark.parametrize("name", sorted(PLATFORMS))
+    def test_openmm_makes_the_steps_of_leapfrog(self, name):
+        pytest.importorskip("openmm", reason="needs the extra 'bench'")
+        crystal, steps = sums.atoms(1, 0.5), 50
+        theirs = sums._openmm(name, crystal, steps)()
+        ours = sums._ours(crystal, "stoermer-verlet", steps)()
+        rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
+        assert np.abs(theirs - ours).max() < rounding
+        assert np.abs(ours - crystal.q).max() > 0.1
 
     @pytest.mark.full
     def test_sums_are_measured_at_equal_error(self, monkeypatch):

@@ -156,7 +156,7 @@ def test_a_field_in_two_parts_has_the_bits_of_one(output_of):
     bits, states, *times = output_of("field_on_two_processes").splitlines()
     assert bits == "two processes have the bits of one: True"
     assert states == "and the states of the compiled integrator: True"
-    assert len(times) == 4
+    assert len(times) in (4, 5)  # the last where others had the cores
 
 
 def test_every_way_to_choose_steps_is_as_good_as_it_says(output_of):

@@ -56,6 +56,7 @@ OWNERS = {
     "markupsafe": "display reproduce",
     "matplotlib": "benchmark pictures reproduce",
     "mpmath": "benchmark display tables",
+    "openmm": "benchmark",
     "pandas": "files runtime",
     "platformdirs": "files",
     "rebound": "benchmark frameworks",

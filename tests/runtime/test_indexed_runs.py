@@ -208,3 +208,18 @@ class TestInputs:
     def test_they_are_shown_by_name(self, driven):
         assert "F on q[N-1]" in str(driven)
         assert driven.depends_on_time
+
+
+def test_parameters_change_the_first_kick_of_an_explicit_method():
+    """Whose force is kept from the step before, which had another."""
+    spring = sc.IndexedSystem.from_text(
+        name="spring", coordinates=["q[N]"], parameters={"k": 1}, lagrangian="sum(i in N, q_dot[i]**2/2 - k*q[i]**2/2)"
+    )
+    stepper = sc.compile_indexed(spring, "stoermer-verlet")
+    run = stepper.start([1.0, 0.5], h=0.1)
+    run.advance(3)
+    run.change(parameters={"k": 5.0})
+    other = stepper.start(run.q, run.p, h=0.1, parameters={"k": 5.0})
+    for each in (run, other):
+        each.advance(1)
+    assert np.abs(run.q["q"] - other.q["q"]).max() < 1e-15

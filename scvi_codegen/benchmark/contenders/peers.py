@@ -251,5 +251,6 @@ PEERS = {
     "cyrk": Peer(modules=("CyRK", "numba"), contenders=_cyrk),
     "jitcode": Peer(modules=("jitcode",), contenders=_jitcode),
     "scipy": Peer(modules=("scipy",), contenders=_scipy),
+    "openmm": Peer(modules=("openmm",), contenders=lambda case, quick: iter(()), suits=lambda case: False),
 }
-"""Peers by the name on the command line, the fastest first."""
+"""Peers by the name on the command line, the fastest first; the last is for sums over pairs alone."""

@@ -97,7 +97,8 @@ def expand_sums(
     }
     if momenta:
         return HamiltonianSystem(**same, momenta=momenta, hamiltonian=Add(*summands))
-    return LagrangianSystem(**same, lagrangian=Add(*summands))
+    held = tuple(term.formula.xreplace(rule) for term in system.constraints for _, rule in written.rules(term))
+    return LagrangianSystem(**same, lagrangian=Add(*summands), constraints=held)
 
 
 def _columns(table: ArrayLike) -> NDArray[np.int64]:

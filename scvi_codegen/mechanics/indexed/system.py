@@ -20,6 +20,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.indexed_constraints import parse_constraint
 from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
 from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
@@ -27,6 +28,7 @@ from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.mechanics.indexed.constraints import check_constraints, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, velocity_slots
 
 __all__ = ["INDEXED", "IndexedSystem"]
@@ -48,6 +50,7 @@ class IndexedSystem:
         terms: of the Lagrangian or the Hamiltonian.
         forces: beside it, of coordinates, velocities (momenta of a Hamiltonian) and time.
         inputs: names of functions of time given as data with each run, each five of the parameters.
+        constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.indexed.constraints`).
     """
 
     name: str
@@ -62,6 +65,7 @@ class IndexedSystem:
     terms: tuple[IndexedTerm, ...]
     forces: tuple[IndexedForce, ...] = ()
     inputs: tuple[str, ...] = ()
+    constraints: tuple[IndexedTerm, ...] = ()
 
     def __repr__(self) -> str:
         return f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))"
@@ -76,6 +80,7 @@ class IndexedSystem:
             for access, formula in force.targets:
                 if problem := unsupported_part(formula):
                     raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
+        check_constraints(self)
         for array in () if self.momenta else self.coordinates:
             if not any(mass.access.array == array for mass in self.masses):
                 raise SystemDefinitionError(
@@ -96,6 +101,7 @@ class IndexedSystem:
         forces=MAPPING,
         dissipation=TEXT,
         inputs=NAMES,
+        constraints=TEXTS,
     )
     def from_text(
         cls,
@@ -110,6 +116,7 @@ class IndexedSystem:
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
         inputs: Sequence[str] = (),
+        constraints: Sequence[str] = (),
     ) -> IndexedSystem:
         """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
 
@@ -126,6 +133,8 @@ class IndexedSystem:
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
             inputs: names of functions of time that are given as data with each run
                 (:mod:`scvi_codegen.formulas.inputs`).
+            constraints: formulas in coordinates and time that stay 0, or equations, and behind them the loops for which
+                they do, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
 
         Raises:
             SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
@@ -164,6 +173,7 @@ class IndexedSystem:
             terms=tuple(_with_formulas(term, driven) for term in parse_indexed(text, everything, known, places)),
             forces=tuple(_with_forces(force, driven) for force in chain(*acting)),
             inputs=tuple(inputs),
+            constraints=tuple(parse_constraint(each, everything, known, places) for each in constraints),
         )
 
     @classmethod
@@ -221,6 +231,7 @@ class IndexedSystem:
         """Every access of an array, with the loops around it."""
         slots = [(access, term.loops) for term in self.terms for _, access in term.slots]
         slots += [(access, force.loops) for force in self.forces for _, access in force.slots]
+        slots += [(access, term.loops) for term in self.constraints for _, access in term.slots]
         return (*slots, *((access, force.loops) for force in self.forces for access, _ in force.targets))
 
     @property
@@ -228,6 +239,8 @@ class IndexedSystem:
         """Why energy is not conserved; nothing where it is."""
         if self.forces:
             return "forces act"
+        if any(self.time in term.formula.free_symbols for term in self.constraints):
+            return "constraints depend on time"
         return f"the {self.function} depends on time" if self.depends_on_time else ""
 
     @property
@@ -282,7 +295,9 @@ class IndexedSystem:
         arguments = ", ".join(map(str, self.state))
         terms = " + ".join(str(_with_formulas(term, self._by_name)) for term in self.terms)
         acting = "; ".join(str(_with_forces(force, self._by_name)) for force in self.forces)
-        return f"{self.name}: {self.function[0]}({arguments}) = {terms}{f'; forces {acting}' if acting else ''}"
+        held = "; ".join(map(constraint_text, self.constraints))
+        beside = f"{f'; forces {acting}' if acting else ''}{f'; {held}' if held else ''}"
+        return f"{self.name}: {self.function[0]}({arguments}) = {terms}{beside}"
 
     @property
     def _by_name(self) -> dict[Expr, Expr]:

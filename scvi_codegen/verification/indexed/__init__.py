@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import MethodError
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.kinds import MAPPING, of, takes
 from scvi_codegen.lowering.indexed import one_coordinate
@@ -70,11 +71,16 @@ def verify_indexed(
 
     Raises:
         BuildError: without a C compiler.
-        MethodError: for a method without sweeps.
+        MethodError: for a method without sweeps, and with constraints.
         StateError: for arrays that do not fit.
     """
     began = time.perf_counter()
     chosen = as_method(method, one_coordinate(system))
+    if system.constraints:
+        raise MethodError(
+            "sums over indices with constraints have no certificate: verify a small one written out (expand_sums) by "
+            "SVI(1, 'gauss-lobatto:2')"
+        )
     stepper = stepper or compile_indexed(system, chosen, flags=tuple(flags))
     run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
     arrays = read_arrays(stepper.interface, q, parameters, tables)

@@ -1,0 +1,71 @@
+"""Constraints on arrays read from text: an equation, and the loops whose every element has one.
+
+constraint = sum ["=" sum] ["for" loop ("," loop)*]      (r[b+1] - r[b])**2 = l[b]**2 for b in 0..N-2
+
+Loops and places are those of :mod:`scvi_codegen.indices`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from itertools import chain
+
+from sympy import Symbol
+
+from scvi_codegen.errors import ExpressionError
+from scvi_codegen.formulas.grammar import parsed
+from scvi_codegen.formulas.indexed import IndexedParser, IndexedTerm, term_of
+from scvi_codegen.indices import Array, Loop
+
+__all__ = ["parse_constraint"]
+
+_FOR = re.compile(r"\bfor\b")
+
+
+def parse_constraint(
+    text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
+) -> IndexedTerm:
+    """Read g = 0 for all elements of loops; of ``left = right`` g is left - right.
+
+    Args:
+        text: the constraint.
+        arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.indexed.parse_indexed`.
+
+    Raises:
+        ExpressionError: as there, and for a sum over a whole array, which would bind all of its entries together.
+
+    >>> from scvi_codegen.formulas.indexed import parse_array
+    >>> term = parse_constraint("(q[i+1] - q[i])**2 = 1 for i in 0..N-2", [parse_array("q[N]")], {})
+    >>> print(term.formula, "for", *term.loops)
+    (q[i+1] - q[i])**2 - 1 for i in 0..N-2
+    """
+    equation, *behind = _FOR.split(text)
+    sides = equation.split("=")
+    if len(sides) > 2 or len(behind) > 1:
+        raise ExpressionError("a constraint has one '=' and one 'for' at most", text, 0)
+    loops = tuple(chain(*(_Loops(each, symbols, arrays, tables).read() for each in behind)))
+    parsers = [IndexedParser(side, symbols, arrays, tables) for side in sides]
+    for parser in parsers:
+        parser.bound = {loop.index: loop for loop in loops}
+    left, *right = map(parsed, parsers)
+    if any(parser.sums for parser in parsers):
+        message = "a constraint of a sum over a whole array is not there: constraints are of few entries each"
+        raise ExpressionError(message, text, text.find("sum"))
+    accesses = dict(chain(*(parser.accesses.items() for parser in parsers)))
+    return term_of(loops, left - right[0] if right else left, accesses)
+
+
+class _Loops(IndexedParser):
+    """``b in B, k in 0..N-2``, alone."""
+
+    def read(self) -> list[Loop]:
+        """All of them."""
+        found = self.loop()
+        self.bound |= {loop.index: loop for loop in found}
+        while self.accept(","):
+            found += self.loop()
+            self.bound |= {loop.index: loop for loop in found}
+        if self.peek().kind != "end":
+            self.refuse(f"a comma or the end is expected here, not '{self.peek().text}'", self.peek().column)
+        return found

@@ -1,0 +1,83 @@
+"""Steps of sums over indices that constraints hold: RATTLE, and its symmetric compositions.
+
+A step of h is, with G0 and G1 the slopes of the constraints at its ends,
+
+    p = p0 + h/2 (F0 + G0^T lambda),  q1 = q0 + h M^-1 p  with  g(q1) = 0,
+    p1 = p + h/2 (F1 + G1^T mu)                           with  G1 M^-1 p1 + g_t = 0,
+
+symmetric and symplectic on the constrained phase space; compositions of such steps keep constraints after each, and
+have their order where no steps of their own would reach it. Both systems of multipliers are solved by corrections with
+G M^-1 G^T of the step's beginning or end, a sparse matrix whose pattern the tables of a run have.
+
+Sources: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983);
+S. Reich, SIAM J. Numer. Anal. 33 (1996), of compositions; E. Barth, K. Kuczera, B. Leimkuhler, R. D. Skeel, J. Comput.
+Chem. 16 (1995), of such corrections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from sympy import Symbol
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.ir.indexed import HeldSteps, LoopedKernel
+from scvi_codegen.ir.numbers import lower_vector
+from scvi_codegen.lowering.indexed_kernels import given_of, kernel_of
+from scvi_codegen.lowering.program import comment_text
+from scvi_codegen.mechanics.indexed.constraints import bend_of, constraint_text, held_slots, slopes_of
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.tables.precision import Vector, mp
+
+__all__ = ["held_steps"]
+
+
+def held_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> HeldSteps:
+    """What such steps need.
+
+    Raises:
+        MethodError: for other methods, and for forces of velocities.
+    """
+    if system.velocities:
+        raise MethodError("with constraints, sums over indices have forces of positions and time alone")
+    pairs = list(_kernels(system))
+    conditions, bends = (tuple(kernels) for kernels in zip(*pairs, strict=True))
+    return HeldSteps(conditions=conditions, bends=bends, parts=lower_vector(_parts(stages, method)))
+
+
+def _parts(stages: StageSystem, method: Method) -> Vector:
+    """Of a step by RATTLE: its own parts of h."""
+    shape = stages.shape
+    if method.fractions and not getattr(method, "drifts_first", False):
+        return method.fractions
+    if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
+        return (mp.one,)
+    raise MethodError(
+        f"{method.name} does not keep the constraints of sums over indices: take 'stoermer-verlet', which is "
+        "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
+    )
+
+
+def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
+    """Of each constraint: its condition, and how straight motions bend away from it."""
+    for number, term in enumerate(system.constraints):
+        held = held_slots(system, term)
+        u, accesses = [slot for slot, _ in held], tuple(access for _, access in held)
+        v = tuple(Symbol(f"{slot.name} along", real=True) for slot in u)
+        *slopes, rate = slopes_of(system, term)
+        values = [term.formula, rate, *slopes]
+        condition = LoopedKernel(
+            text=comment_text(constraint_text(term)),
+            loops=term.loops,
+            slots=accesses,
+            targets=accesses,
+            given=given_of(term.slots, u),
+            kernel=kernel_of(system, f"condition_{number}", values, term.slots, u, "g, g_t, and the slopes of g."),
+        )
+        both = [*term.slots, *zip(v, accesses, strict=True)]
+        bend = kernel_of(system, f"bend_{number}", [bend_of(system, term, v)], both, [*u, *v], "d^2 g / dt^2 along v.")
+        yield condition, replace(condition, slots=(*accesses, *accesses), along=len(accesses), kernel=bend)

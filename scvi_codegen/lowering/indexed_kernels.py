@@ -1,0 +1,40 @@
+"""Kernels of sums over indices: what moves is their arguments, other entries of arrays the last of their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sympy import Expr, Symbol
+
+from scvi_codegen.indices import Access
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+
+__all__ = ["given_of", "kernel_of"]
+
+
+def given_of(slots: Sequence[tuple[Symbol, Access]], u: Sequence[Symbol]) -> tuple[Access, ...]:
+    """The entries that do not move."""
+    return tuple(access for slot, access in slots if slot not in u)
+
+
+def kernel_of(
+    system: IndexedSystem,
+    name: str,
+    values: Sequence[Expr],
+    slots: Sequence[tuple[Symbol, Access]],
+    u: Sequence[Symbol],
+    purpose: str,
+) -> Kernel:
+    """Values of slots, of which ``u`` move."""
+    kernel = lower_kernel(
+        name,
+        arguments=tuple(u),
+        time=system.time,
+        parameters=(*system.parameters, *(slot for slot, _ in slots if slot not in u)),
+        values=tuple(values),
+        slopes=(),
+    )
+    return replace(kernel, purpose=purpose)

@@ -1,0 +1,231 @@
+"""Nests of loops around a kernel, as C.
+
+What a slot is read from, and what is added to it, stands in the innermost loop that moves its place: in a sum over
+pairs i < j what belongs to i is read before the loop over j, and added once behind it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias
+
+from scvi_codegen.indices import Access, Array, Loop, Place, Size
+from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
+from scvi_codegen.rendering.layout import wrapped, wrapped_comment
+
+__all__ = ["DIRECTION", "Lines", "Nest", "count_text", "product_text", "size_text", "sizes_text"]
+
+DIRECTION = "V"
+"""What the slots along a direction are read from."""
+
+Lines: TypeAlias = Callable[[int], list[str]]
+"""Of a slot, by its number."""
+
+
+def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
+    """Where each array begins in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
+    sizes: list[str] = []
+    for array in (*program.coordinates, *program.momenta, *program.velocities):
+        yield array.name, " + ".join(sizes) or "0"
+        sizes.append(product_text(array))
+
+
+def product_text(array: Array) -> str:
+    """The number of its entries, in C."""
+    return " * ".join(map(size_text, array.axes))
+
+
+def count_text(loops: Sequence[Loop]) -> str:
+    """How many elements loops have, in C."""
+    behind = {loop.behind: loop for loop in loops if loop.behind}
+    return " * ".join(_span_text(loop, loop.index in behind) for loop in loops if not loop.behind) or "1"
+
+
+def _span_text(loop: Loop, paired: bool) -> str:
+    size = f"({size_text(loop.end)} - {size_text(loop.first)})"
+    return f"(({size_text(loop.end)}) * ({size_text(loop.end)} - 1) / 2)" if paired else size
+
+
+def size_text(size: Size) -> str:
+    """A size in C."""
+    number = f"{size.number:+d}"
+    return f"size_{size.name}{f' {number[0]} {number[1:]}' if size.number else ''}" if size.name else str(size.number)
+
+
+class Nest:
+    """The loops of a kernel, with arguments and parameters at the level where they are first known.
+
+    The innermost loop runs over parts of its span. On each part the places of a ring stand at the same distance from
+    the index, whether that goes around or not, so that nothing is asked an element.
+
+    Args:
+        program: whose arrays they are.
+        looped: the kernel.
+        scalar: type of the arguments.
+        source: what they are read from; nothing where they are not.
+        chunked: whether all values of a part are found before any is added, in loops without conflicts, which a
+            compiler turns into vectors.
+    """
+
+    def __init__(
+        self, program: IndexedProgram, looped: LoopedKernel, scalar: str, source: str, *, chunked: bool = False
+    ) -> None:
+        self.program, self.looped, self.scalar, self.source = program, looped, scalar, source
+        self.chunked = chunked
+        self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
+        self.loops = {loop.index: loop for loop in looped.loops}
+        self.scalars = len(program.parameter_names)
+
+    def level(self, access: Access) -> int:
+        """The depth of the innermost loop that moves it."""
+        return max((self.levels[index] for index in access.indices), default=0)
+
+    def is_innermost(self, access: Access) -> bool:
+        """Whether an entry moves with the innermost loop."""
+        return self.level(access) == len(self.looped.loops)
+
+    def text(self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str] = ()) -> list[str]:
+        """The nest.
+
+        Args:
+            prepare, finish: lines of targets before and behind the loops that do not move them.
+            innermost: lines in the innermost loop.
+            behind: lines, each in a loop of its own over the same part.
+        """
+        return self._inside(0, prepare, innermost, finish, behind)
+
+    def _inside(
+        self, level: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str]
+    ) -> list[str]:
+        lines = list(self._found(level))
+        outer = [k for k, target in enumerate(self.looped.targets) if self.level(target) == level]
+        if level == len(self.looped.loops):
+            return [*lines, *innermost]
+        lines += [line for k in outer for line in prepare(k)]
+        loop, inner = self.looped.loops[level], self._inside(level + 1, prepare, innermost, finish, behind)
+        last = level + 1 == len(self.looped.loops)
+        lines += self._parts(loop, inner, behind) if last else _loop(loop, _first(loop), size_text(loop.end), inner)
+        return lines + [line for k in outer for line in finish(k)]
+
+    def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[str]) -> list[str]:
+        """The innermost loop, in parts where it needs some."""
+        first, end = _first(loop), size_text(loop.end)
+        offsets = self._offsets(loop)
+        if not offsets and not self.chunked:
+            return _loop(loop, first, end, inner)
+        lines = [f"end = {end} - begin > CHUNK ? begin + CHUNK : {end};" if self.chunked else f"end = {end};"]
+        lines += [
+            f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {end}, &end);"
+            for offset in offsets
+        ]
+        lines += [f"lanes values[{len(self.looped.targets)}][CHUNK];"] if self.chunked else []
+        lines += _loop(loop, "begin", "end", inner)
+        for line in behind:
+            lines += _loop(loop, "begin", "end", [line])
+        return [
+            f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
+            *(f"  {line}" for line in lines),
+            "}",
+        ]
+
+    def _offsets(self, loop: Loop) -> list[int]:
+        """At which places of a ring stand from an index."""
+        accesses = (*self.looped.slots, *self.looped.targets, *self.looped.given)
+        places = [place for access in accesses for place in access.places]
+        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
+        return sorted(moved - {0}) if loop.periodic else []
+
+    def _found(self, level: int) -> Iterator[str]:
+        """What is known at a level: arguments, parameters."""
+        for k, slot in enumerate(self.looped.slots):
+            if self.level(slot) == level and self.source:
+                source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
+                yield f"u[{k}] = {source}[{self.place_of(slot)}];"
+        for k, access in enumerate(self.looped.given, self.scalars):
+            if self.level(access) == level:
+                yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"
+
+    def place_of(self, access: Access) -> str:
+        """Where an entry stands in the state."""
+        return f"start_{access.array.name} + {self.place(access)}"
+
+    def place(self, access: Access) -> str:
+        """Where an entry stands in its array, the last axis running fastest."""
+        text = ""
+        for place, axis in zip(access.places, access.array.axes, strict=True):
+            here = self.index(place)
+            first = text if text.isidentifier() or text.endswith(")") else f"({text})"
+            text = f"{first} * {size_text(axis)} + {here}" if text else here
+        return text
+
+    def index(self, place: Place) -> str:
+        """A place on an axis."""
+        if place.table:
+            columns = next(table for table in self.program.tables if table.name == place.table).axes[1].number
+            return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
+        if not place.index:
+            return size_text(place.base)
+        name, offset = f"index_{place.index}", place.base.number
+        loop = self.loops[place.index]
+        if not offset or not loop.periodic:
+            return name + (f" {'+' if offset > 0 else '-'} {abs(offset)}" if offset else "")
+        if loop is self.looped.loops[-1]:
+            return f"{name} + {_shift(place.index, offset)}"
+        return f"place_on_ring({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")
+
+    def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
+        """The nest as a function; without values nothing is evaluated."""
+        known = [*self._arrays("\n".join(lines)), *self._unknowns(), *self._parameters(values)]
+        body = [*sizes_text(self.program, "\n".join([*known, *lines])), *known, *lines]
+        text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
+        signature = wrapped(f"{head}({', '.join(arguments)})", indent=0)
+        return f"{wrapped_comment(self.looped.text)}\n{signature}\n{{\n{text}\n}}"
+
+    def _unknowns(self) -> Iterator[str]:
+        """The arguments of the kernel, if it has any."""
+        if self.source and self.looped.slots:
+            yield f"{self.scalar} u[{len(self.looped.slots)}];"
+        elif self.source:
+            yield f"const {self.scalar} u[1] = {{0}};"
+            yield f"(void){self.source};"
+
+    def _parameters(self, values: str) -> Iterator[str]:
+        """Of the kernel, and where its values go."""
+        if values:
+            yield f"{values};"
+            yield f"double parameters[{max(1, self.scalars + len(self.looped.given))}] = {{0}};"
+            yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
+
+    def _arrays(self, text: str) -> Iterator[str]:
+        """Where those begin that occur."""
+        for name, start in _starts(self.program):
+            if re.search(rf"\bstart_{name}\b", text):
+                yield f"const long long start_{name} = {start};"
+        for kind, arrays, number in (("field", self.program.fields, "double"), ("table", self.program.tables, "int")):
+            for k, array in enumerate(arrays):
+                if f"{kind}_{array.name}[" in text:
+                    yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
+
+
+def sizes_text(program: IndexedProgram, text: str) -> Iterator[str]:
+    """Declarations of the sizes that occur in a text."""
+    for k, name in enumerate(program.sizes):
+        if re.search(rf"\bsize_{name}\b", text):
+            yield f"const long long size_{name} = given->size[{k}];"
+
+
+def _first(loop: Loop) -> str:
+    return f"index_{loop.behind} + 1" if loop.behind else size_text(loop.first)
+
+
+def _shift(index: str, offset: int) -> str:
+    return f"shift_{index}_{'plus' if offset > 0 else 'minus'}_{abs(offset)}"
+
+
+def _loop(loop: Loop, first: str, end: str, lines: Sequence[str]) -> list[str]:
+    """A loop from first to the one before end."""
+    name = f"index_{loop.index}"
+    head = f"for (long long {name} = {first}; {name} < {end}; {name}++)"
+    body = [f"  {line}" for line in lines]
+    return [head, *body] if len(lines) == 1 else [f"{head} {{", *body, "}"]

@@ -1,0 +1,114 @@
+"""States of runs over arrays and their constraints: how far they are off, the nearest that is on, what holds them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
+from scvi_codegen.indices import Loop
+from scvi_codegen.native.options import STATUS
+from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
+from scvi_codegen.runtime.indexed_interface import Numbers
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.indexed_run import IndexedRun
+
+__all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "project"]
+
+
+def constraint_values(run: IndexedRun) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
+    """g, and its rate, of each constraint as it was written, an array over its loops."""
+    found = np.zeros(_count(run)), np.zeros(_count(run))
+    run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, found))
+    return _apart(run, found[0]), _apart(run, found[1])
+
+
+def multipliers(run: IndexedRun) -> tuple[Numbers, ...]:
+    """Multipliers lambda of the forces G^T lambda that keep the state on each constraint, an array over its loops."""
+    found = np.zeros(_count(run))
+    if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
+        raise StateError(f"the constraints of {run.interface.system} leave no forces here ({STATUS[status]})")
+    return _apart(run, found)
+
+
+def consistent(run: IndexedRun) -> None:
+    """Put the state a run begins with on the constraints: silently by what rounding and typing explain, or say so.
+
+    Raises:
+        StateError: if it is far off, and where there is no state near that meets them.
+    """
+    g, rate = constraint_values(run)
+    before, moved = project(run)
+    if max(moved) <= ROUNDED * np.finfo(float).eps:
+        run.state[:] = before
+    if max(moved) <= TYPED:
+        return
+    largest = [max(float(np.abs(each).max(initial=0.0)) for each in values) for values in (g, rate)]
+    said = (
+        f"the initial state is {max(moved):.1e} (relative) off the constraints: they are up to {largest[0]:.3g}, "
+        f"their rates up to {largest[1]:.3g}, not 0"
+    )
+    if max(moved) > NEAR:
+        raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
+    warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=5)
+
+
+def project(run: IndexedRun) -> tuple[Numbers, tuple[float, float]]:
+    """Put the state on the constraints; returned are the one before, and how far positions and momenta were off.
+
+    Raises:
+        StateError: where there is no state near that meets them.
+    """
+    before, report = run.state.copy(), run.problem.binding.new("report *")
+    status = run.call("project", run.problem.struct, run.problem.binding.options(run.options), report)
+    if status:
+        same = "do constraints say the same there, or contradict each other?"
+        hint = f"; {same if 'singular' in STATUS[status] else 'give positions that are nearer to them'}"
+        raise StateError(f"the constraints of {run.interface.system} cannot be met near there ({STATUS[status]}{hint})")
+    half = len(before) // 2
+    return before, (_relative(before[:half], run.state[:half]), _relative(before[half:], run.state[half:]))
+
+
+def check_reachable(run: IndexedRun) -> None:
+    """Raise :class:`StateError` where changed parameters put constraints elsewhere; momenta follow rates that jump."""
+    before, (moved, _) = project(run)
+    if moved > TYPED:
+        run.state[:] = before
+        raise StateError(
+            f"at t = {run.t:g} the constraints jump by {moved:.1e} (relative), which positions cannot follow: "
+            "parameters of constraints change without jumps"
+        )
+    run.state[: len(before) // 2] = before[: len(before) // 2]
+
+
+def _count(run: IndexedRun) -> int:
+    if not run.interface.constraints:
+        raise MethodError(f"{run.interface.system} has no constraints")
+    return sum(int(np.prod(_shape(loops, run.sizes))) for loops in run.interface.constraints)
+
+
+def _apart(run: IndexedRun, values: Numbers) -> tuple[Numbers, ...]:
+    """By constraints as they were written."""
+    found, start = [], 0
+    for loops in run.interface.constraints:
+        shape = _shape(loops, run.sizes)
+        size = int(np.prod(shape))
+        found.append(values[start : start + size].reshape(shape))
+        start += size
+    return tuple(found)
+
+
+def _shape(loops: Sequence[Loop], sizes: Mapping[str, int]) -> list[int]:
+    """An axis a loop, but one alone of two that are a pair."""
+    outer = {loop.behind for loop in loops}
+    spans = [(loop, loop.end.at(sizes) - loop.first.at(sizes)) for loop in loops if loop.index not in outer]
+    return [span * (span - 1) // 2 if loop.behind else span for loop, span in spans]
+
+
+def _relative(before: Numbers, after: Numbers) -> float:
+    size = float(max(np.abs(before).max(initial=0.0), np.abs(after).max(initial=0.0)))
+    return float(np.abs(after - before).max(initial=0.0)) / size if size > 0.0 else 0.0

@@ -1,0 +1,21 @@
+"""Values of momentum maps of arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scvi_codegen.indices import IndexedMap
+from scvi_codegen.runtime.indexed_interface import Numbers
+
+__all__ = ["momentum_of"]
+
+
+def momentum_of(q: Numbers, p: Numbers, of: IndexedMap) -> float:
+    """Of positions and momenta of one array."""
+    if of.phase:
+        return float(np.sum(q**2 + p**2) / 2)
+    if of.component is None:
+        return float(np.sum(p))
+    if of.other is None:
+        return float(np.sum(p[..., of.component]))
+    return float(np.sum(q[..., of.component] * p[..., of.other] - q[..., of.other] * p[..., of.component]))

@@ -1,0 +1,200 @@
+/* The matrix G M^-1 G^T of constraints, and systems with it by conjugate gradients, preconditioned by its incomplete
+ * factors L D L^T without fill. Of a chain or a tree whose rods are given from an end on these are the whole ones.
+ * Where constraints say a thing twice the matrix is singular, which is refused. Before it: held_pattern.h.
+ *
+ * J. A. Meijerink, H. A. van der Vorst, Math. Comp. 31 (1977). */
+
+#define LEAST_PIVOT 1e-3 /* beside the diagonal: less is what incomplete factors have lost */
+#define DEPENDENT 1e-13 /* of the matrix beside L D L^T: what is as good as 0 in a direction */
+#define GRAINS 4096.0 /* of rounding: what may be left where positions rest */
+#define SPARE_PRODUCTS 100 /* beyond as many as there are constraints, for rounding */
+
+/* The parts of held: a number a constraint each (g, g_t, multipliers, and of a system its right-hand side, which
+ * becomes the residual, its solution, three directions, its rounding, the diagonals of the matrix and of D
+ * inverted), a number an entry (slopes at the state and at another), and one a pair (the matrix, L). */
+typedef struct {
+  pattern of;
+  long long count, entries;
+  double *g, *rate, *lambda, *right, *change, *near, *way, *image, *grain, *diagonal, *pivot;
+  double *slope, *next;
+  double *entry, *factor;
+} held;
+
+static held held_of(const run_memory *run, long long n)
+{
+  held found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
+  double **const each[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.near, &found.way,
+      &found.image, &found.grain, &found.diagonal, &found.pivot};
+  double *numbers = run->held;
+  for (size_t k = 0; k < sizeof each / sizeof *each; k++, numbers += found.count)
+    *each[k] = numbers;
+  found.slope = numbers;
+  found.next = found.slope + found.entries;
+  found.entry = found.next + found.entries;
+  found.factor = found.entry + run->pairs;
+  return found;
+}
+
+/* The row of a constraint: products of slopes on the same coordinates. */
+static void find_products(const held *held, const double *inverse_mass, int k)
+{
+  const pattern *of = &held->of;
+  held->diagonal[k] = 0.0;
+  for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+    of->where[of->column[m]] = m;
+    held->entry[m] = 0.0;
+  }
+  for (int e = of->first[k]; e < of->first[k + 1]; e++) {
+    const int i = of->place[e];
+    const double weight = held->slope[e] * inverse_mass[i];
+    for (int m = of->at[i]; m < of->at[i + 1]; m++) {
+      const int f = of->list[m], l = of->owner[f];
+      if (l > k)
+        break;
+      if (l == k)
+        held->diagonal[k] += weight * held->slope[f];
+      else
+        held->entry[of->where[l]] += weight * held->slope[f];
+    }
+  }
+}
+
+/* The row of L, by those above; 0 where the diagonal is not positive. */
+static int factorise_row(const held *held, int k)
+{
+  const pattern *of = &held->of;
+  double left = held->diagonal[k];
+  for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+    const int l = of->column[m];
+    double product = held->entry[m], inverse = held->pivot[l];
+    for (int j = of->row[l]; j < of->row[l + 1]; j++) {
+      const int there = of->where[of->column[j]];
+      if (there >= 0)
+        product -= held->factor[there] * held->factor[j];
+    }
+    held->factor[m] = product; /* of L D */
+    left -= product * product * inverse;
+  }
+  for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+    held->factor[m] *= held->pivot[of->column[m]];
+    of->where[of->column[m]] = -1;
+  }
+  held->pivot[k] = 1.0 / (left > LEAST_PIVOT * held->diagonal[k] ? left : held->diagonal[k]);
+  return held->diagonal[k] > 0.0 && held->diagonal[k] < INFINITY;
+}
+
+/* The matrix of the slopes at the state; 0 where a constraint has none. */
+static int assemble(const held *held, const double *inverse_mass)
+{
+  int sound = 1;
+  for (int k = 0; k < held->count; k++) {
+    find_products(held, inverse_mass, k);
+    sound &= factorise_row(held, k);
+  }
+  return sound;
+}
+
+/* y = G M^-1 G^T x. */
+static void multiply(const held *held, const double *x, double *y)
+{
+  const pattern *of = &held->of;
+  for (int k = 0; k < held->count; k++) {
+    double sum = held->diagonal[k] * x[k];
+    for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+      sum += held->entry[m] * x[of->column[m]];
+      y[of->column[m]] += held->entry[m] * x[k];
+    }
+    y[k] = sum;
+  }
+}
+
+/* y = (L D L^T)^-1 x. */
+static void precondition(const held *held, const double *x, double *y)
+{
+  const pattern *of = &held->of;
+  for (int k = 0; k < held->count; k++) {
+    y[k] = x[k];
+    for (int m = of->row[k]; m < of->row[k + 1]; m++)
+      y[k] -= held->factor[m] * y[of->column[m]];
+  }
+  for (int k = 0; k < held->count; k++)
+    y[k] *= held->pivot[k];
+  for (int k = (int)held->count - 1; k >= 0; k--)
+    for (int m = of->row[k]; m < of->row[k + 1]; m++)
+      y[of->column[m]] -= held->factor[m] * y[k];
+}
+
+/* In four sums, one behind the other in time, not in what they wait for. */
+static double product_of(const double *x, const double *y, long long n)
+{
+  double sum[4] = {0.0, 0.0, 0.0, 0.0};
+  long long i = 0;
+  for (; i + 4 <= n; i += 4)
+    for (int k = 0; k < 4; k++)
+      sum[k] += x[i + k] * y[i + k];
+  for (; i < n; i++)
+    sum[0] += x[i] * y[i];
+  return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+/* What rounding may make of so many times G x, a constraint each. */
+static void find_grain(const held *held, const double *slope, const double *x, double scale)
+{
+  for (long long k = 0; k < held->count; k++) {
+    double terms = 0.0;
+    for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
+      terms += fabs(slope[e] * x[held->of.place[e]]);
+    held->grain[k] = DBL_EPSILON * fabs(scale) * terms;
+  }
+}
+
+/* Whether some of what is left on the right is more than its grain. */
+static int is_beyond_grain(const held *held)
+{
+  int found = 0;
+  for (long long k = 0; k < held->count; k++)
+    found |= !(fabs(held->right[k]) <= held->grain[k]);
+  return found;
+}
+
+/* right -= step image and change += step way; returned is the size of what is left, squared. */
+static double move_on(const held *held, double step)
+{
+  for (long long k = 0; k < held->count; k++) {
+    held->change[k] += step * held->way[k];
+    held->right[k] -= step * held->image[k];
+  }
+  return product_of(held->right, held->right, held->count);
+}
+
+/* change = (G M^-1 G^T)^-1 right, but for that part of right, or its grain; OK, or why there is more left. */
+static int solve_held(const held *held, double tolerance, solver_report *report)
+{
+  const long long n = held->count;
+  double size = product_of(held->right, held->right, n), slope, length; /* of the way, by L D L^T, squared */
+  const double least = tolerance * tolerance * size;
+  memset(held->change, 0, sizeof(double) * (size_t)n);
+  if (!(size < INFINITY))
+    return NOT_FINITE;
+  precondition(held, held->right, held->near);
+  memcpy(held->way, held->near, sizeof(double) * (size_t)n);
+  length = slope = product_of(held->right, held->near, n);
+  for (long long k = 0; size > least && is_beyond_grain(held); k++) {
+    double curve, again, last = slope;
+    if (k >= n + SPARE_PRODUCTS)
+      return NOT_CONVERGED;
+    multiply(held, held->way, held->image);
+    report->products++;
+    curve = product_of(held->way, held->image, n);
+    if (!(curve > DEPENDENT * length))
+      return SINGULAR;
+    size = move_on(held, slope / curve);
+    precondition(held, held->right, held->near);
+    slope = product_of(held->right, held->near, n);
+    again = slope / last;
+    length = slope + again * again * length; /* what is left is at right angles to the way */
+    for (long long i = 0; i < n; i++)
+      held->way[i] = held->near[i] + again * held->way[i];
+  }
+  return OK;
+}

@@ -1,0 +1,291 @@
+"""Constraints of sums over indices: rods and pins over tables, beside the system written out, and SciPy."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import scvi_codegen as sc
+from scvi_codegen.derivation.indexed import derive_sums
+from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, StepFailedError, SystemDefinitionError
+from scvi_codegen.models.indexed_package import generate_sums
+
+RATTLE = sc.SVI(1, "gauss-lobatto:2")
+ROUNDING = 2.0**-52
+
+
+def net(axes=2):
+    """Masses in weight, rods between them by a table, pins."""
+    return sc.IndexedSystem.from_text(
+        name="net",
+        coordinates=[f"r[N, {axes}]"],
+        parameters={"m[N]": 1, "l[B]": 1, "g": 9.81, f"x[P, {axes}]": 0},
+        tables=["bonds[B, 2]", "pins[P]"],
+        lagrangian=f"sum(i in N, m[i]*sum(a in {axes}, r_dot[i, a]**2)/2 - m[i]*g*r[i, {axes - 1}])",
+        constraints=[
+            *(f"r[pins[p], {k}] = x[p, {k}] for p in P" for k in range(axes)),
+            f"sum(a in {axes}, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = l[b]**2 for b in B",
+        ],
+    )
+
+
+def chain(count):
+    """A chain of rods that begins as a wave, pinned at one end."""
+    angles = 0.5 + 0.3 * np.sin(7 * np.linspace(0, 1, count))
+    ends = np.cumsum(np.stack([np.cos(angles), np.sin(angles)], axis=1), axis=0) / count
+    bonds = np.stack([np.arange(count), np.arange(1, count + 1)], axis=1)
+    data = {"tables": {"bonds": bonds, "pins": [0]}, "parameters": {"l": 1 / count, "m": 1 / count}}
+    return np.concatenate([[[0.0, 0.0]], ends]), data
+
+
+def cloth(side):
+    """Rods along both directions, pinned along the upper edge, at rest but for a wave of its velocity."""
+    places = np.arange(side * side).reshape(side, side)
+    x, y = np.meshgrid(np.arange(side) / side, np.arange(side) / side)
+    along, down = (np.stack(pair, axis=-1) for pair in ((places[1:, :-1], places[1:, 1:]), (places[:-1], places[1:])))
+    rows = [np.concatenate([down[k], along[k]]) for k in range(side - 1)]  # in this order factors are nearly whole
+    q = np.stack([x, 0 * x, -y], axis=-1).reshape(-1, 3)
+    velocity = np.zeros_like(q)
+    velocity[:, 1] = -np.sin(3 * q[:, 0]) * q[:, 2]
+    parameters = {"l": 1 / side, "m": 1 / side**2, "x": q[places[0]]}
+    return q, velocity, {"tables": {"bonds": np.concatenate(rows), "pins": places[0]}, "parameters": parameters}
+
+
+def residuals(run):
+    """The largest of g, and of its rate."""
+    return [max(np.abs(each).max() for each in values) for values in run.constraint_values]
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    return sc.compile_indexed(net(), RATTLE)
+
+
+def test_steps_states_and_multipliers_are_those_of_the_system_written_out(stepper):
+    q, data = chain(3)
+    small = sc.expand_sums(net(), {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))
+    other = sc.compile_stepper(small, RATTLE)
+    own = stepper.integrate(q, h=0.01, steps=100, **data)
+    expected = other.integrate(q.ravel(), np.zeros(8), h=0.01, steps=100)
+    assert np.abs(own.q["r"].reshape(101, 8) - expected.q).max() < 1e-13
+    assert np.abs(own.p["r"].reshape(101, 8) - expected.p).max() < 1e-13
+    end = own.q["r"][-1], own.p["r"][-1]
+    found = np.concatenate(stepper.start(*end, h=0.01, **data).multipliers)
+    exact = other.multipliers(end[0].ravel(), end[1].ravel())
+    assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
+
+
+def with_fields(data, count):
+    """Arrays of parameters in full."""
+    parameters = data["parameters"]
+    return {
+        "tables": data["tables"],
+        "parameters": {"l": np.full(count, parameters["l"]), "m": np.full(count + 1, parameters["m"])},
+    }
+
+
+@pytest.mark.parametrize("count", [30, 2000])
+def test_every_state_of_a_chain_meets_its_constraints(stepper, count):
+    q, data = chain(count)
+    run = stepper.start(q, h=0.05 / count, **data)
+    for _ in range(20):
+        run.advance(1)
+        g, rate = residuals(run)
+        assert g < 16 * ROUNDING / count  # of 4 terms of 2 l x
+        assert rate < 64 * ROUNDING / count
+    assert run.iterations < 20 * 20
+
+
+def test_a_chain_takes_one_product_a_correction(stepper):
+    q, data = chain(500)
+    run = stepper.start(q, h=1e-4, **data)
+    report = run.problem.binding.new("report *")
+    run.call("advance", run.problem.struct, 10, run.problem.binding.null, report)
+    assert report.products <= report.iterations
+
+
+def test_a_cloth_keeps_its_rods_and_its_energy():
+    stepper = sc.compile_indexed(net(3), "stoermer-verlet")
+    q, velocity, data = cloth(12)
+    run = stepper.start(*stepper.project(q, velocity=velocity, **data), h=0.004, **data)
+    before, kinetic, changes = run.energy, run.energies[0], []
+    for _ in range(20):
+        run.advance(50)
+        g, rate = residuals(run)
+        assert g < 64 * ROUNDING / 12
+        assert rate < 1e-13
+        changes.append(run.energy - before)
+    assert np.abs(changes).max() < 1e-3 * kinetic
+    assert np.abs(run.q["r"] - q).max() > 0.1  # it moved
+
+
+def test_compositions_have_their_order_and_keep_constraints():
+    stepper = sc.compile_indexed(net(), "composition:8")
+    q, data = chain(3)
+    exact = stepper.integrate(q, h=1 / 400, steps=400, every=400, **data).q["r"][-1]
+    errors = [
+        np.abs(stepper.integrate(q, h=1 / n, steps=n, every=n, **data).q["r"][-1] - exact).max() for n in (25, 50)
+    ]
+    assert errors[1] < 1e-7
+    assert 2.0**7 < errors[0] / errors[1] < 2.0**10
+
+
+def test_a_step_back_undoes_a_step(stepper):
+    q, data = chain(40)
+    there = stepper.start(q, h=1e-3, **data)
+    there.advance(30)
+    back = stepper.start(there.q, there.p, h=-1e-3, **data)
+    back.advance(30)
+    assert np.abs(back.q["r"] - q).max() < 1e-11
+
+
+def test_the_start_is_put_on_the_nearest_state(stepper):
+    q, data = chain(3)
+    off = q + 1e-3 * np.random.default_rng(1).normal(size=q.shape)
+    near, _ = stepper.project(off, **data)
+    lengths = {"type": "eq", "fun": lambda x: [*(np.diff(x.reshape(4, 2), axis=0) ** 2).sum(1) - 1 / 9, *x[:2]]}
+    nearest = minimize(
+        lambda x: np.sum((x - off.ravel()) ** 2), q.ravel(), constraints=[lengths], tol=1e-14, method="SLSQP"
+    )
+    assert np.abs(near["r"].ravel() - nearest.x).max() < 1e-7
+    with pytest.warns(AccuracyWarning, match=r"\(relative\) off the constraints"):
+        run = stepper.start(off, h=0.01, **data)
+    assert np.abs(run.q["r"] - near["r"]).max() < 1e-14
+    with pytest.raises(StateError, match=r"stepper\.project"):
+        stepper.start(1.02 * q, h=0.01, **data)
+
+
+def test_observed_and_restored_runs_go_on_to_the_bit(stepper):
+    q, data = chain(20)
+    one, other = (stepper.start(q, h=1e-3, **data) for _ in range(2))
+    one.advance(20)
+    for _ in range(10):
+        other.advance(1)
+        other.multipliers, other.constraint_values  # noqa: B018  (they leave what the next step begins with)
+    other = stepper.restore(other.save())
+    other.advance(10)
+    assert (one.q["r"] == other.q["r"]).all()
+    assert (one.p["r"] == other.p["r"]).all()
+
+
+def test_momentum_maps_are_those_that_constraints_leave():
+    """Free rods turn in space; pins hold them, by whose constraints nothing is kept."""
+    free = sc.IndexedSystem.from_text(
+        name="molecule",
+        coordinates=["r[N, 3]"],
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)",
+        constraints=["sum(a in 3, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = 1 for b in B"],
+    )
+    stepper = sc.compile_indexed(free, "stoermer-verlet")
+    assert len(stepper.momentum_map_names) == 6
+    assert sc.compile_indexed(net(), "stoermer-verlet").momentum_map_names == ()
+    q = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])
+    velocity = np.random.default_rng(2).normal(size=q.shape)
+    tables = {"bonds": [[0, 1], [1, 2], [2, 3]]}
+    q, p = stepper.project(q, velocity=velocity, tables=tables)
+    run = stepper.integrate(q, p, h=0.01, steps=500, every=100, tables=tables)
+    assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-13
+
+
+def test_constraints_move_in_time():
+    """A pendulum whose pivot shakes is that written out in its angle."""
+    shaken = sc.IndexedSystem.from_text(
+        name="shaken",
+        coordinates=["r[N, 2]"],
+        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",
+        constraints=["(r[i, 0] - sin(3*t)/10)**2 + r[i, 1]**2 = 1 for i in N"],
+    )
+    stepper = sc.compile_indexed(shaken, "composition:8")
+    run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, every=100)
+    angle = sc.LagrangianSystem.from_text(
+        name="angle",
+        coordinates=["a"],
+        lagrangian="((a_dot*cos(a) + 3*cos(3*t)/10)**2 + (a_dot*sin(a))**2)/2 + cos(a)",
+    )
+    exact = sc.compile_stepper(angle, "svi:8").integrate([0.0], velocity=[0.0], h=0.05, steps=40)
+    place = [np.sin(6.0) / 10 + np.sin(exact.q[-1, 0]), -np.cos(exact.q[-1, 0])]
+    assert np.abs(run.q["r"][-1, 0] - place).max() < 1e-9
+
+
+MODEL = """
+[system]
+name = "chain"
+coordinates = ["r[N, 2]"]
+lagrangian = "sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - g*r[i, 1])"
+constraints = ["r[0, 0] = 0", "r[0, 1] = 0", "sum(a in 2, (r[i+1, a] - r[i, a])**2) = 1/100 for i in 0..N-2"]
+[sizes]
+N = 6
+[parameters]
+g = 9.81
+[initial]
+q = "i*(1-j)/10"
+[method]
+method = "stoermer-verlet"
+[run]
+step = 0.01
+steps = 20
+"""
+
+
+def test_model_files_and_the_programs_made_of_them_have_constraints(tmp_path):
+    (tmp_path / "chain.toml").write_text(MODEL)
+    model = sc.load_indexed_model(tmp_path / "chain.toml")
+    run = model.integrate()
+    folder = generate_sums(model, tmp_path / "chain_c")
+    made = subprocess.run(["make", "run"], cwd=folder, capture_output=True, text=True, check=True)
+    assert "warning" not in made.stderr
+    end = np.loadtxt(folder / "end.txt")
+    assert np.abs(end[:12] - run.q["r"][-1].ravel()).max() < 1e-12
+    assert "lambda*(2*r[i+1, 0] - 2*r[i, 0])" in derive_sums(model.system, model.method)
+    with pytest.raises(MethodError, match="expand_sums"):
+        sc.verify_indexed(model.system, model.method, model.q, h=0.01)
+
+
+@pytest.mark.parametrize(
+    ("bonds", "lengths"),
+    [([[0, 1], [1, 2], [0, 1]], [1, 1, 1.001]), ([[0, 1], [1, 2], [1, 1]], [1, 1, 1])],
+    ids=["contradiction", "a rod to itself"],
+)
+def test_constraints_that_cannot_be_met_are_refused(stepper, bonds, lengths):
+    q = [[0.0, 0], [1, 0], [1, 1]]
+    with pytest.raises((StateError, StepFailedError), match=r"singular|not finite|not converged|off the constraints"):
+        stepper.start(q, h=0.01, tables={"bonds": bonds, "pins": [0]}, parameters={"l": lengths}).advance(10)
+
+
+def test_parameters_of_constraints_do_not_jump(stepper):
+    q, data = chain(3)
+    run = stepper.start(q, h=0.01, **data)
+    with pytest.raises(StateError, match="without jumps"):
+        run.change(parameters={"l": 0.5})
+    run.advance(1)
+    assert residuals(run)[0] < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("r[i, 0] = r_dot[i, 1] for i in N", "names the velocity r_dot"),
+        ("g = 1", "no coordinate"),
+        ("sum(i in N, r[i, 0]) = 1", "of a sum over a whole array"),
+        ("r[i, 0] = 1 for i in N for i in N", "one 'for'"),
+        ("r[i, 0] = 1 for i in M", "size of no array"),
+        ("r[i, 0] = 1 for i in N x", "the end is expected"),
+    ],
+)
+def test_what_is_no_constraint_is_refused(text, said):
+    with pytest.raises(SystemDefinitionError, match=said):
+        sc.IndexedSystem.from_text(
+            name="x",
+            coordinates=["r[N, 2]"],
+            parameters={"g": 1},
+            lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
+            constraints=[text],
+        )
+
+
+@pytest.mark.parametrize("method", ["svi:2", "gauss:2", sc.StoermerVerlet("drift-kick-drift")])
+def test_methods_that_do_not_keep_them_are_refused(method):
+    with pytest.raises(MethodError, match="RATTLE"):
+        sc.compile_indexed(net(), method)
