@@ -131,4 +131,5 @@ def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInt
         accesses=system.accesses,
         depends_on_time=system.depends_on_time,
         inputs=system.inputs,
+        conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
     )

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import warn_of_lost_energies
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
@@ -81,7 +82,9 @@ class Ensembles(ConstrainedStates):
                 options=options,
             )
             work.run(progress=progress, threads=threads)
-            return work.result()
+            found = work.result()
+            warn_of_lost_energies(found)
+            return found
         h, steps = steps_of_ensemble(h, steps, t_end=t_end, tolerance=tolerance, t_eval=t_eval)
         return integrate_ensemble(
             self,

@@ -41,6 +41,7 @@ class IndexedInterface:
         depends_on_time: whether energy is not conserved.
         inputs: names of functions of time given as data, each five of the parameters.
         solver: of the equations of a step, in a word.
+        conserves_energy: whether the motion of a Lagrangian does.
     """
 
     prefix: str
@@ -60,6 +61,7 @@ class IndexedInterface:
     depends_on_time: bool
     inputs: tuple[str, ...] = ()
     solver: str = "fixed-point"
+    conserves_energy: bool = False
     energy_parameter = ""
     """That of transformed time, which sums over indices do not have."""
 
