@@ -1,6 +1,7 @@
 /* A step of any number of coordinates by sweeps, for any Hamiltonian: positions and momenta y at the points follow
- * their rates there until they rest. Before it: points.h, contraction.h, the tables, coefficients.h, forces, which gives the slopes G
- * at X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand behind positions. */
+ * their rates there until they rest. Before it: points.h, contraction.h, the tables, coefficients.h, forces, which
+ * gives the slopes G at X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand
+ * behind positions. */
 
 /* The parts of work, group after group of points: y there, and slopes in this step, the last and the one before. */
 typedef struct {
