@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import TypeVar
 
 from sympy import Expr, Symbol
@@ -44,7 +45,11 @@ class LikeTerms:
 
 
 def like_terms(
-    terms: Iterable[Expr], places: Mapping[Symbol, tuple[str, int]], names: Iterable[Symbol], most: int
+    terms: Iterable[Expr],
+    places: Mapping[Symbol, tuple[str, int]],
+    names: Iterable[Symbol],
+    most: int,
+    first: Iterable[tuple[int, ...]] = repeat(()),
 ) -> tuple[LikeTerms, ...]:
     """The kinds of terms, in the order of their texts; none where they are more than ``most``.
 
@@ -53,11 +58,12 @@ def like_terms(
         places: array and place of each coordinate, velocity or momentum.
         names: of parameters.
         most: kinds.
+        first: places of each term that come before those in it: where a force acts.
     """
     shapes, known = dict[Expr, str](), set(names)
     kinds: dict[str, list[tuple[Expr, _Term]]] = {}
-    for term in terms:
-        read = _Term(places, known, shapes)
+    for term, begun in zip(terms, first, strict=False):
+        read = _Term(places, known, shapes, [*begun])
         kinds.setdefault(read.write(term), []).append((term, read))
         if len(kinds) > most:
             return ()
