@@ -39,12 +39,14 @@ from scvi_codegen.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.lowering.density import density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
+from scvi_codegen.lowering.rolled import with_sums
 from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
 from scvi_codegen.lowering.solvers.ladder import control_of
 from scvi_codegen.lowering.solvers.rattle import rattle_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.changes import with_changes
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanics.rolled import rolled
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
@@ -279,6 +281,26 @@ def program_of(
         fallback: whether Newton's iteration is to stand behind it. Time as an integral along the curve needs it there.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
+    tracked = all_symmetries(system, symmetries)
+    found = partial(
+        _program, method=method, solver=solver, prefix=name, symmetries=tracked, lanes=lanes, fallback=fallback
+    )
+    parts = rolled(system)
+    looped = with_sums(found(parts.rest), parts) if parts else None
+    return looped or found(system)
+
+
+def _program(
+    system: MechanicalSystem,
+    *,
+    method: Method,
+    solver: str,
+    prefix: str,
+    symmetries: Sequence[Symmetry],
+    lanes: bool,
+    fallback: bool,
+) -> Program:
+    """That of a system as it is written out."""
     stages = discretise(system, method)
     explicit = solver in ("auto", "explicit") and not system.integrands
     splitting = splitting_of(system, method) if explicit else None
@@ -287,17 +309,16 @@ def program_of(
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     alone = sweep is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
-    tracked = all_symmetries(system, symmetries)
     return lower(
         system,
         method,
         stages,
-        prefix=name,
+        prefix=prefix,
         sweep=sweep,
         splitting=splitting,
         newton=newton,
         rattle=rattle_of(system, stages) if solver == "auto" else None,
-        symmetries=tracked,
+        symmetries=symmetries,
     )
 
 

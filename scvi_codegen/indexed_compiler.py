@@ -135,4 +135,5 @@ def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInt
         depends_on_time=system.depends_on_time,
         inputs=system.inputs,
         constraints=tuple(term.loops for term in system.constraints),
+        conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
     )

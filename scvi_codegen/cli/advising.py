@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 import click
 
@@ -11,17 +12,19 @@ from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.frame import tell
 from scvi_codegen.cli.wording import duration
 from scvi_codegen.errors import StateError
+from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 
 __all__ = ["advised_model", "controlled_model"]
 
+AnyModel = TypeVar("AnyModel", Model, IndexedModel)
 ROUND_OFF = 2.0**-52
 MOST_STEPS = 10**9
 """More are not begun unasked: at a microsecond each these take a quarter of an hour."""
 
 
-def controlled_model(model: Model, tolerance: float) -> Model:
+def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
     """The model with steps that choose their length, each right to the tolerance, or as right as doubles allow.
 
     Raises:

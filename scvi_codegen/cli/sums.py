@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 
 from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, tell
 from scvi_codegen.cli.memory import check_states
-from scvi_codegen.cli.progress import interruptions, progress_bar
+from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.errors import StepFailedError
@@ -75,15 +76,21 @@ def run_sums(model: IndexedModel, output: str | None, plot: str | None, options:
 
 
 def _integrate(model: IndexedModel, options: SolverOptions | None) -> SumsOutcome:
-    steps, began = model.step_count, time.perf_counter()
-    check_states(sum(np.size(values) for values in model.q.values()), steps, model.every)
+    began, controlled = time.perf_counter(), model.h is None
+    steps = math.inf if controlled else model.step_count
+    if not controlled:
+        check_states(sum(np.size(values) for values in model.q.values()), model.step_count, model.every)
     stepper = model.stepper()
     run, failure = model.start(stepper, options=options), None
     preparation, began = time.perf_counter() - began, time.perf_counter()
     record = IndexedRecord(run)
-    with interruptions() as caught, progress_bar(steps) as reach:
+    with interruptions() as caught, progress_bar(PARTS if controlled else model.step_count) as reach:
+
+        def told(done: int) -> None:
+            reach(int(PARTS * (run.t - model.t) / model.covered) if controlled else done)
+
         try:
-            record.follow(steps, model.every, progress=reach, stop=lambda: bool(caught))
+            record.follow(steps, model.every, progress=told, stop=lambda: bool(caught))
         except StepFailedError as error:
             failure = error
     return SumsOutcome(
@@ -93,7 +100,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None) -> SumsOutcom
         preparation=preparation,
         seconds=time.perf_counter() - began,
         failure=failure,
-        interrupted=bool(caught) and run.steps < steps,
+        interrupted=bool(caught) and not (run.arrived or run.steps >= steps),
     )
 
 
@@ -106,7 +113,8 @@ def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
     geometry = f"{'' if method.symplectic else 'not '}symplectic, {'' if method.symmetric else 'not '}symmetric"
     yield f"{method.title}; {order}, {geometry}"
     kept = counted(len(trajectory.t), "state")
-    yield f"{counted(run.steps, 'step')} of {run.h:g} from t = {model.t:g} to t = {run.t:g}; {kept} kept"
+    lengths = "of their own lengths" if run.goal else f"of {run.h:g}"
+    yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} kept"
     if run.steps:
         each = outcome.seconds / run.steps
         yield (
@@ -157,7 +165,8 @@ def _numbers(model: IndexedModel, outcome: SumsOutcome) -> dict[str, Any]:
         "order": model.method.order,
         "sizes": run.sizes,
         "steps": run.steps,
-        "h": run.h,
+        "h": model.h,
+        "tolerance": model.tolerance,
         "states": len(trajectory.t),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

@@ -1,6 +1,7 @@
-"""Forces on arrays read from text: on an entry whose indices run over whole axes, or at a single place.
+"""Forces on arrays read from text: at all places of an axis, at a single one, at those in a table.
 
-target   = array "[" (index | size | whole number) ("," ..)* "]"        q[i], r[i, a], q[0], q[N-1]
+target   = array "[" (index | size | whole number | entry) ("," ..)* "]"        q[i], r[i, a], q[0], q[N-1]
+entry    = table "[" index ("," whole number)? "]"                            q[pins[p]], r[bonds[b, 1], a]
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def parse_force(
     symbols: Mapping[str, Symbol],
     tables: Sequence[Array] = (),
 ) -> tuple[IndexedForce, ...]:
-    """Read the force on ``q[i]``, every place of an axis, or on a single place, ``q[0]``.
+    """Read the force on ``q[i]``, every place of an axis, on a single place, ``q[0]``, or on those of a table.
 
     Args:
         target: what it acts on.
@@ -60,7 +61,7 @@ def parse_force(
     >>> [str(force) for force in parse_force("q[i]", "-c*q_dot[i]", [q], [q, v], {"c": symbol("c")})]
     ['-c*q_dot[i] on q[i] for i in N']
     """
-    reader = _Target(target, {}, coordinates, ())
+    reader = _Target(target, {}, coordinates, tables)
     bounds = reader.read()
     rows: list[dict[str, Bound]] = [{}]
     for name, axis in bounds.items():
@@ -92,12 +93,27 @@ class _Target(IndexedParser):
             if number:
                 self.expect(",")
             place = self.peek()
-            if place.kind != "name" or place.text in self.sizes:
+            if place.text in self.tables:
+                self.row(self.tables[self.take_name("a table").text], bounds)
+            elif place.kind != "name" or place.text in self.sizes:
                 self.size()
-                continue
-            self.check_index(place)
-            if place.text in bounds:
-                self.refuse(f"the index '{place.text}' stands for two axes", place.column)
-            bounds[self.take_name("an index").text] = axis
+            else:
+                self.index_along(axis, bounds)
         self.expect("]")
         return bounds
+
+    def row(self, table: Array, bounds: dict[str, Size]) -> None:
+        """``[b, 0]`` of a table, whose rows are those of a loop."""
+        self.expect("[")
+        self.index_along(table.axes[0], bounds)
+        if self.accept(","):
+            self.size()
+        self.expect("]")
+
+    def index_along(self, axis: Size, bounds: dict[str, Size]) -> None:
+        """An index of its own along an axis."""
+        place = self.peek()
+        self.check_index(place)
+        if place.text in bounds:
+            self.refuse(f"the index '{place.text}' stands for two axes", place.column)
+        bounds[self.take_name("an index").text] = axis

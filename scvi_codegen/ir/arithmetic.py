@@ -60,8 +60,8 @@ DEEPEST_EXPRESSION = 24
 class _Graph:
     """Hash-consed arithmetic: ``nodes[k]`` is a leaf or (operator, operand ids)."""
 
-    def __init__(self, loads: Mapping[sympy.Symbol, Load]) -> None:
-        self.loads = loads
+    def __init__(self, loads: Mapping[sympy.Symbol, Load], given: Sequence[sympy.Symbol]) -> None:
+        self.loads, self.given = loads, set(given)
         self.nodes: list[Constant | Load | tuple[str, tuple[int, ...]]] = []
         self._ids: dict[Constant | Load | tuple[str, tuple[int, ...]], int] = {}
         self._read: dict[sympy.Expr, int] = {}
@@ -197,7 +197,7 @@ class _Graph:
         if self.is_constant(factor):
             return (0, self.read(factor))
         if isinstance(factor, sympy.Symbol):
-            return (1 if self.loads[factor].source == "parameters" else 3, self.read(factor))
+            return (1 if factor in self.given else 3, self.read(factor))
         return (2, self.read(factor))
 
 
@@ -209,12 +209,13 @@ def lower_kernel(
     parameters: Sequence[sympy.Symbol],
     values: Sequence[sympy.Expr],
     slopes: Sequence[sympy.Expr] = (),
+    constants: int = 0,
 ) -> Kernel:
-    """One kernel with all its results sharing their common parts."""
+    """One kernel with all its results sharing their common parts; so many of the last arguments are constants."""
     loads = {symbol: Load("u", i) for i, symbol in enumerate(arguments)}
     loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
     loads[time] = Load("t", -1)
-    graph = _Graph(loads)
+    graph = _Graph(loads, (*parameters, *arguments[len(arguments) - constants :]))
     roots = [graph.read(expression) for expression in (*values, *slopes)]
     temporaries, results = _linearise(graph, roots)
     return Kernel(

@@ -9,7 +9,7 @@ stand in a loop over a table of places (:class:`IndexedSum`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from scvi_codegen.ir.numbers import Number
@@ -74,6 +74,11 @@ class Kernel:
     def __post_init__(self) -> None:
         for each in self.sums:
             each.check(self)
+
+    def with_sums(self, sums: tuple[IndexedSum, ...]) -> Kernel:
+        """The same with further loops, whose terms are called after the kernel."""
+        named = (replace(each, term=replace(each.term, name=f"{self.name}_{each.term.name}")) for each in sums)
+        return replace(self, sums=(*self.sums, *named))
 
     @property
     def functions(self) -> tuple[Kernel, ...]:
@@ -140,32 +145,46 @@ class Kernel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedSum:
-    """A kernel in a loop over an index table: for every row e, value[table[e][a]] += term_a(u[table[e][0]], ...).
+    """A kernel in a loop over an index table: for every row e, value[targets[e][a]] += term_a(u[table[e][..]], ...).
 
-    Rows are taken in order, the slots a of a row in order, so that a loop and the same terms written out one after the
-    other (:func:`scvi_codegen.ir.unrolled.unrolled`) round alike. A place may occur in a row twice. The length of the
-    code depends on the term, not on the number of rows; time and parameters are those of the kernel.
+    Rows are taken in order, the targets a of a row in order, so that a loop and the same terms written out one after
+    the other (:func:`scvi_codegen.ir.unrolled.unrolled`) round alike. A place may occur in a row twice. The length of
+    the code depends on the term, not on the number of rows; time and parameters are those of the kernel.
 
     Attributes:
-        term: a kernel of as many values as arguments (slots), without slopes and without loops of its own.
-        table: (rows, slots) places in ``u``, which are also those in the values.
+        term: a kernel of as many arguments as slots and constants, of as many values as targets, without slopes and
+            without loops of its own.
+        table: (rows, slots) places in ``u``.
+        given: (constants, rows) what the arguments behind the slots are: numbers, or parameters.
+        targets: (rows, values) places in the values; by default those in ``u``.
     """
 
     term: Kernel
     table: tuple[tuple[int, ...], ...]
+    given: tuple[tuple[Constant | Load, ...], ...] = ()
+    targets: tuple[tuple[int, ...], ...] = ()
+
+    @property
+    def aims(self) -> tuple[tuple[int, ...], ...]:
+        """The targets, also where they are those of the table."""
+        return self.targets or self.table
 
     def check(self, kernel: Kernel) -> None:
-        """Raise ``ValueError`` for a term or a table that does not fit a kernel."""
-        term, places = self.term, min(kernel.arguments, kernel.values)
-        if term.sums or not term.arguments == term.values == len(term.results):
-            raise ValueError(f"the term '{term.name}' has not as many values as arguments, or has slopes or loops")
-        for row in self.table:
-            if len(row) != term.arguments or not all(0 <= place < places for place in row):
-                raise ValueError(f"'{term.name}' takes {term.arguments} places below {places}, not {row}")
+        """Raise ``ValueError`` for a term or tables that do not fit a kernel."""
+        term, slots = self.term, self.term.arguments - len(self.given)
+        if term.sums or term.values != len(term.results) or not (self.targets or slots == term.values):
+            raise ValueError(f"the term '{term.name}' has not as many values as targets, or has slopes or loops")
+        for rows, width, most in ((self.table, slots, kernel.arguments), (self.aims, term.values, kernel.values)):
+            for row in rows:
+                if len(row) != width or not all(0 <= place < most for place in row):
+                    raise ValueError(f"'{term.name}' takes {width} places below {most}, not {row}")
+        if len({len(self.table), len(self.aims), *map(len, self.given)}) > 1:
+            raise ValueError(f"the tables of '{term.name}' are not of equal length")
 
     def __str__(self) -> str:
         """One line: the loop."""
-        return f"value[table[e][a]] += {self.term.name}(u[table[e]])[a], e < {len(self.table)}"
+        given, aims = ", given[..][e]" * bool(self.given), "targets" if self.targets else "table"
+        return f"value[{aims}[e][a]] += {self.term.name}(u[table[e]]{given})[a], e < {len(self.table)}"
 
 
 def loads(expression: Expression) -> Iterator[Load]:

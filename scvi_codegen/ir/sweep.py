@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import ClassVar
 
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
 __all__ = ["GuessTables", "Kept", "Sweep", "SweepTable"]
@@ -101,6 +101,10 @@ class Sweep(ABC):
     @abstractmethod
     def memory(self, dimension: int) -> int:
         """Numbers kept from step to step."""
+
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Sweep | None:
+        """The same with further forces L_q of positions; ``None`` where these enter in other ways, too."""
+        return None
 
     @property
     def facts(self) -> Mapping[str, int]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.sweep import GuessTables, Kept, Sweep, SweepTable
 
@@ -99,6 +99,10 @@ class SeparableSweep(Sweep):
         """The forces at the points in the last two steps."""
         return 2 * dimension * self.lanes
 
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> SeparableSweep:
+        """See :meth:`Sweep.with_forces`."""
+        return replace(self, force=self.force.with_sums(forces))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointSweep(Sweep):
@@ -163,6 +167,10 @@ class PointSweep(Sweep):
         """Whether time occurs in a kernel with lanes."""
         return any(kernel.uses_time for kernel in self.kernels)
 
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self:
+        """See :meth:`Sweep.with_forces`."""
+        return replace(self, force=self.force.with_sums(forces))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoupledSweep(PointSweep):
@@ -187,6 +195,10 @@ class CoupledSweep(PointSweep):
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
         return 2 * dimension * self.lanes
+
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self:
+        """In both kernels: positions come first in the arguments, forces in the values."""
+        return replace(self, kernel=self.kernel.with_sums(forces), force=self.force.with_sums(forces))
 
     @property
     def projected(self) -> bool:

@@ -13,23 +13,24 @@ def unrolled(kernel: Kernel) -> Kernel:
     """The kernel without loops; where compilers contract nothing, both round alike."""
     temporaries, results = list(kernel.temporaries), list(kernel.results)
     for each in kernel.sums:
-        for row in each.table:
-            terms = _placed(each, row, temporaries)
-            for place, term in zip(row, terms, strict=True):
+        for number, aims in enumerate(each.aims):
+            terms = _placed(each, number, temporaries)
+            for place, term in zip(aims, terms, strict=True):
                 temporaries.append(Operation("+", (results[place], term)))
                 results[place] = Load("w", len(temporaries) - 1)
     return replace(kernel, temporaries=tuple(temporaries), results=tuple(results), sums=())
 
 
-def _placed(each: IndexedSum, row: tuple[int, ...], temporaries: list[Expression]) -> list[Expression]:
+def _placed(each: IndexedSum, number: int, temporaries: list[Expression]) -> list[Expression]:
     """What a row of the table gives; the temporaries that it needs are appended."""
     first = len(temporaries)
+    arguments = (*(Load("u", place) for place in each.table[number]), *(column[number] for column in each.given))
 
     def placed(expression: Expression) -> Expression:
         if isinstance(expression, Operation):
             return Operation(expression.operator, tuple(map(placed, expression.operands)))
         if isinstance(expression, Load) and expression.source == "u":
-            return Load("u", row[expression.index])
+            return arguments[expression.index]
         if isinstance(expression, Load) and expression.source == "w":
             return Load("w", first + expression.index)
         return expression

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import tee
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,7 @@ def singular_part(
         rows = {row for row, _ in entries}
         missing = tuple(variable for index, variable in enumerate(variables) if index not in rows)
         return missing, {}
+    points = sample_points(variables, others, constants)
     for block in coupled_blocks(entries, size):
         local = {
             (i, j): entries[row, column]
@@ -59,7 +61,8 @@ def singular_part(
             for j, column in enumerate(block)
             if (row, column) in entries
         }
-        if _is_singular(local, len(block), sample_points(variables, others, constants)):
+        points, same = tee(points)  # drawn once, as far as they are asked for
+        if _is_singular(local, len(block), same):
             return tuple(variables[index] for index in block), local
     return None
 

@@ -29,8 +29,8 @@
     method = "svi:4"
 
     [run]
-    step = 0.1
-    span = 100.0                                        # or steps
+    step = 0.1                                          # or tolerance = 1e-9 (0, and without both: round-off): steps
+    span = 100.0                                        # that choose their length; or steps of h
     every = 10
 
 Hamiltonians, and sections laid over others, are as there.
@@ -66,6 +66,7 @@ from scvi_codegen.models.sections import (
     laid_over,
     names_of,
     read_method,
+    read_run,
     required,
     text_of,
 )
@@ -75,13 +76,13 @@ __all__ = ["read_indexed"]
 KEYS = {
     "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "constraints"),
     "initial": ("q", "p", "q_dot", "t"),
-    "run": ("step", "span", "steps", "every"),
+    "run": ("step", "tolerance", "span", "steps", "every"),
 }
 SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
 OTHERS = {
     "": ("inputs",),
     "system": ("inputs", "catalogue", "monitor"),
-    "run": ("tolerance", "controller"),
+    "run": ("controller",),
 }
 """What other models have."""
 GROUPS = ("q", "p", "q_dot", "parameters", "tables")
@@ -136,7 +137,7 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
         parameters=groups["parameters"],
         tables={name: _whole(values, f"[tables] {name}") for name, values in groups["tables"].items()},
         document=document,
-        **_read_run(document.get("run", {})),
+        **read_run(document.get("run", {})),
     )
 
 
@@ -244,16 +245,3 @@ def _whole(values: Any, where: str) -> Any:
     if not np.array_equal(whole, values):
         raise ModelFileError(f"{where} must be whole numbers")
     return whole
-
-
-def _read_run(section: Section) -> dict[str, Any]:
-    check_one(section, "run", "span", "steps")
-    if "span" not in section and "steps" not in section:
-        raise ModelFileError("there is no span or steps in [run]")
-    found: dict[str, Any] = {"h": real(required(section, "step", "[run]"), "[run] step")}
-    if "span" in section:
-        found["span"] = real(section["span"], "[run] span")
-    for name, least in (("steps", 0), ("every", 1)):
-        if name in section:
-            found[name] = checked_count(section[name], f"[run] {name}", least=least, error=ModelFileError)
-    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.kinds import check_kind
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import check_step, real, steps_in
+from scvi_codegen.models.model import check_controlled, check_one_of, check_step, real, steps_in
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -31,8 +32,9 @@ class IndexedModel:
         method: how its motion is discretised.
         q: initial positions by the name of their array; their shapes are the sizes.
         p, velocity: initial momenta or velocities by the same names, one of both; or neither: 0.
-        h: step, not 0, negative for a run backward.
-        span: length of time, positive, or ``None`` if ``steps`` is given.
+        h: step, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given.
+        tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off.
+        span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps, or ``None`` if ``span`` is given.
         every: distance between kept states in steps.
         t: initial time.
@@ -47,7 +49,8 @@ class IndexedModel:
     system: IndexedSystem
     method: Method
     q: Mapping[str, Any]
-    h: float
+    h: float | None = None
+    tolerance: float | None = None
     p: Mapping[str, Any] | None = None
     velocity: Mapping[str, Any] | None = None
     span: float | None = None
@@ -62,27 +65,45 @@ class IndexedModel:
         check_kind(INDEXED, self.system, "system", ModelFileError)
         if self.p is not None and self.velocity is not None:
             raise ModelFileError("give p or velocity (q_dot), not both")
-        if (self.span is None) == (self.steps is None):
-            raise ModelFileError("give exactly one of span and steps")
-        for name in ("h", "t"):
-            object.__setattr__(self, name, real(getattr(self, name), name))
-        if self.span is not None:
-            object.__setattr__(self, "span", real(self.span, "span"))
-        check_step(self.h, self.span)
+        check_one_of("h (step)", self.h, "tolerance", self.tolerance)
+        check_one_of("span", self.span, "steps", self.steps)
+        for name in ("h", "tolerance", "t", "span"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, real(value, name))
+        if self.h is None:
+            check_controlled(self.tolerance, self.span)
+        else:
+            check_step(self.h, self.span)
         if self.steps is not None:
             checked_count(self.steps, "steps", least=0, error=ModelFileError)
         checked_count(self.every, "every", least=1, error=ModelFileError)
 
     def __repr__(self) -> str:
-        return f"<IndexedModel of {self.system.name}: {self.method.name}, {self.step_count} steps of {self.h:g}>"
+        steps = f"span {self.span:g}" if self.h is None else f"{self.step_count} steps of {self.h:g}"
+        return f"<IndexedModel of {self.system.name}: {self.method.name}, {steps}>"
+
+    @property
+    def step(self) -> float:
+        """The step h, for what works with steps of one length; ModelFileError where there is none."""
+        if self.h is None:
+            raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
+        return self.h
 
     @property
     def step_count(self) -> int:
-        """Number of steps: ``steps``, or the whole number (at least 1) of steps nearest to ``span``."""
+        """Number of steps of h: ``steps``, or the whole number (at least 1) of steps nearest to ``span``."""
         if self.steps is not None:
             return self.steps
         assert self.span is not None  # by construction
-        return steps_in(self.span, self.h)
+        return steps_in(self.span, self.step)
+
+    @property
+    def covered(self) -> float:
+        """The span of time, negative for a run backward."""
+        if self.h is None:
+            assert self.span is not None  # by construction
+            return self.span
+        return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
 
     def stepper(self) -> IndexedStepper:
         """Compiled for runs of any size; raises as :func:`~scvi_codegen.compile_indexed`."""
@@ -92,12 +113,19 @@ class IndexedModel:
 
     def start(self, stepper: IndexedStepper | None = None, *, options: SolverOptions | None = None) -> IndexedRun:
         """The run of this model from its initial state; raises as :meth:`IndexedStepper.start`."""
-        return (stepper or self.stepper()).start(**self._beginning, h=self.h, options=options)
+        return (stepper or self.stepper()).start(**self._beginning, **self._lengths, options=options)
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """All of it; raises as :meth:`IndexedStepper.integrate`."""
-        stepper, steps = self.stepper(), self.step_count
-        return stepper.integrate(**self._beginning, h=self.h, steps=steps, every=self.every, progress=progress)
+        lengths = self._lengths if self.h is None else {**self._lengths, "steps": self.step_count}
+        return self.stepper().integrate(**self._beginning, **lengths, every=self.every, progress=progress)
+
+    @property
+    def _lengths(self) -> dict[str, Any]:
+        """Of steps: the one of all, or where those lead that choose theirs."""
+        if self.h is not None:
+            return {"h": self.h}
+        return {"t_end": self.t + self.covered, "tolerance": self.tolerance or None}
 
     @property
     def _beginning(self) -> dict[str, Any]:

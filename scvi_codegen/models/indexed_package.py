@@ -57,7 +57,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
         tables={f"table_{name}": values.size for name, values in problem.places.items()},
         moving=moving if moving in arrays else "",
         constraints=bool(interface.constraints),
-        run={"t": model.t, "h": model.h, "steps": model.step_count, "every": model.every},
+        run={"t": model.t, "h": model.step, "steps": model.step_count, "every": model.every},
     )
     texts = {**source.files, **example, **{f"{name}.txt": _lines(values) for name, values in arrays.items()}}
     texts |= model_texts(model)

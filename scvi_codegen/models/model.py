@@ -26,7 +26,16 @@ if TYPE_CHECKING:
     from scvi_codegen.runtime.run import Run
     from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["DEFAULT_METHOD", "Model", "check_length", "check_step", "real", "steps_in"]
+__all__ = [
+    "DEFAULT_METHOD",
+    "Model",
+    "check_controlled",
+    "check_length",
+    "check_one_of",
+    "check_step",
+    "real",
+    "steps_in",
+]
 
 DEFAULT_METHOD = SVI(8)
 """What the problems of the catalogue are integrated with unless another method is chosen."""
@@ -77,9 +86,9 @@ class Model:
     def __post_init__(self) -> None:
         check_kind(SYSTEM, self.system, "system", ModelFileError)
         object.__setattr__(self, "method", as_method(self.method, self.system))
-        _check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
-        _check_one_of("h (step)", self.h, "tolerance", self.tolerance)
-        _check_one_of("span", self.span, "steps", self.steps)
+        check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
+        check_one_of("h (step)", self.h, "tolerance", self.tolerance)
+        check_one_of("span", self.span, "steps", self.steps)
         for name in ("q", "p", "velocity"):
             if (vector := getattr(self, name)) is not None:
                 object.__setattr__(self, name, self._vector(name, vector))
@@ -251,18 +260,9 @@ class Model:
                 "not steps), of a system whose time is not transformed"
             )
         if self.h is None:
-            self._check_tolerance()
+            check_controlled(self.tolerance, self.span)
             return
         check_step(self.h, self.span)
-
-    def _check_tolerance(self) -> None:
-        assert self.tolerance is not None  # by construction
-        if not 0.0 <= self.tolerance < 1.0:
-            raise ModelFileError(f"tolerance is {self.tolerance:g}: a relative error below 1, or 0 for round-off")
-        if self.span is None:
-            raise ModelFileError("steps that choose their length (tolerance) have no number: give span, not steps")
-        if self.span == 0.0:
-            raise ModelFileError("span is 0: it is a length of time, negative to go back")
 
     def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:
         names = [coordinate.name for coordinate in self.system.coordinates]
@@ -284,6 +284,16 @@ def check_step(h: float, span: float | None) -> None:
         )
 
 
+def check_controlled(tolerance: float | None, span: float | None) -> None:
+    """Refuse what cannot be the tolerance and the span of steps that choose their length."""
+    if tolerance is None or not 0.0 <= tolerance < 1.0:
+        raise ModelFileError(f"tolerance is {tolerance}: a relative error below 1, or 0 for round-off")
+    if span is None:
+        raise ModelFileError("steps that choose their length (tolerance) have no number: give span, not steps")
+    if span == 0.0:
+        raise ModelFileError("span is 0: it is a length of time, negative to go back")
+
+
 def steps_in(span: float, h: float) -> int:
     """The whole number (at least 1) of steps nearest to a length of time."""
     return max(1, round(span / abs(h)))
@@ -296,7 +306,8 @@ def check_length(values: Sequence[object], names: Sequence[str], where: str) -> 
         raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
 
 
-def _check_one_of(one: str, first: object, other: str, second: object) -> None:
+def check_one_of(one: str, first: object, other: str, second: object) -> None:
+    """Refuse both of two fields, and neither."""
     if (first is None) == (second is None):
         raise ModelFileError(f"give exactly one of {one} and {other}")
 

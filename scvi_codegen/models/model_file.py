@@ -65,7 +65,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
@@ -89,6 +88,7 @@ from scvi_codegen.models.sections import (
     laid_over,
     names_of,
     read_method,
+    read_run,
     required,
     text_of,
 )
@@ -245,7 +245,7 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     state = _read_state(document["initial"], system)
     method = read_method(fitted(document["method"], system))
     inputs = _read_inputs(document.get("inputs", {}), folder)
-    return Model(system=system, method=method, monitor=monitor, inputs=inputs, **state, **_read_run(document["run"]))
+    return Model(system=system, method=method, monitor=monitor, inputs=inputs, **state, **read_run(document["run"]))
 
 
 def _with_own_step(layer: Document) -> Document:
@@ -345,20 +345,3 @@ def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> dict[str, 
     from scvi_codegen.models.input_files import read_input  # here: other models are read without NumPy
 
     return {name: read_input(name, entry, folder) for name, entry in section.items()}
-
-
-def _read_run(section: Section) -> dict[str, Any]:
-    check_one(section, "run", "step", "tolerance")
-    check_one(section, "run", "span", "steps")
-    fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
-    found: dict[str, Any] = {
-        field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
-    }
-    if not {"step", "tolerance"} & section.keys():
-        if "steps" in section:
-            raise ModelFileError("[run] has steps and no step, which says how long they are")
-        found["tolerance"] = 0.0
-    if "steps" in section:
-        found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
-    found["every"] = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
-    return found

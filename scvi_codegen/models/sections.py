@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
+from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
-from scvi_codegen.models.model import DEFAULT_METHOD
+from scvi_codegen.models.model import DEFAULT_METHOD, real
 
 __all__ = [
     "Document",
@@ -19,6 +20,7 @@ __all__ = [
     "laid_over",
     "names_of",
     "read_method",
+    "read_run",
     "required",
     "text_of",
 ]
@@ -135,3 +137,21 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
         return build()
     except (ScviCodegenError, TypeError) as error:
         raise ModelFileError(f"{where}: {error}") from error
+
+
+def read_run(section: Section) -> dict[str, Any]:
+    """The fields of a model that ``[run]`` gives; without a step its steps choose their length."""
+    check_one(section, "run", "step", "tolerance")
+    check_one(section, "run", "span", "steps")
+    fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
+    found: dict[str, Any] = {
+        field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
+    }
+    if not {"step", "tolerance"} & section.keys():
+        if "steps" in section:
+            raise ModelFileError("[run] has steps and no step, which says how long they are")
+        found["tolerance"] = 0.0
+    if "steps" in section:
+        found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
+    found["every"] = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
+    return found

@@ -5,15 +5,15 @@ A kernel that is cut calls its parts, functions of their own with the arguments 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from scvi_codegen.ir.kernel import IndexedSum, Kernel
+from scvi_codegen.ir.kernel import Constant, IndexedSum, Kernel, Load
 from scvi_codegen.ir.parts import Part, parts
 from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.rendering.lanes import Lanes
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
-from scvi_codegen.rendering.target import Target
+from scvi_codegen.rendering.target import DOUBLE, Target
 
 __all__ = ["kernel_text", "lane_kernel_text", "lane_mass_text"]
 
@@ -30,7 +30,7 @@ def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
     declared |= {"u": f"const {real} *u", "t": f"{real} t", "parameters": f"const {real} *parameters"}
     declared["kept"] = f"{real} *restrict kept"
     texts = [_function(PART, part, _used(part, declared), print_statements(part, target)) for part in _parts(kernel)]
-    texts += [text for each in kernel.sums for text in (kernel_text(each.term, target), _places(kernel, each))]
+    texts += [text for each in kernel.sums for text in (kernel_text(each.term, target), *_tables(each, target))]
     arguments = _arguments(kernel, declared, slopes=slopes)
     statements = [*print_statements(kernel, target), *_loops(kernel, real)]
     return "\n\n".join([*texts, _whole("static", kernel, arguments, statements)])
@@ -47,9 +47,9 @@ def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
         for part in _parts(kernel)
     ]
     texts += [
-        text for each in kernel.sums for text in (lane_kernel_text(each.term, sweep, lanes), _places(kernel, each))
+        text for each in kernel.sums for text in (lane_kernel_text(each.term, sweep, lanes), *_tables(each, DOUBLE))
     ]
-    statements = [*print_lane_statements(kernel, sweep, sources), *_loops(kernel, "lanes")]
+    statements = [*print_lane_statements(kernel, sweep, sources), *_loops(kernel, "lanes", sources)]
     return "\n\n".join([*texts, _whole("static inline", kernel, _arguments(kernel, declared), statements)])
 
 
@@ -58,33 +58,55 @@ def lane_mass_text(kernel: Kernel, sweep: Sweep, lanes: Lanes, target: Target) -
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, sweep, lanes)
 
 
-def _table_name(kernel: Kernel, each: IndexedSum) -> str:
-    return f"{kernel.name}_{each.term.name}".upper()
+def _table_name(each: IndexedSum, what: str) -> str:
+    return f"{each.term.name}_{what}".upper()
 
 
-def _places(kernel: Kernel, each: IndexedSum) -> str:
-    """The index table of a loop."""
-    rows = [list(map(str, row)) for row in each.table]
-    return table(f"static const int {_table_name(kernel, each)}[{len(rows)}][{each.term.arguments}]", rows)
+def _tables(each: IndexedSum, target: Target) -> Iterator[str]:
+    """The index tables of a loop, and the constants of its rows."""
+    yield _rows(_table_name(each, "places"), each.table)
+    if each.targets:
+        yield _rows(_table_name(each, "targets"), each.targets)
+    for k, column in enumerate(each.given):
+        numbers = [target.number(one.value) for one in column if isinstance(one, Constant)]
+        places = [str(one.index) for one in column if isinstance(one, Load)]
+        kind, name = target.scalar if numbers else "int", _table_name(each, f"given_{k}")
+        yield table(f"static const {kind} {name}[{len(column)}]", numbers or places)
 
 
-def _loops(kernel: Kernel, real: str) -> list[str]:
+def _rows(name: str, rows: Sequence[Sequence[int]]) -> str:
+    return table(f"static const int {name}[{len(rows)}][{len(rows[0])}]", [list(map(str, row)) for row in rows])
+
+
+def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
     """Statements of loops: slots are gathered, the term is evaluated, what it gives is added."""
     lines = []
     for each in kernel.sums:
-        slots = each.term.arguments
+        slots, values = len(each.table[0]), each.term.values
+        aims = _table_name(each, "targets" if each.targets else "places")
+        given = [_constant(each, k, real, sources) for k in range(len(each.given))]
         lines += [
             f"for (int e = 0; e < {len(each.table)}; e++) {{",
-            f"  const int *at = {_table_name(kernel, each)}[e];",
-            f"  {real} slot[{slots}], term[{slots}];",
+            f"  const int *at = {_table_name(each, 'places')}[e], *to = {aims}[e];",
+            f"  {real} slot[{each.term.arguments}], term[{values}];",
             f"  for (int a = 0; a < {slots}; a++)",
             "    slot[a] = u[at[a]];",
+            *(f"  slot[{slots + k}] = {text};" for k, text in enumerate(given)),
             f"  {each.term.name}(slot, t, parameters, term);",
-            f"  for (int a = 0; a < {slots}; a++)",
-            "    value[at[a]] += term[a];",
+            f"  for (int a = 0; a < {values}; a++)",
+            "    value[to[a]] += term[a];",
             "}",
         ]
     return lines
+
+
+def _constant(each: IndexedSum, k: int, real: str, sources: Sequence[str]) -> str:
+    """What a row is given for its k-th constant."""
+    entry = f"{_table_name(each, f'given_{k}')}[e]"
+    is_number = isinstance(each.given[k][0], Constant)
+    text = entry if is_number else f"parameters[{entry}]"
+    alike = real == "lanes" and (is_number or "parameters" not in sources)
+    return f"lanes_of({text})" if alike else text
 
 
 def _parts(kernel: Kernel) -> tuple[Part, ...]:

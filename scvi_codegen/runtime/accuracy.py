@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
@@ -17,12 +19,36 @@ from scvi_codegen.runtime.goal import Goal
 if TYPE_CHECKING:
     from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["TOLERABLE_ERROR", "unwarned", "warn_of_long_steps", "warn_of_lost_energy"]
+__all__ = [
+    "GROSS_ERROR",
+    "MET",
+    "TOLERABLE_ERROR",
+    "unwarned",
+    "warn_of_energies",
+    "warn_of_long_steps",
+    "warn_of_lost_energies",
+    "warn_of_lost_energy",
+]
 
 TOLERABLE_ERROR: Final = 1e-3
 """Of a step, relative to the state: one that is wrong by more is too long for its motion; and of a run's energy."""
 
 CONTROLLED: Final = ", or steps that choose their length (t_end= with a tolerance)"
+
+GROSS_ERROR: Final = 0.5
+"""Of the energy of a run by steps of one length that tell no error; it swings by less while these are short enough."""
+
+MOST_ASKED: Final = 1000
+"""Trajectories of an ensemble."""
+
+MAGNIFIED: Final = (
+    "though each step was as accurate as wanted: the motion magnifies errors, as near collisions do; take a smaller "
+    "tolerance, or coordinates in which nothing collides"
+)
+MET: Final = (
+    "though the motion conserves it: steps are too long, perhaps where bodies nearly meet; take a shorter h, or an SVI "
+    "by steps that choose their length (t_end=)"
+)
 
 Array = NDArray[np.float64]
 
@@ -59,6 +85,18 @@ class EnergyAtEnds(Protocol):
     def parameters(self) -> Array: ...
 
 
+class StatesOfMany(Protocol):
+    """What an ensemble tells of its trajectories: times, positions, momenta, status and steps of each."""
+
+    @property
+    def goals(self) -> tuple[Goal, ...]: ...
+    @property
+    def stepper(self) -> Integrator: ...
+    @property
+    def parameters(self) -> Array: ...
+    def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]: ...
+
+
 @contextmanager
 def unwarned() -> Iterator[None]:
     """Inside, and in functions that this decorates, long steps are made on purpose."""
@@ -84,25 +122,58 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
 
 
 def warn_of_lost_energy(trajectory: EnergyAtEnds) -> None:
-    """An :class:`AccuracyWarning` where steps chose their length and the energy that the motion conserves is another.
-
-    Each step was as accurate as wanted; past a near collision, say, the motion magnifies what is left. The size of an
-    energy is that of p.v where it is larger, so that one near zero has a size.
-    """
+    """An :class:`AccuracyWarning` where steps chose their length and the energy that is conserved is another."""
     goal, stepper = trajectory.goal, trajectory.stepper
     if goal is None or goal.tau or not stepper.interface.conserves_energy or not _heard.get():
         return
-    ends = trajectory.q[[0, -1]], trajectory.p[[0, -1]], trajectory.t[[0, -1]], trajectory.parameters
+    ends = trajectory.t[[0, -1]], trajectory.q[[0, -1]], trajectory.p[[0, -1]]
+    if energies := _energies(stepper, *ends, trajectory.parameters):
+        warn_of_energies(*energies)
+
+
+def warn_of_lost_energies(ensemble: StatesOfMany) -> None:
+    """The same of an ensemble: of the worst of its trajectories, of which so many are asked."""
+    goals, stepper = ensemble.goals, ensemble.stepper
+    if not goals or not stepper.interface.conserves_energy or not _heard.get():
+        return
+    found = {}
+    for j, (t, q, p, _, _) in islice(enumerate(ensemble.each()), 0, None, -(-len(goals) // MOST_ASKED)):
+        if len(t) and (energies := _energies(stepper, t[[0, -1]], q[[0, -1]], p[[0, -1]], ensemble.parameters[j])):
+            found[j] = energies
+    worst = max(found, key=lambda j: lost_part(*found[j]), default=None)
+    if worst is not None:
+        warn_of_energies(*found[worst], where=f" of trajectory {worst}")
+
+
+def warn_of_energies(
+    first: float, last: float, size: float, *, tolerable: float = TOLERABLE_ERROR, where: str = "", why: str = MAGNIFIED
+) -> None:
+    """An :class:`AccuracyWarning` where an energy that the motion conserves is another at the end.
+
+    Args:
+        first, last: energies.
+        size: of a part of one: that of p.v, so that an energy near zero has a size.
+        tolerable: part of the largest of the three.
+        where: which motion, in words.
+        why: what may be the cause, and what to do.
+    """
+    if lost_part(first, last, size) > tolerable and _heard.get():
+        warnings.warn(f"the energy{where} went from {first:.3g} to {last:.3g} {why}", AccuracyWarning, stacklevel=4)
+
+
+def lost_part(first: float, last: float, size: float) -> float:
+    """By what part of its size an energy changed; 0 of one that is not known."""
+    part = abs(last - first) / max(abs(first), abs(last), size, sys.float_info.min)
+    return part if part == part else 0.0
+
+
+def _energies(
+    stepper: Integrator, t: Array, q: Array, p: Array, parameters: Array
+) -> tuple[float, float, float] | None:
+    """Of the first and the last state the energies, and the largest p.v; nothing beyond the domain of L."""
     try:
-        first, last = energies = stepper.energy(*ends)
-        sizes = np.sum(ends[1] * stepper.velocity(*ends), axis=1)
-    except StateError:  # beyond the domain of L
-        return
-    if not abs(last - first) > TOLERABLE_ERROR * np.abs([*energies, *sizes]).max():
-        return
-    warnings.warn(
-        f"the energy went from {first:.3g} to {last:.3g} though each step was as accurate as wanted: the motion "
-        "magnifies errors, as near collisions do; take a smaller tolerance, or coordinates in which nothing collides",
-        AccuracyWarning,
-        stacklevel=3,
-    )
+        first, last = stepper.energy(q, p, t, parameters)
+        sizes = np.sum(p * stepper.velocity(q, p, t, parameters), axis=1)
+    except StateError:
+        return None
+    return float(first), float(last), float(np.abs(sizes).max())

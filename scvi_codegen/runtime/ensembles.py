@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.accuracy import warn_of_lost_energies
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
@@ -78,7 +79,9 @@ class Ensembles(ConstrainedStates):
             options=options,
         )
         work.run(progress=progress, threads=threads)
-        return work.result()
+        found = work.result()
+        warn_of_lost_energies(found)
+        return found
 
     @takes(StateError, progress=FUNCTION, inputs=MAPPING)
     def drive_ensemble(

@@ -42,6 +42,7 @@ class IndexedInterface:
         inputs: names of functions of time given as data, each five of the parameters.
         solver: of the equations of a step, in a word.
         constraints: the loops of each.
+        conserves_energy: whether the motion of a Lagrangian does.
     """
 
     prefix: str
@@ -62,6 +63,7 @@ class IndexedInterface:
     inputs: tuple[str, ...] = ()
     solver: str = "fixed-point"
     constraints: tuple[tuple[Loop, ...], ...] = ()
+    conserves_energy: bool = False
     energy_parameter = ""
     """That of transformed time, which sums over indices do not have."""
 

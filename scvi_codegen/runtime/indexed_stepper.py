@@ -17,7 +17,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy import warn_of_long_steps
+from scvi_codegen.runtime.accuracy import GROSS_ERROR, MET, warn_of_energies, warn_of_long_steps
 from scvi_codegen.runtime.compiled_method import no_text
 from scvi_codegen.runtime.driven import checked_inputs, end_of, entered, parameters_at, stretches
 from scvi_codegen.runtime.events import EventLike, as_events
@@ -295,10 +295,21 @@ def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal
 
 
 def _said(record: IndexedRecord) -> IndexedTrajectory:
-    """What was kept, after what is to be said of its worst step."""
+    """What was kept, after what is to be said of its worst step, and of its energy."""
     found = record.trajectory()
     warn_of_long_steps(found, remedy="")
+    if record.run.interface.conserves_energy:
+        _say_lost_energy(found)
     return found
+
+
+def _say_lost_energy(found: IndexedTrajectory) -> None:
+    """Of steps that chose their length or tell no error; a Hamiltonian has no part that says how large it is."""
+    (first, last), size = found.energies[[0, -1], 2], 2.0 * found.energies[[0, -1], 0].max()
+    if found.goal is not None:
+        warn_of_energies(first, last, size)
+    elif np.isnan(found.step_error):
+        warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=MET)
 
 
 def _rebuild(

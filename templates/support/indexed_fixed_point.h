@@ -71,7 +71,7 @@ static void last_positions(const run_memory *run, const parts_of_work *parts, co
 /* Sweeps until the points rest; then once more with all digits of the coefficients. The tables continue so many steps;
  * then `guess` is how many are best continued into the next, and `error` what the curve leaves unresolved. */
 static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
-    long long *guess, double *error, const solver_options *options, solver_report *report)
+    long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
   const lengths by = lengths_of(run->h);
@@ -93,5 +93,5 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   improve_velocities(run, &parts, &by, n);
   forces_at_points(run, given, parts.X, parts.F, n);
   *guess = steps_to_continue(*guess, now.first);
-  return examine(run, parts.F, &by, n, largest, error) ? OK : NOT_FINITE;
+  return examine(run, parts.F, &by, n, largest, decay, error) ? OK : NOT_FINITE;
 }

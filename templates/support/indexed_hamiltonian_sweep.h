@@ -1,6 +1,7 @@
 /* A step of any number of coordinates by sweeps, for any Hamiltonian: positions and momenta y at the points follow
- * their rates there until they rest. Before it: points.h, contraction.h, the tables, forces, which gives the slopes G
- * at X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand behind positions. */
+ * their rates there until they rest. Before it: points.h, contraction.h, the tables, coefficients.h, forces, which
+ * gives the slopes G at X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand
+ * behind positions. */
 
 /* The parts of work, group after group of points: y there, and slopes in this step, the last and the one before. */
 typedef struct {
@@ -71,8 +72,9 @@ static inline double moved_by(const run_memory *run, const lanes *velocity, long
 }
 
 /* What the highest coefficient of the velocities at the points moves a coordinate by, squared, over what they bend it
- * by: the largest of these, everything as a part of the largest coordinate. */
-static double unresolved(const run_memory *run, const lanes *velocity, long long n)
+ * by: the largest of these, everything as a part of the largest coordinate. That coefficient is taken for at least
+ * `decay` times the one below (coefficients.h). */
+static double unresolved(const run_memory *run, const lanes *velocity, long long n, double decay)
 {
   double largest = DBL_MIN, least = 0.0;
   for (long long i = 0; i < n; i++)
@@ -83,7 +85,7 @@ static double unresolved(const run_memory *run, const lanes *velocity, long long
     const double start = at_point(rate, 2 * n, 0), middle = at_point(rate, 2 * n, KEPT / 2);
     const double ends = fabs(at_point(rate, 2 * n, KEPT - 1) - start) + fabs(middle - start);
     const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
-    const double top = RESOLVED * run->h * weigh_apart(HIGHEST, rate, 2 * n);
+    const double top = run->h * top_coefficient(rate, 2 * n, decay);
     least = larger(least, top * top / (bend * size));
   }
   return least;
@@ -105,7 +107,7 @@ static void move(run_memory *run, const lanes *rates, const lanes *end, const la
  * are judged in pairs. The tables continue so many steps; then `guess` is how many are best continued into the next,
  * and `error` what the curve leaves unresolved. */
 static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
-    long long *guess, double *error, const solver_options *options, solver_report *report)
+    long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
   iteration now = at_its_start();
@@ -127,7 +129,7 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
     return failure_of(&now);
   if (!finite_slopes(parts.G, n))
     return NOT_FINITE;
-  *error = unresolved(run, parts.G + n, n);
+  *error = unresolved(run, parts.G + n, n, decay);
   *guess = steps_to_continue(*guess, now.first);
   return OK;
 }

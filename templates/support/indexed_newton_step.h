@@ -65,7 +65,7 @@ static void start_nearer(linear_system *of, const parts_of_work *parts)
 /* Until the points rest. The tables continue so many steps; then `guess` is how many are best continued into the next,
  * and `error` what the curve leaves unresolved. */
 static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
-    long long *guess, double *error, const solver_options *options, solver_report *report)
+    long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
   linear_system of = linear_of(run, given, &parts, n);
@@ -90,5 +90,5 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   if (largest <= DBL_MIN)
     largest = largest_at_end(parts.X, n);
   *guess = steps_to_continue(*guess, now.first);
-  return examine(run, parts.F, &of.by, n, largest, error) ? OK : NOT_FINITE;
+  return examine(run, parts.F, &of.by, n, largest, decay, error) ? OK : NOT_FINITE;
 }

@@ -86,8 +86,10 @@ static double largest_at_end(const lanes *X, long long n)
 }
 
 /* Whether all forces are finite. And what the highest coefficient of the forces at the points moves a coordinate by,
- * squared, over what they bend it by: the largest of these, everything as a part of the largest coordinate. */
-static int examine(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest, double *error)
+ * squared, over what they bend it by: the largest of these, everything as a part of the largest coordinate. That
+ * coefficient is taken for at least `decay` times the one below (coefficients.h). */
+static int examine(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest, double decay,
+    double *error)
 {
   lanes faults = lanes_of(0.0);
   double least = 0.0;
@@ -96,7 +98,7 @@ static int examine(const run_memory *run, const lanes *F, const lengths *by, lon
     const double size = fabs(run->q[i]) + fabs(by->h * run->inverse_mass[i] * run->p[i]) + largest;
     const double ends = fabs(at_point(&F[i], n, 0)) + fabs(at_point(&F[i], n, KEPT - 1));
     const double bend = fabs(unit) * ends + NEGLIGIBLE * size;
-    const double top = RESOLVED * unit * weigh_apart(HIGHEST, &F[i], n);
+    const double top = unit * top_coefficient(&F[i], n, decay);
     for (int g = 0; g < GROUPS; g++)
       faults += 0.0 * F[g * n + i];
     least = larger(least, top * top / (bend * size));

@@ -22,6 +22,7 @@ static void try_step(run_memory *run, trial *now, double least, const solver_opt
   run->h = next_length(run->rung, (now->t_end - now->at.t) - now->at.t_low, &now->last);
   report->t = now->at.t;
   now->guess = now->last || !choose_tables(run, &tables) ? 0 : run->guess;
-  if (solve(run, now->given, now->n, &tables, &now->guess, &now->error, options, report) != OK)
+  if (solve(run, now->given, now->n, &tables, &now->guess, now->limits.decay, &now->error,
+          options, report) != OK)
     now->error = INFINITY;
 }

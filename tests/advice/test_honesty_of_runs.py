@@ -89,6 +89,18 @@ class TestAnotherRoot:
             stepper.integrate(q, p, h=h, steps=2)
 
 
+@pytest.fixture(scope="module")
+def pair():
+    return sc.IndexedSystem.from_text(
+        name="falling",
+        coordinates=["x[N, 2]"],
+        lagrangian="""
+            sum(i in N, sum(a in 2, x_dot[i, a]**2)/2)
+            + sum(i < j in N, 1/sqrt(sum(a in 2, (x[i, a] - x[j, a])**2)))
+        """,
+    )
+
+
 class TestLostEnergy:
     def test_of_a_near_collision_is_said(self, kepler):
         """Each step keeps its tolerance; at the pericentre, 5e-7 from the centre, the speed is a thousandfold."""
@@ -106,6 +118,32 @@ class TestLostEnergy:
         run = sc.compile_stepper(driven, "svi:4").integrate([0.1], [0.0], t_end=20.0, tolerance=1e-8)
         energy = run.energy()
         assert abs(energy[-1] - energy[0]) > 1.0
+
+    def test_of_a_trajectory_of_many_is_said(self, kepler):
+        """Of the one whose orbit is nearly a line; the other keeps its energy."""
+        starts = [[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1e-3]]
+        with pytest.warns(sc.AccuracyWarning, match=r"energy of trajectory 1 went from -1 to \S+ though each step"):
+            kepler.integrate_ensemble(*starts, t_end=3.0, tolerance=1e-6)
+
+    @pytest.mark.parametrize(
+        ("method", "steps", "message"),
+        [
+            ("svi:8", {"t_end": 4.0, "tolerance": 1e-6}, "though each step was as accurate"),
+            ("stoermer-verlet", {"h": 0.01, "steps": 400}, "though the motion conserves it.* shorter h"),
+        ],
+    )
+    def test_of_sums_over_indices_is_said(self, pair, method, steps, message):
+        """Two bodies that fall onto each other: the step jumps over where they meet."""
+        with pytest.warns(sc.AccuracyWarning, match=rf"energy went from -0.5\d* to \S+ {message}"):
+            run = sc.compile_indexed(pair, method).integrate([[-0.987, 0.0], [1.0, 0.0]], **steps)
+        assert abs(run.energy()[-1] - run.energy()[0]) > 10
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("method", ["svi:8", "stoermer-verlet"])
+    def test_nothing_is_said_of_sums_that_keep_theirs(self, pair, method):
+        steps = {"t_end": 4.0, "tolerance": 1e-6} if method == "svi:8" else {"h": 0.3, "steps": 60}
+        start = {"q": [[-1.0, 0.0], [1.0, 0.0]], "velocity": [[0.0, 0.5], [0.0, -0.5]]}
+        sc.compile_indexed(pair, method).integrate(**start, **steps)
 
 
 class TestPromises:

@@ -52,6 +52,21 @@ def invoke(*words: str) -> Result:
     return CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
 
 
+def test_run_by_steps_that_choose_their_length(ring: str) -> None:
+    """To the end, as accurate as wanted; in place of the step of the file. What needs one step says so."""
+    result = invoke("run", ring, "--tolerance", "1e-9", "--span", "7", "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert (found["h"], found["tolerance"], found["final"]["t"], found["failure"]) == (None, 1e-9, 7.0, None)
+    assert found["step_error"] < 1e-9
+    assert found["energy_error"] < 1e-7
+    assert "steps of their own lengths from t = 0 to t = 2;" in invoke("run", ring, "--tolerance", "1e-9").stdout
+    Path("own.toml").write_text(RING.replace("step = 0.1\nsteps = 20", "tolerance = 1e-9\nspan = 2.0"))
+    for command in (("generate", "own.toml", "-o", "own_svi"), ("verify", "own.toml")):
+        assert "give a step h (--step, [run] step)" in invoke(*command).output
+    assert invoke("run", ring, "--advise", "1e-9").exit_code == 2
+
+
 def test_run(ring: str) -> None:
     """What is conserved and where it ends, in words, numbers and files, against normal modes."""
     result = invoke("run", ring, "-o", "ring.npz")
@@ -84,7 +99,7 @@ def test_options(ring: str) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("run", "--tolerance", "1e-9"), "--tolerance is not for sums over indices"),
+        (("run", "--advise", "1e-9"), "--advise is not for sums over indices"),
         (("run", "--monitor", "frequency"), "monitor is not for sums over indices"),
         (("run", "-o", "ring.csv"), "saved as .npz"),
         (("run", "--size", "N=1.5"), "is a whole number, not 1.5"),

@@ -98,5 +98,5 @@ def test_terms_have_a_value_for_every_slot() -> None:
     system, bonds = chain(4)
     looped = looped_force(system, "force", bonds)
     bond = replace(looped.sums[0].term, results=looped.sums[0].term.results[:1], values=1)
-    with pytest.raises(ValueError, match="not as many values as arguments"):
+    with pytest.raises(ValueError, match="not as many values as targets"):
         replace(looped, sums=(IndexedSum(term=bond, table=tuple(bonds)),))

@@ -32,14 +32,41 @@ def lattice(count):
     return lagrangian(names, " + ".join(kinetic) + " ".join(springs) + " - q0**4*sin(t)", k=0.3)
 
 
-@pytest.mark.parametrize("system", [bodies(4), bodies(12), lattice(5), lattice(13)], ids=lambda each: each.name)
+def damped(count):
+    """Forces of two kinds and an input."""
+    q = [f"q{i}" for i in range(count)]
+    kinetic = " + ".join(f"{a}_dot**2/2" for a in q)
+    springs = "".join(f" - ({b} - {a})**2/2 - ({b} - {a})**4" for a, b in pairwise(q))
+    friction = {a: f"-c*{k + 1}*{a}_dot**3 + sin({b} - {a})" for k, (a, b) in enumerate(pairwise(q))}
+    return sc.LagrangianSystem.from_text(
+        name="damped",
+        coordinates=q,
+        lagrangian=f"{kinetic}{springs} - q0**2/2",
+        parameters={"c": 0.1},
+        forces={**friction, q[-1]: "c*cos(t)"},
+    )
+
+
+def canonical(count):
+    """A Hamiltonian that is no sum of both energies."""
+    q = [f"q{i}" for i in range(count)]
+    terms = [f"((q{i} - q{i + 1})**2 + (p_q{i} - p_q{i + 1})**2)/2" for i in range(count - 1)]
+    terms += [f"{i + 1}*({a}**2 + p_{a}**2)**2/4" for i, a in enumerate(q)]
+    return sc.HamiltonianSystem.from_text(name="canonical", coordinates=q, hamiltonian=" + ".join(terms))
+
+
+EXAMPLES = [bodies(4), bodies(12), lattice(5), lattice(13), damped(6), canonical(5)]
+
+
+@pytest.mark.parametrize("system", EXAMPLES, ids=lambda each: each.name)
 def test_the_motion_is_the_same(system):
     found = sc.gather_sums(system)
     q, v = np.random.default_rng(3).normal(size=(2, len(system.coordinates)))
-    run = sc.compile_indexed(found.system, "svi:4").integrate(
-        q, velocity=v, h=0.01, steps=5, tables=found.tables, parameters=found.parameters
+    start = {"p" if system.auxiliaries else "velocity": v}
+    run = sc.compile_indexed(found.system, "gauss:4").integrate(
+        q, **start, h=0.01, steps=5, tables=found.tables, parameters=found.parameters
     )
-    other = sc.compile_stepper(system, "svi:4").integrate(q, velocity=v, h=0.01, steps=5)
+    other = sc.compile_stepper(system, "gauss:4").integrate(q, **start, h=0.01, steps=5)
     assert np.abs(run.q["q"] - other.q).max() < 1e-13 * np.abs(q).max()
     assert np.abs(run.energy() - other.energy()).max() < 1e-12 * np.abs(run.energies).max()
 
@@ -66,13 +93,46 @@ def test_parameters_that_all_have_in_common_stay():
             "more than 64 kinds",
         ),
         (
+            sc.LagrangianSystem.from_text(name="damped", coordinates=["x"], lagrangian="x_dot**2/2", damping="1"),
+            "damping of 'damped'",
+        ),
+        (
             sc.LagrangianSystem.from_text(
-                name="damped", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "-x_dot"}
+                name="rod",
+                coordinates=["x", "y"],
+                lagrangian="x_dot**2/2 + y_dot**2/2",
+                constraints=["x**2 + y**2 = 1"],
             ),
-            "forces beside the Lagrangian",
+            "constraints of 'rod'",
         ),
     ],
 )
 def test_what_is_refused(system, message):
     with pytest.raises(SystemDefinitionError, match=message):
         sc.gather_sums(system)
+
+
+def test_inputs_keep_their_names():
+    q = [f"q{i}" for i in range(4)]
+    springs = "".join(f" - ({b} - {a})**2/2" for a, b in pairwise(q))
+    system = sc.LagrangianSystem.from_text(
+        name="driven",
+        coordinates=q,
+        lagrangian=" + ".join(f"{a}_dot**2/2" for a in q) + springs + " + q0*u",
+        inputs=["u"],
+        forces={"q3": "-u*q3_dot"},
+    )
+    found = sc.gather_sums(system)
+    assert found.system.inputs == ("u",)
+    assert (
+        found.system.parameters
+        == sc.IndexedSystem.from_text(
+            name="u", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 + u*q[i])", inputs=["u"]
+        ).parameters
+    )
+    data = {"u": (np.linspace(0, 1, 11), np.sin(np.linspace(0, 1, 11)))}
+    run = sc.compile_indexed(found.system, "svi:3").drive(
+        np.zeros(4), inputs=data, h=0.1, steps=5, tables=found.tables, parameters=found.parameters
+    )
+    other = sc.compile_stepper(system, "svi:3").drive(np.zeros(4), velocity=np.zeros(4), inputs=data, h=0.1, steps=5)
+    assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)

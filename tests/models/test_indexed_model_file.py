@@ -113,9 +113,11 @@ def test_an_index_means_one_thing() -> None:
         ('file = "bonds.csv"', 'file = "bonds.csv", colum = "a"', "unknown key 'colum' in"),
         ('file = "bonds.csv"', "file = 3", "must be a file, .* with texts between quotes"),
         ('{ file = "bonds.csv" }', "[[0.5, 1], [1, 2]]", "must be whole numbers"),
-        ("steps = 4", "steps = 4\ntolerance = 1e-9", "tolerance is not for sums over indices"),
-        ("steps = 4", "", "no span or steps"),
-        ("step = 0.1", "", "lacks 'step'"),
+        ("steps = 4", "steps = 4\ntolerance = 1e-9", "step.*tolerance"),
+        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not for sums over indices"),
+        ("steps = 4", "", "span"),
+        ("step = 0.1", "", "has steps and no step"),
+        ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "a relative error below 1"),
         ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not for sums over indices"),
     ],
 )
@@ -136,3 +138,20 @@ def test_each_kind_has_its_reader(net: Path, tmp_path: Path) -> None:
     sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
     with pytest.raises(sc.ModelFileError, match="read by load_model"):
         sc.load_indexed_model(tmp_path / "kepler.toml")
+
+
+def test_steps_that_choose_their_length(net: Path) -> None:
+    """With a tolerance, or without a step; a step laid over it takes its place."""
+    given = {"tolerance": 1e-6, "span": -3.0}
+    net.write_text(net.read_text().replace("step = 0.1\nsteps = 4", "tolerance = 1e-6\nspan = -3.0"))
+    model = sc.load_indexed_model(net)
+    assert (model.h, model.tolerance, model.covered) == (None, 1e-6, -3.0)
+    own = model.integrate()
+    assert own.t[-1] == model.start().goal.t_end == -3.0
+    other = sc.compile_indexed(model.system, "svi:2").integrate(
+        model.q, t_end=-3.0, tolerance=given["tolerance"], tables=model.tables, parameters=model.parameters
+    )
+    assert np.array_equal(own.q["r"], other.q["r"])
+    with pytest.raises(sc.ModelFileError, match="give a step"):
+        model.step_count  # noqa: B018
+    assert sc.load_indexed_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10

@@ -152,8 +152,8 @@ def run(
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
     if isinstance(model, IndexedModel):
-        refuse({"ensemble": ensemble, **wanted, "solver": None if solver == "auto" else solver})
-        run_sums(model, output, plot, options)
+        refuse({"ensemble": ensemble, "advise": advise, "solver": None if solver == "auto" else solver})
+        run_sums(model if tolerance is None else controlled_model(model, tolerance), output, plot, options)
         return
     if model.system.inputs:
         _check_driven(advise, recorded=recorded)

@@ -24,11 +24,12 @@ from sympy import Expr, Symbol
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.parts import parts
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, array_value, drawn_parameters
+from scvi_codegen.mechanics.symmetry.pulls import array_value
+from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, drawn_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["Column", "Monomial", "Polynomial", "conserved"]
+__all__ = ["Column", "Monomial", "Polynomial", "confirmed", "conserved"]
 
 Array = NDArray[np.float64]
 
@@ -99,6 +100,11 @@ def conserved(
         for row in recognised
         if row is not None and search.verified(row)
     ]
+
+
+def confirmed(motion: Rates, columns: Sequence[Column], row: Mapping[int, Expr]) -> bool:
+    """Whether a combination of columns is conserved by a motion to 40 digits where that is defined."""
+    return _Search(motion, columns).verified(row)
 
 
 class _Search:

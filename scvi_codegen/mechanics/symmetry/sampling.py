@@ -23,10 +23,12 @@ from scvi_codegen.formulas.parts import parts
 from scvi_codegen.formulas.tape import Tape, evaluate
 from scvi_codegen.mechanics.constraints import constraint_multipliers, with_reactions
 from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.rolled import RolledTerms
+from scvi_codegen.mechanics.symmetry.pulls import LARGEST, array_pulls, array_value, exact_pulls
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import Number, mp
 
-__all__ = ["Rates", "Sample", "array_value", "drawn_parameters", "rates_of"]
+__all__ = ["Rates", "Sample", "drawn_parameters", "rates_of"]
 
 Array = NDArray[np.float64]
 
@@ -34,7 +36,6 @@ SEED = 20250101
 SPREADS = (1.0, 0.3, 0.1)
 """Sizes of velocities or momenta: some Lagrangians exist for small ones only."""
 ATTEMPTS = 24
-LARGEST = 10**300
 VERIFIED_AT = 3
 LONGEST_NUMBER = 1000
 """Numerators and denominators of numbers in a formula that are as good as parameters: measured, not derived."""
@@ -71,6 +72,7 @@ class Rates:
         time: t.
         constants: default value by parameter; long numbers of the formula are parameters here.
         numbers: what stands for a long number, with that number.
+        families: what adds to the forces, of a system of many like terms.
     """
 
     arguments: tuple[Symbol, ...]
@@ -81,6 +83,7 @@ class Rates:
     time: Symbol
     constants: Mapping[Symbol, float]
     numbers: Mapping[Symbol, sympy.Rational]
+    families: tuple[RolledTerms, ...] = ()
 
     def arrays(self, parameters: Mapping[Symbol, Array], count: int) -> Sample:
         """``count`` points; NaN where the system is not defined. Parameters: one number, or one a point."""
@@ -91,7 +94,8 @@ class Rates:
             size = 1.5 if k < m else generator.choice(SPREADS, count)
             values[argument] = size * generator.uniform(-1.0, 1.0, count)
         with np.errstate(all="ignore"):
-            return self._sample(values, lambda expression: array_value(expression, values) + np.zeros(count))
+            pulls = array_pulls(self.families, self.arguments[:m], values, count)
+            return self._sample(values, lambda expression: array_value(expression, values) + np.zeros(count), pulls)
 
     def points(self, parameters: Mapping[Symbol, Number], count: int) -> Iterator[Sample]:
         """At most ``count`` points at which the system is defined, one by one in 60 digits."""
@@ -107,7 +111,8 @@ class Rates:
                 values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
             try:
                 known = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
-                found = self._sample(values, functools.partial(_known_or_evaluated, known, values))
+                pulls = exact_pulls(self.families, self.arguments[: len(self.momenta)], values)
+                found = self._sample(values, functools.partial(_known_or_evaluated, known, values), pulls)
             except ArithmeticError:
                 continue
             count -= 1
@@ -115,17 +120,19 @@ class Rates:
 
     @functools.cached_property
     def verifying(self) -> list[Sample]:
-        """Points in 60 digits, none if the system is defined nowhere."""
+        """Points in 60 digits, none if the system is defined nowhere; one where each of many terms is a test."""
+        count = 1 if self.families else VERIFIED_AT
         for near in (False, True):
             drawn = drawn_parameters(self.constants, 1, near=near)
-            found = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, VERIFIED_AT))
+            found = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, count))
             if found:
                 return found
         return []
 
-    def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any]) -> Sample:
+    def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any], pulls: Sequence[Any]) -> Sample:
         m = len(self.momenta)
         transformed, forces = (tuple(map(value, given)) for given in (self.transformed, self.forces))
+        forces = tuple(force + pull for force, pull in zip(forces, pulls, strict=True))
         halves = (self.arguments[:m], self.arguments[m : 2 * m])
         q, second = (tuple(values[argument] for argument in half) for half in halves)
         p, v = (second, transformed) if self.hamiltonian else (transformed, second)
@@ -147,8 +154,8 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
     return evaluate(expression, {x: values[x] for x in expression.free_symbols})
 
 
-def rates_of(system: MechanicalSystem) -> Rates:
-    """The motion of a system, long numbers replaced by parameters."""
+def rates_of(system: MechanicalSystem, families: tuple[RolledTerms, ...] = ()) -> Rates:
+    """The motion of a system, long numbers replaced by parameters; with ``families`` of terms beside it."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
     forces = with_reactions(system, forms_of(system).thrust)
     numbers = _long_numbers((*transformed, *forces))
@@ -164,6 +171,7 @@ def rates_of(system: MechanicalSystem) -> Rates:
         time=system.time,
         constants=system.constants | {given: float(number) for given, number in numbers.items()},
         numbers=numbers,
+        families=families,
     )
 
 
@@ -172,24 +180,3 @@ def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
     found = (part for part in parts(*expressions) if part.is_Rational)
     sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}
-
-
-def array_value(expression: Any, known: dict[Any, Any]) -> Any:
-    """Value of an expression at many points, NaN where it has none; ``known`` has its symbols and gets its parts."""
-    if expression not in known:
-        known[expression] = _array_node(expression, known)
-    return known[expression]
-
-
-def _array_node(expression: Any, known: dict[Any, Any]) -> Any:
-    if not expression.args:
-        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
-    arguments = [array_value(argument, known) for argument in expression.args]
-    if expression.is_Add:
-        return functools.reduce(np.add, arguments)
-    if expression.is_Mul:
-        return functools.reduce(np.multiply, arguments)
-    if expression.is_Pow:
-        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
-    name = type(expression).__name__
-    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)

@@ -34,8 +34,10 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.kinds import several, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.rolled import rolled
 from scvi_codegen.mechanics.symmetry.ansatz import (
     Terms,
+    bodies_of,
     boost_columns,
     combined,
     independent,
@@ -44,8 +46,9 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
     polynomial_in,
     rigid_columns,
 )
-from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, conserved
+from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, confirmed, conserved
 from scvi_codegen.mechanics.symmetry.names import name_of
+from scvi_codegen.mechanics.symmetry.pulls import among_few
 from scvi_codegen.mechanics.symmetry.sampling import Rates, rates_of
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 
@@ -165,18 +168,43 @@ def all_symmetries(system: MechanicalSystem, given: Sequence[Symmetry]) -> tuple
 
 def _found(system: MechanicalSystem) -> list[Terms]:
     """The momentum maps as polynomials."""
-    m, motion = system.dimension, rates_of(system)
-    if m > MOST_COORDINATES:
-        columns: list[Polynomial] = list(rigid_columns(system))
-        if any(is_shift(columns[min(row)]) for row in conserved(system, motion, columns)):
-            columns += boost_columns(system, columns)
-        return [terms for terms in (combined(row, columns) for row in conserved(system, motion, columns)) if terms]
+    if system.dimension > MOST_COORDINATES:
+        return _rigid(system)
+    motion = rates_of(system)
     if not isinstance(system, HamiltonianSystem):
         return _spanned(system, motion, curved=False)
     mixed = _spanned(system, motion, curved=True)
     if not system.is_regular or not mixed:
         return independent(mixed)
     return independent(mixed, first=_spanned(system, motion, curved=False), trivial=_energy(system))
+
+
+def _rigid(system: MechanicalSystem) -> list[Terms]:
+    """Those of everything as a whole; of like terms looked for with those of a few bodies, then held against all."""
+    parts, columns = rolled(system), list[Polynomial](rigid_columns(system))
+    if parts is None:
+        return _combined(*_conserved_by(system, rates_of(system), columns))
+    motion = rates_of(parts.rest, parts.families)
+    of_few = replace(motion, families=among_few(parts.families, bodies_of(system)))
+    rows, known = _conserved_by(parts.rest, of_few, columns)
+    if not all(confirmed(motion, known, row) for row in rows):
+        rows, known = _conserved_by(parts.rest, motion, columns)
+    return _combined(rows, known)
+
+
+def _conserved_by(
+    system: MechanicalSystem, motion: Rates, columns: Sequence[Polynomial]
+) -> tuple[list[dict[int, Expr]], Sequence[Polynomial]]:
+    """Conserved combinations of columns, and of the boosts where there is a translation among them."""
+    rows = conserved(system, motion, columns)
+    if any(is_shift(columns[min(row)]) for row in rows):
+        columns = [*columns, *boost_columns(system, columns)]
+        rows = conserved(system, motion, columns)
+    return rows, columns
+
+
+def _combined(rows: Sequence[Mapping[int, Expr]], columns: Sequence[Polynomial]) -> list[Terms]:
+    return [terms for terms in (combined(row, columns) for row in rows) if terms]
 
 
 def _spanned(system: MechanicalSystem, motion: Rates, *, curved: bool) -> list[Terms]:

@@ -1,0 +1,64 @@
+"""Families of terms in loops: what a program computes of a system's large part, added to what is written out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sympy import Expr
+
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.kernel import Constant, IndexedSum, Load
+from scvi_codegen.ir.numbers import exact_number
+from scvi_codegen.ir.program import Program
+from scvi_codegen.mechanics.rolled import Rolled, RolledTerms
+
+__all__ = ["with_sums"]
+
+
+def with_sums(program: Program, of: Rolled) -> Program | None:
+    """The program of ``of.rest`` with the forces and the energy of the families.
+
+    ``None`` where forces enter otherwise than as values of kernels: in Newton's iteration, in shooting.
+    """
+    forces = tuple(_forces(of, family, number) for number, family in enumerate(of.families))
+    energies = tuple(_energy(of, family, number) for number, family in enumerate(of.families))
+    sweep, splitting = program.sweep and program.sweep.with_forces(forces), program.splitting
+    if program.newton or not (sweep or splitting):
+        return None
+    return replace(
+        program,
+        energy=program.energy.with_sums(energies),
+        sweep=sweep,
+        splitting=replace(splitting, force=splitting.force.with_sums(forces)) if splitting else None,
+    )
+
+
+def _forces(of: Rolled, family: RolledTerms, number: int) -> IndexedSum:
+    return _summed(of, f"pull_{number}", family, family.slopes, ())
+
+
+def _energy(of: Rolled, family: RolledTerms, number: int) -> IndexedSum:
+    value = -family.formula if of.rest.auxiliaries else family.formula
+    return _summed(of, f"term_{number}", family, (value,), ((0,),) * len(family.places))
+
+
+def _summed(
+    of: Rolled, name: str, family: RolledTerms, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+) -> IndexedSum:
+    system = of.rest
+    places = {parameter: k for k, parameter in enumerate(system.parameters)}
+
+    def constant(value: Expr) -> Constant | Load:
+        return Load("parameters", places[value]) if value in places else Constant(exact_number(value))
+
+    term = lower_kernel(
+        name,
+        arguments=(*family.slots, *family.given),
+        time=system.time,
+        parameters=system.parameters,
+        values=tuple(values),
+        constants=len(family.given),
+    )
+    given = tuple(tuple(map(constant, column)) for column in family.values)
+    return IndexedSum(term=term, table=family.places, given=given, targets=targets)

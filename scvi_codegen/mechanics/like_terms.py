@@ -1,0 +1,138 @@
+"""Terms of one kind: those that differ in their coordinates, parameters and numbers alone.
+
+That two terms are of one kind is read off their trees: arguments of sums and products in the order of what they are
+without names, leaves in the order of that.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import repeat
+from typing import TypeVar
+
+from sympy import Expr, Symbol
+
+from scvi_codegen.formulas.vocabulary import NAME_OF
+
+__all__ = ["LikeTerms", "like_terms"]
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LikeTerms:
+    """Terms of one kind.
+
+    Attributes:
+        text: of any of them: ``q{0}`` is the entry of the array q at the first place of a term, ``[0]`` its first
+            constant.
+        terms: as they were given.
+        places: of each term.
+        constants: of each term, numbers or parameters.
+    """
+
+    text: str
+    terms: tuple[Expr, ...]
+    places: tuple[tuple[int, ...], ...]
+    constants: tuple[tuple[Expr, ...], ...]
+
+    def written(self, place: Callable[[int], str], constant: Callable[[int], str]) -> str:
+        """The text with places and constants written so."""
+        text = re.sub(r"\[(\d+)\]", lambda found: constant(int(found[1])), self.text)
+        return re.sub(r"\{(\d+)\}", lambda found: place(int(found[1])), text)
+
+
+def like_terms(
+    terms: Iterable[Expr],
+    places: Mapping[Symbol, tuple[str, int]],
+    names: Iterable[Symbol],
+    most: int,
+    first: Iterable[tuple[int, ...]] = repeat(()),
+) -> tuple[LikeTerms, ...]:
+    """The kinds of terms, in the order of their texts; none where they are more than ``most``.
+
+    Args:
+        terms: in canonical form.
+        places: array and place of each coordinate, velocity or momentum.
+        names: of parameters.
+        most: kinds.
+        first: places of each term that come before those in it: where a force acts.
+    """
+    shapes, known = dict[Expr, str](), set(names)
+    kinds: dict[str, list[tuple[Expr, _Term]]] = {}
+    for term, begun in zip(terms, first, strict=False):
+        read = _Term(places, known, shapes, [*begun])
+        kinds.setdefault(read.write(term), []).append((term, read))
+        if len(kinds) > most:
+            return ()
+    return tuple(
+        LikeTerms(
+            text=text,
+            terms=tuple(term for term, _ in found),
+            places=tuple(tuple(read.rows) for _, read in found),
+            constants=tuple(tuple(read.constants) for _, read in found),
+        )
+        for text, found in sorted(kinds.items())
+    )
+
+
+@dataclass(slots=True)
+class _Term:
+    """A term as text with numbered leaves.
+
+    Attributes:
+        places: array and place of each coordinate and velocity.
+        names: of parameters.
+        shapes: of formulas, as far as they are known.
+        rows: the places that occur, in order.
+        constants: numbers and parameters, in order, those of one name once.
+    """
+
+    places: Mapping[Symbol, tuple[str, int]]
+    names: set[Symbol]
+    shapes: dict[Expr, str]
+    rows: list[int] = field(default_factory=list)
+    constants: list[Expr] = field(default_factory=list)
+
+    def write(self, formula: Expr) -> str:
+        """Its text; a place is {0}, a constant [0]."""
+        if formula.is_Pow:
+            exponent = str(formula.exp) if formula.exp.is_Number else self.write(formula.exp)
+            return f"({self.write(formula.base)})**({exponent})"
+        if formula.is_Add or formula.is_Mul:
+            parts = [self.write(part) for part in sorted(formula.args, key=self.shape)]
+            return f"({(' + ' if formula.is_Add else '*').join(parts)})"
+        if formula.args:
+            return f"{NAME_OF[formula.func]}({', '.join(self.write(part) for part in formula.args)})"
+        if formula in self.places:
+            array, place = self.places[formula]
+            return f"{array}{{{_number(self.rows, place)}}}"
+        if formula.is_Number or formula in self.names:
+            return f"[{_number(self.constants, formula)}]"
+        return str(formula)
+
+    def shape(self, formula: Expr) -> str:
+        """The same without numbers of leaves."""
+        found = self.shapes.get(formula)
+        if found is None:
+            found = self.shapes[formula] = self._shape(formula)
+        return found
+
+    def _shape(self, formula: Expr) -> str:
+        if formula.is_Pow:
+            exponent = str(formula.exp) if formula.exp.is_Number else self.shape(formula.exp)
+            return f"({self.shape(formula.base)})**({exponent})"
+        if formula.args:
+            return f"{formula.func.__name__}({', '.join(sorted(map(self.shape, formula.args)))})"
+        if formula in self.places:
+            return self.places[formula][0]
+        return "c" if formula.is_Number or formula in self.names else str(formula)
+
+
+def _number(known: list[Item], item: Item) -> int:
+    """The place of an item in a list, at whose end it is put if it is not there."""
+    if item not in known:
+        known.append(item)
+    return known.index(item)
