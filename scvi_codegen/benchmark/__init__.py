@@ -53,6 +53,7 @@ from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.sums import run_growth, run_sums
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
+from scvi_codegen.files.atomic import write_atomically
 
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
@@ -137,7 +138,8 @@ def benchmark(
         check_plot_path(plot_path)
     report = _measured(sections or tuple(SECTIONS), plan or Plan(), say)
     if json_path is not None:
-        Path(json_path).write_text(json.dumps(report.data(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        data = f"{json.dumps(report.data(), indent=1, allow_nan=False)}\n".encode()
+        write_atomically(json_path, lambda file: file.write(data))
     if plot_path is not None and report.cases:
         from scvi_codegen.benchmark.picture import plot_curves
 
