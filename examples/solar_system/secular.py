@@ -178,19 +178,22 @@ def drawn(
     figure, (top, middle, lower, bottom) = plt.subplots(4, 1, figsize=(10, 10.5), layout="constrained")
     early = million < 1.0
     for k, planet in enumerate(PLANETS):
-        top.plot(million[early], abs(perihelia[early, k]), label=planet.capitalize())
+        top.plot(million[early], abs(perihelia[early, k]), lw=0.8, label=planet.capitalize())
         middle.plot(million[early], 2.0 * np.degrees(np.arcsin(abs(nodes[early, k]))))
     top.set(ylabel="eccentricity", title="The first million years")
     top.legend(ncols=4, frameon=False)
     middle.set(ylabel="inclination, degrees", xlabel="million years")
-    windows = parts(len(million), max(1, int(million[-1] / WINDOW)))
+    windows = parts(len(million), max(4, int(million[-1] / WINDOW)))
     for name in ("g5", "g6", "s6"):
         found = [
             ARCSECONDS * frequency(MILLION_YEARS * million[part], signals[name][part]) - PUBLISHED[name]
             for part in windows
         ]
         lower.plot([million[part].mean() for part in windows], found, "o-", ms=3, lw=1, label=name)
-    lower.set(ylabel="arcseconds a year beside Laskar", title=f"Frequencies over {WINDOW:g} million years each")
+    lower.set(
+        ylabel="arcseconds a year beside Laskar",
+        title=f"Frequencies over {million[-1] / len(windows):.0f} million years each",
+    )
     lower.axhline(0.0, color="0.6", lw=0.8)
     lower.legend(ncols=3, frameon=False)
     bottom.plot(million, energy, lw=0.3)
