@@ -1,13 +1,16 @@
 """How the orbits of the giant planets turn: their secular frequencies over millions of years, beside Laskar's.
 
-Sun and giant planets of DE421, the inner planets within the Sun; with a number of million years on the command line
-(default 20) and `newton` after it without what relativity and the ring of the inner planets add.
+Sun and giant planets of DE421, the inner planets within the Sun. The run is recorded in a folder: called again, it goes
+on from where it ended, or was killed.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+import math
 import time
+from itertools import pairwise
+from pathlib import Path
 
 import ephemeris
 import matplotlib
@@ -21,11 +24,11 @@ import scvi_codegen as sc
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-MILLION_YEARS = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
-PLAIN = "newton" in sys.argv[2:]
 INNER = ("sun", "mercury", "venus", "earth", "moon", "mars")
 PLANETS = ("jupiter", "saturn", "uranus", "neptune")
-STEP, EVERY = 200.0, 400  # days, steps between kept states
+STEP, EVERY = 400.0, 1000  # days, steps between kept states
+MILLION_YEARS = 365.25e6  # in days
+WINDOW = 20.0  # million years, over which Laskar's frequencies are
 ARCSECONDS = np.degrees(3600.0) * 365.25  # a year, of radians a day
 
 # Laskar et al., "A long-term numerical solution for the insolation quantities of the Earth", A&A 428 (2004), table 3:
@@ -55,10 +58,11 @@ def pole(masses: dict[str, float], q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return momentum / np.linalg.norm(momentum)
 
 
-def stepper_of(masses: dict[str, float], rings: float, axis: np.ndarray) -> sc.Stepper:
+def stepper_of(masses: dict[str, float], rings: float, axis: np.ndarray, *, plain: bool = False) -> sc.Stepper:
+    """Of order 16; Newton's Lagrangian alone if ``plain``."""
     lagrangian = newton(tuple(masses))
     parameters = {f"gm_{body}": mass for body, mass in masses.items()}
-    if not PLAIN:
+    if not plain:
         ring = zonal("sun", PLANETS, [repr(k) for k in axis.tolist()], 1.0, {2: rings})
         lagrangian += f" + {relativity(tuple(masses))} + {ring}"
         parameters["c"] = ephemeris.LIGHT
@@ -105,43 +109,93 @@ def frequency(t: np.ndarray, signal: np.ndarray, rank: int = 0) -> float:
     return frequency(t, signal - integral(found) * np.exp(1j * found * (t - t[0])), rank - 1) if rank else float(found)
 
 
-def main() -> None:
-    masses, q, v, rings = bodies()
-    stepper = stepper_of(masses, rings, pole(masses, q, v))
-    steps = round(MILLION_YEARS * 365.25e6 / STEP / EVERY) * EVERY
+def frequencies(t: np.ndarray, signals: dict[str, np.ndarray]) -> dict[str, float]:
+    """Of each signal, arcseconds a year; in the motion of Uranus g5 is stronger than g7."""
+    return {name: ARCSECONDS * frequency(t, signal, int(name == "g7")) for name, signal in signals.items()}
+
+
+def parts(count: int, number: int) -> list[slice]:
+    """As many equal ones of so many rows."""
+    ends = np.linspace(0, count, number + 1).astype(int)
+    return [slice(first, last) for first, last in pairwise(ends)]
+
+
+def recorded(folder: Path, steps: int, hours: float, *, plain: bool) -> sc.RecordedRun:
+    """The run in the folder, led on to so many steps, or for so many hours of processor time."""
     began = time.process_time()
-    run = stepper.integrate(q.ravel(), velocity=v.ravel(), h=STEP, steps=steps, every=EVERY)
-    seconds = time.process_time() - began
+
+    def stop() -> bool:
+        return time.process_time() - began > 3600.0 * hours
+
+    if folder.exists():
+        before = len(sc.load_run(folder))
+        run = sc.resume_run(folder, steps=max(steps, EVERY * (before - 1)), stop=stop)
+    else:
+        before = 1
+        masses, q, v, rings = bodies()
+        stepper = stepper_of(masses, rings, pole(masses, q, v), plain=plain)
+        run = sc.record_run(
+            stepper.start(q.ravel(), velocity=v.ravel(), h=STEP), folder, steps=steps, every=EVERY, stop=stop
+        )
+    seconds, done = time.process_time() - began, EVERY * (len(run) - before)
+    each = f" ({1e6 * seconds / done:.2f} us a step)" if done else ""
+    print(f"{done:,} steps in {seconds:.0f} s of processor time{each}")
+    return run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("million_years", type=float, nargs="?", default=20.0, help="how many (20)")
+    parser.add_argument("--hours", type=float, default=math.inf, help="of processor time, after which the run ends")
+    parser.add_argument("--newton", action="store_true", help="Newton's Lagrangian alone")
+    parser.add_argument("--folder", type=Path, help="of the recorded run (giant_planets.run)")
+    options = parser.parse_args()
+    folder = options.folder or Path(f"giant_planets{'_newton' * options.newton}.run")
+    steps = round(options.million_years * MILLION_YEARS / STEP / EVERY) * EVERY
+    run = recorded(folder, steps, options.hours, plain=options.newton)[:]
     energy = run.energy() / run.energy()[0] - 1.0
-    print(
-        f"{MILLION_YEARS:g} million years, {steps:,} steps in {seconds:.0f} s ({1e6 * seconds / steps:.2f} us a step)"
-    )
+    print(f"{run.t[-1] / MILLION_YEARS:.1f} million years, {EVERY * (len(run.t) - 1):,} steps")
     print(f"energy error at most {abs(energy).max():.1e}, at the end {abs(energy[-1]):.1e}")
     print(f"angular momentum {abs(run.momentum_errors()).max():.1e}")
+    masses, *_ = bodies()
     perihelia, nodes = elements(run, masses)
-    half = len(run.t) // 2
-    print(f"{'':4}{'here':>12}{'of halves':>24}{'Laskar':>12}   arcseconds a year")
+    signals = {name: (perihelia if name[0] == "g" else nodes)[:, int(name[1]) - 5] for name in PUBLISHED}
+    whole = frequencies(run.t, signals)
+    quarters = [
+        frequencies(run.t[part], {name: signal[part] for name, signal in signals.items()})
+        for part in parts(len(run.t), 4)
+    ]
+    print(f"{'':4}{'here':>12}{'quarters off by':>18}{'Laskar':>12}   arcseconds a year")
     for name, published in PUBLISHED.items():
-        signal = (perihelia if name[0] == "g" else nodes)[:, int(name[1]) - 5]
-        rank = int(name == "g7")  # in the motion of Uranus g5 is stronger
-        whole, first, second = (
-            ARCSECONDS * frequency(run.t[part], signal[part], rank)
-            for part in (slice(None), slice(half), slice(half, None))
-        )
-        print(f"{name:4}{whole:12.5f}{first:12.5f}{second:12.5f}{published:12.5f}")
-    drawn(run.t, perihelia, nodes, energy)
+        apart = max(abs(quarter[name] - whole[name]) for quarter in quarters)
+        print(f"{name:4}{whole[name]:12.6f}{apart:18.6f}{published:12.6f}")
+    drawn(run.t / MILLION_YEARS, perihelia, nodes, energy, signals)
 
 
-def drawn(t: np.ndarray, perihelia: np.ndarray, nodes: np.ndarray, energy: np.ndarray) -> None:
-    million = t / 365.25e6
-    figure, (top, middle, bottom) = plt.subplots(3, 1, figsize=(10, 8), layout="constrained")
+def drawn(
+    million: np.ndarray, perihelia: np.ndarray, nodes: np.ndarray, energy: np.ndarray, signals: dict[str, np.ndarray]
+) -> None:
+    figure, (top, middle, lower, bottom) = plt.subplots(4, 1, figsize=(10, 10.5), layout="constrained")
     early = million < 1.0
     for k, planet in enumerate(PLANETS):
-        top.plot(million[early], abs(perihelia[early, k]), label=planet.capitalize())
+        top.plot(million[early], abs(perihelia[early, k]), lw=0.8, label=planet.capitalize())
         middle.plot(million[early], 2.0 * np.degrees(np.arcsin(abs(nodes[early, k]))))
     top.set(ylabel="eccentricity", title="The first million years")
     top.legend(ncols=4, frameon=False)
     middle.set(ylabel="inclination, degrees", xlabel="million years")
+    windows = parts(len(million), max(4, int(million[-1] / WINDOW)))
+    for name in ("g5", "g6", "s6"):
+        found = [
+            ARCSECONDS * frequency(MILLION_YEARS * million[part], signals[name][part]) - PUBLISHED[name]
+            for part in windows
+        ]
+        lower.plot([million[part].mean() for part in windows], found, "o-", ms=3, lw=1, label=name)
+    lower.set(
+        ylabel="arcseconds a year beside Laskar",
+        title=f"Frequencies over {million[-1] / len(windows):.0f} million years each",
+    )
+    lower.axhline(0.0, color="0.6", lw=0.8)
+    lower.legend(ncols=3, frameon=False)
     bottom.plot(million, energy, lw=0.3)
     bottom.set(ylabel="relative energy error", xlabel="million years")
     figure.savefig("secular.png", dpi=110)

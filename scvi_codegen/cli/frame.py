@@ -21,6 +21,7 @@ from click.shell_completion import CompletionItem
 
 from scvi_codegen.errors import BuildError, MethodWarning, RecordingError, ScviCodegenError, StepFailedError
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.native.waiting import told_to
 
 __all__ = [
     "FAILURE",
@@ -30,6 +31,8 @@ __all__ = [
     "Commands",
     "check_writable",
     "emit",
+    "is_quiet",
+    "note",
     "reporting",
     "tell",
 ]
@@ -161,6 +164,20 @@ def _begin_report(context: click.Context, parameter: click.Parameter, wanted: bo
 
 def _be_quiet(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
     context.meta[QUIET] = wanted
+    if wanted:
+        context.with_resource(told_to(lambda _: None))
+
+
+def is_quiet() -> bool:
+    """Whether the command that runs, if one does, was told to be."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(QUIET))
+
+
+def note(text: str) -> None:
+    """Say on stderr what goes on beside the result."""
+    if not is_quiet():
+        click.echo(text, err=True)
 
 
 def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
@@ -168,7 +185,7 @@ def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
     meta = click.get_current_context().meta
     if REPORT in meta:
         meta[REPORT] |= numbers
-    elif text and not meta.get(QUIET):
+    elif text and not is_quiet():
         click.echo(text, nl=nl)
 
 
@@ -195,12 +212,13 @@ def check_writable(path: Path, hint: str) -> None:
         raise click.BadParameter(f"the folder '{path.parent}' cannot be written", param_hint=hint)
 
 
-def emit(text: str, output: str | None) -> None:
-    """Print a text, or write it to a file whole or not at all."""
+def emit(text: str, /, output: str | None, **numbers: Any) -> None:
+    """Print a text, or write it to a file whole or not at all; ``numbers`` as for :func:`tell`."""
     if output is None:
-        click.echo(text)
+        tell(text, **numbers)
         return
     check_writable(Path(output), "'-o'")
     data = (text.rstrip("\n") + "\n").encode()
     write_atomically(output, lambda file: file.write(data))
-    click.echo(f"wrote {output}", err=True)
+    tell(**numbers, written=[output])
+    note(f"wrote {output}")

@@ -11,6 +11,8 @@ from types import FrameType
 
 import click
 
+from scvi_codegen.cli.frame import is_quiet
+
 __all__ = ["PARTS", "interruptions", "progress_bar"]
 
 PARTS = 1000
@@ -43,7 +45,7 @@ def interruptions() -> Iterator[list[int]]:
 @contextlib.contextmanager
 def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
     """A bar on stderr if that is a terminal; the function given is told how many steps are done in all."""
-    if not sys.stderr.isatty() or steps == 0:
+    if not sys.stderr.isatty() or steps == 0 or is_quiet():
         yield lambda done: None
         return
     with click.progressbar(length=steps, label="integrating", file=sys.stderr) as bar:

@@ -1,7 +1,7 @@
 """A model as an FMU: co-simulation by FMI 3.0, for Modelica tools, Simulink, FMPy and whatever else imports these.
 
     pendulum.fmu   modelDescription.xml          variables, the step, what it can do
-                   binaries/x86_64-linux/..      the library, compiled here
+                   binaries/x86_64-linux/..      the library, compiled here, and those for platforms asked for
                    sources/                      the integrator and FMI's functions, C99, for any other machine
                    resources/model.toml          what it was made from
 
@@ -30,8 +30,9 @@ from scvi_codegen.models.fmu_description import build_description, model_descrip
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import MODEL, example_of, model_text, prefix_of
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
+from scvi_codegen.native.cross import TARGETS, library_for
 from scvi_codegen.rendering.fmu import with_fmu
-from scvi_codegen.rendering.source import Interface
+from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.text import ExampleRun
 from scvi_codegen.version import __version__
 
@@ -41,16 +42,19 @@ DESCRIPTION = "modelDescription.xml"
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Of every file in the archive: equal models give equal bytes."""
 PROCESSORS = {"amd64": "x86_64", "arm64": "aarch64", "i686": "x86", "i386": "x86"}
-SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
+SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
+SUFFIXES = {"darwin": ".dylib", "windows": ".dll"}
+"""Of libraries, where it is not .so."""
 
 
-@takes(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, force=SWITCH)
+@takes(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, platforms=TEXTS, force=SWITCH)
 def generate_fmu(
     model: Model,
     path: str | os.PathLike[str],
     *,
     solver: str = "auto",
     flags: tuple[str, ...] = PORTABLE_FLAGS,
+    platforms: tuple[str, ...] = (),
     force: bool = False,
 ) -> Path:
     """Write a model as an FMU 3.0 for co-simulation: a library for this machine, and the sources for others.
@@ -64,6 +68,7 @@ def generate_fmu(
         path: where to, ``<name>.fmu``; the name begins the C names.
         solver: of the stage equations, as for ``compile_stepper``.
         flags: for the C compiler; by default those with which every processor of the kind computes the same bits.
+        platforms: for which it has libraries besides, as FMI names them: ``x86_64-windows``, ``aarch64-darwin``, ..
         force: overwrite a file that is no FMU.
 
     Returns:
@@ -71,26 +76,36 @@ def generate_fmu(
 
     Raises:
         ModelFileError: for a model whose steps choose their length, or go backward, or are of transformed time.
-        PackageError: if the name does not serve, or the file cannot be written or is no FMU.
+        PackageError: if a name does not serve, or the file cannot be written or is no FMU.
         MethodError: for a solver that the method does not have.
-        BuildError: without a C compiler.
+        BuildError: without a C compiler, or for further platforms without the extra ``compiler``.
     """
     target = Path(path)
     if target.suffix != ".fmu":
         raise PackageError(f"the name of an FMU ends with .fmu, as in {target.name or 'model'}.fmu")
     prefix = prefix_of(target.with_suffix(""))
-    files = _files(model, prefix, solver, flags)
+    _check(platforms)
     if not force:
         _refuse_to_lose(target)
+    source, texts = _texts(model, prefix, solver)
+    libraries = {_place(_here(), prefix): load(source, flags=flags).path.read_bytes()}
+    for name in sorted({*platforms} - {_here()}):
+        libraries[_place(name, prefix)] = library_for(name, source, flags=flags)
     try:
-        write_atomically(target, lambda file: _write(files, file))
+        write_atomically(target, lambda file: _write(texts | libraries, file))
     except OSError as error:
         raise PackageError(f"{target} cannot be written: {error.strerror or error}") from error
     return target
 
 
-def _files(model: Model, prefix: str, solver: str, flags: tuple[str, ...]) -> dict[str, bytes]:
-    """What stands in the archive, by name."""
+def _check(platforms: tuple[str, ...]) -> None:
+    for name in platforms:
+        if name not in TARGETS:
+            raise PackageError(f"{name!r} is no platform of FMUs; there are {', '.join(TARGETS)}")
+
+
+def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, bytes]]:
+    """What is compiled, and what stands in the archive beside libraries, by name."""
     source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
     by_velocity = model.velocity is not None
     start = _start(model)
@@ -98,15 +113,13 @@ def _files(model: Model, prefix: str, solver: str, flags: tuple[str, ...]) -> di
     token = _token(source.to_json(), interface, start)
     source = with_fmu(source, interface, start, by_velocity=by_velocity, places=places, token=token)
     described = model_text(model)
-    folder, suffix = _platform()
     texts = {
         DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),
         **{f"sources/{name}": text for name, text in source.files.items()},
         "sources/buildDescription.xml": build_description(prefix, [f"{each.prefix}.c" for each in source.sources]),
         **({} if described is None else {"resources/model.toml": described}),
     }
-    library = load(source, flags=flags).path.read_bytes()
-    return {name: text.encode() for name, text in texts.items()} | {f"binaries/{folder}/{prefix}{suffix}": library}
+    return source, {name: text.encode() for name, text in texts.items()}
 
 
 def _start(model: Model) -> ExampleRun:
@@ -125,11 +138,16 @@ def _token(text: str, interface: Interface, start: ExampleRun) -> str:
     return f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
 
 
-def _platform() -> tuple[str, str]:
-    """The folder of libraries for this machine, and how they end."""
+def _here() -> str:
+    """The platform that this machine is, as FMI names it."""
     processor = platform.machine().lower()
-    system, suffix = SYSTEMS.get(sys.platform, (re.sub(r"\W", "", sys.platform), ".so"))
-    return f"{PROCESSORS.get(processor, processor)}-{system}", suffix
+    system = SYSTEMS.get(sys.platform, re.sub(r"\W", "", sys.platform))
+    return f"{PROCESSORS.get(processor, processor)}-{system}"
+
+
+def _place(platform: str, prefix: str) -> str:
+    """Of a library in the archive."""
+    return f"binaries/{platform}/{prefix}{SUFFIXES.get(platform.rpartition('-')[2], '.so')}"
 
 
 def _refuse_to_lose(target: Path) -> None:

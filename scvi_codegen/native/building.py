@@ -54,6 +54,7 @@ __all__ = [
     "cache_folder",
     "fingerprint",
     "load",
+    "run_compiler",
 ]
 
 TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
@@ -211,9 +212,7 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
     """The parts at the same time, each in a process; then one library of them, and what describes it."""
-    for name, text in source.files.items():
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8")
+    source.write(folder)
     cut = any("support/parts.h" in each.files for each in source.sources)
     wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
@@ -225,7 +224,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
                 ended.enter_context(_finished([*command, "-c", f"{name}.c"], folder))
             _write_binding(_declarations(source, [*compiler, *flags, *wanted], folder), folder)
         try:
-            _run([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
+            run_compiler([*compiler, *objects, *libraries, "-o", _library(folder).name], folder)
             break
         except BuildError:
             if not define:
@@ -241,7 +240,7 @@ def _declarations(source: Source, command: list[str], folder: Path) -> str:
         return text
     given, found = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
     given.write_text(text, encoding="utf-8")
-    _run([*command, "-E", "-P", given.name, "-o", found.name], folder)
+    run_compiler([*command, "-E", "-P", given.name, "-o", found.name], folder)
     text = found.read_text(encoding="utf-8")
     given.unlink()
     found.unlink()
@@ -276,7 +275,8 @@ def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
     return [plain]
 
 
-def _run(command: list[str], folder: Path) -> None:
+def run_compiler(command: list[str], folder: Path) -> None:
+    """Run it in a folder; BuildError if it fails."""
     with _finished(command, folder):
         pass
 

@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from scvi_codegen.version import __version__
@@ -45,6 +46,12 @@ class Source:
         """Text by file name, ``/`` between folders."""
         own = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
         return own | (self.beside.files if self.beside else {})
+
+    def write(self, folder: Path) -> None:
+        """All files, into a folder of their own."""
+        for name, text in self.files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text, encoding="utf-8")
 
     @property
     def sources(self) -> tuple[Source, ...]:

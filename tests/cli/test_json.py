@@ -7,24 +7,37 @@ import math
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
+import sympy
 from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
+from scvi_codegen import benchmark
+from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.cli import frame, main
 from scvi_codegen.models.model_file import parse_model
 
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
 QUIET_COMMANDS = (
     ("run", *KEPLER),
+    ("export", "orbit.run", "-o", "orbit.csv"),
     ("systems",),
     ("systems", "kepler"),
     ("methods",),
     ("methods", "--tableau", "gauss:2"),
     ("cache",),
     ("generate", "kepler", "-o", "kepler_svi"),
+    ("derive", "planar-pendulum", "--method", "svi:1"),
+    ("derive", str(Path(__file__).parents[2] / "examples" / "fput_ring.toml"), "--method", "stoermer-verlet"),
+    ("verify", "planar-pendulum", "--method", "svi:1"),
+    ("reproduce", "--list"),
+    ("bench", "nothing-but-this"),
+    ("doctor",),
 )
+"""Of every command one at least, after a run in the folder ``orbit.run``."""
+NO_TIMES = ResultTable(name="nothing", title="no times", columns={"a": ""}, rows=({"a": "b"},))
 
 
 @pytest.fixture(autouse=True)
@@ -47,11 +60,33 @@ def refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is no JSON")
 
 
-@pytest.mark.parametrize("words", QUIET_COMMANDS, ids=" ".join)
-def test_quiet_prints_nothing_and_json_one_document(words):
+def test_every_command_is_asked():
+    assert {words[0] for words in QUIET_COMMANDS} == set(main.list_commands(click.Context(main)))
+
+
+@pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
+def test_quiet_prints_nothing_and_json_one_document(words, monkeypatch):
+    monkeypatch.setattr(benchmark, "SECTIONS", {"nothing-but-this": lambda plan, say: NO_TIMES})
+    invoke("run", *KEPLER, "-o", "orbit.run")
     assert invoke(*words).stdout
-    assert invoke(*words, "--quiet").stdout == ""
+    quiet = invoke(*words, "--quiet")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
     assert document(*words)
+
+
+def test_the_equations_of_a_step_are_formulas():
+    words = ("derive", "planar-pendulum", "--method", "svi:1", "--quadrature", "gauss-lobatto:2", "--radicals")
+    found = document(*words)
+    assert found["unknowns"] == ["Q_1"]
+    symbols = {name: sympy.Symbol(name) for name in ("Q_1", "q_k", "p_k", "h", "g", "l", "m")}
+    [equation] = found["equations"]
+    assert equation["number"] == "27a"
+    written = sympy.sympify("p_k - g*h*l*m*sin(q_k)/2 - l**2*m*(Q_1 - q_k)/h", symbols)
+    assert sympy.simplify(sympy.sympify(equation["residual"], symbols) - written) == 0
+    assert found["end"]["q"] == ["Q_1"]
+    assert found["text"] == invoke(*words).stdout[:-1]
+    assert document(*words, "-o", "step.txt")["written"] == ["step.txt"]
+    assert Path("step.txt").read_text().rstrip() == found["text"].rstrip()
 
 
 def test_the_numbers_of_a_run_are_those_of_the_library():

@@ -1,5 +1,6 @@
 """FMUs: what describes them, and what they compute through FMI's functions, bit for bit what the stepper computes."""
 
+import importlib.util
 import re
 import subprocess
 import zipfile
@@ -16,6 +17,7 @@ from style import check_style
 
 from scvi_codegen import (
     SVI,
+    BuildError,
     Gauss,
     LagrangianSystem,
     Model,
@@ -28,7 +30,9 @@ from scvi_codegen import (
     reparametrise,
 )
 from scvi_codegen.cli import main
+from scvi_codegen.models import fmu as fmu_module
 from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.native.cross import TARGETS
 
 H = 0.1
 STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-psabi -Werror -c".split()  # noqa: SIM905
@@ -279,7 +283,7 @@ def test_names_are_told_apart(tmp_path):
 
 
 def test_the_archive_is_the_same_each_time_and_has_all_that_compiles(tmp_path):
-    first, second = (generate_fmu(pushed(), tmp_path / part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
+    first, second = (generate_fmu(pushed(), part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
     assert first.read_bytes() == second.read_bytes()
     folder = tmp_path / "unpacked"
     zipfile.ZipFile(first).extractall(folder)
@@ -302,7 +306,7 @@ def test_the_archive_is_the_same_each_time_and_has_all_that_compiles(tmp_path):
 def _folders(root, *names):
     for name in names:
         (root / name).mkdir()
-        yield name
+        yield root / name
 
 
 def test_all_functions_of_the_standard_are_there(fmu):
@@ -347,6 +351,49 @@ def test_the_command_line_writes_one(tmp_path):
     assert zipfile.is_zipfile(target)
     refused = CliRunner().invoke(main, ["generate", "kepler", "--fmu", "--single-file", "-o", str(target)])
     assert (refused.exit_code, "--fmu excludes" in refused.output) == (2, True)
+
+
+MAGIC = {"x86_64-windows": b"MZ", "aarch64-darwin": b"\xcf\xfa\xed\xfe\x0c\0\0\1", "aarch64-linux": b"\x7fELF\2\1"}
+"""How PE, Mach-O for ARM and ELF of 64 bits begin."""
+
+
+class TestPlatforms:
+    """Libraries for other machines, by the cross compiler of the extra ``compiler``."""
+
+    def test_each_has_a_place_of_its_own(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(fmu_module, "library_for", lambda name, source, *, flags: f"{name} {flags}".encode())
+        here = fmu_module._here()
+        path = generate_fmu(pushed(), tmp_path / "push.fmu", platforms=tuple(TARGETS), flags=("-O1",))
+        archive = zipfile.ZipFile(path)
+        found = {name for name in archive.namelist() if name.startswith("binaries")}
+        ends = {"windows": ".dll", "darwin": ".dylib", "linux": ".so"}
+        assert found == {f"binaries/{name}/push{ends[name.partition('-')[2]]}" for name in {*TARGETS, here}}
+        assert archive.read("binaries/aarch64-windows/push.dll") == b"aarch64-windows ('-O1',)"
+
+    def test_what_is_no_platform_or_cannot_be_made_is_said_and_leaves_nothing(self, tmp_path, monkeypatch):
+        with pytest.raises(PackageError, match=r"'windows' is no platform .* x86_64-windows"):
+            generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("windows",))
+        monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+        with pytest.raises(BuildError, match=r"for aarch64-windows .* pip install 'scvi-codegen\[compiler\]'"):
+            generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("aarch64-windows",))
+        words = ["generate", "kepler", "--platform", "x86_64-windows", "-o", str(tmp_path / "kepler")]
+        refused = CliRunner().invoke(main, words)
+        assert (refused.exit_code, "--platform is for --fmu" in refused.output) == (2, True)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.full
+    def test_they_are_libraries_of_their_machines_with_all_functions(self, tmp_path):
+        pytest.importorskip("ziglang", reason="pip install 'scvi-codegen[compiler]'")
+        first, second = (
+            zipfile.ZipFile(generate_fmu(rod(), part / "rod.fmu", platforms=tuple(MAGIC)))
+            for part in _folders(tmp_path, "a", "b")
+        )
+        for name, begin in MAGIC.items():
+            place = fmu_module._place(name, "rod")
+            library = first.read(place)
+            assert library.startswith(begin)
+            assert len(set(re.findall(rb"fmi3[A-Z]\w+", library))) == 75
+            assert second.read(place) == library
 
 
 class TestByFMPy:

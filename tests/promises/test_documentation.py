@@ -158,6 +158,19 @@ class TestTheSite:
         assert {url.split(":")[0] for url in view.asked} <= {"file", "data"}
         assert view.said == []
 
+    def test_who_walks_by_keys_sees_where_he_is(self, site, view):
+        """Links that a phone keeps in a drawer, too: it comes out."""
+        view.goto((site / "solar_system.html").as_uri())
+        for _ in range(8):
+            view.keyboard.press("Tab")
+        view.wait_for_function(
+            """() => {
+                const box = document.activeElement.getBoundingClientRect();
+                return box.width > 0 && box.left >= 0 && box.right <= innerWidth;
+            }""",
+            timeout=5000,
+        )
+
     def test_the_search_finds(self, site, browser):
         with looked_at(browser, "desk", "light") as view:
             view.goto((site / "search.html").as_uri() + "?q=momentum")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import multiprocessing
 import os
 import re
@@ -21,7 +22,7 @@ from html_page import Page
 from toy_experiments import EXPERIMENTS, GOOD
 
 from scvi_codegen.cli import main
-from scvi_codegen.cli.commands.reproduce import Reproduction, experiments_table
+from scvi_codegen.cli.commands.reproduce import Reproduction, experiments_table, experiments_titles
 from scvi_codegen.display.page.typesetting import cell, prose
 from scvi_codegen.errors import StateError
 from scvi_codegen.reproduce.laboratory.experiment import Picture, Result
@@ -314,11 +315,22 @@ class TestCommand:
     def test_the_list(self):
         assert "figure-4      Energy errors\n" in invoke("--list").stdout
         assert invoke("--list", "table-8").stdout == "figure-4  Energy errors\ntable-8   Iterations\n"
-        assert experiments_table(module=TOYS) == invoke("--list").stdout.rstrip("\n")
+        assert experiments_table(experiments_titles(module=TOYS)) == invoke("--list").stdout.rstrip("\n")
+
+    def test_numbers_for_programs_and_silence(self):
+        listed = json.loads(invoke("--list", "--json").stdout)
+        assert listed["experiments"]["figure-4"] == "Energy errors"
+        found = json.loads(invoke("broken", "table-8", "--json").stdout)
+        assert {each["name"]: each["verdict"] for each in found["results"]}["figure-4"] == "holds in part"
+        assert list(found["failures"]) == ["broken"]
+        assert "reproduced/table-8.txt" in found["written"]
+        assert invoke("table-8", "--quiet").stdout == invoke("--list", "--quiet").stdout == ""
 
     def test_after_ctrl_c_it_ends_with_130(self, monkeypatch):
         interrupted = Reproduction(interrupted=True)
-        monkeypatch.setattr("scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words: interrupted)
+        monkeypatch.setattr(
+            "scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words, say: interrupted
+        )
         done = invoke("slow")
         assert done.exit_code == 130
         assert "interrupted" in done.stderr

@@ -1,4 +1,4 @@
-"""What is public, a line each: names and their signatures, options of commands, keys of model files, names in C.
+"""What is public, a line each: names and signatures, options, keys of model files, names in C, variables of FMUs.
 
 python tests/tools/public.py      writes it to tests/corpus/public.txt, which test_public.py compares.
 """
@@ -8,9 +8,12 @@ from __future__ import annotations
 import inspect
 import re
 import sys
+import tempfile
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import click
 
@@ -32,7 +35,7 @@ PLAIN = (int, float, str, type, type(None))
 
 def public() -> str:
     """All lines, sorted."""
-    found = (*_python(), *_command_line(main, "$ scvi-codegen"), *_model_files(), *_headers())
+    found = (*_python(), *_command_line(main, "$ scvi-codegen"), *_model_files(), *_headers(), *_fmus())
     return "\n".join(sorted(found)) + "\n"
 
 
@@ -125,6 +128,34 @@ def _headers() -> Iterator[str]:
         source, _ = scvi_codegen.generate_source(system, METHOD, prefix="one", controlled=True)
         names |= set(re.findall(r"\b(?:one|ONE)_\w+", source.header))
     yield from (f"in C: {name}" for name in names - {"ONE_H"})
+
+
+def _fmus() -> Iterator[str]:
+    """Variables of FMUs that start by velocities and by momenta, with what an importer sees of each."""
+    pushed = scvi_codegen.LagrangianSystem.from_text(
+        name="pushed",
+        coordinates=["x"],
+        lagrangian="m*x_dot**2/2",
+        parameters={"m": 2.0},
+        forces={"x": "u"},
+        inputs=["u"],
+    )
+    for started in ("velocity", "p"):
+        given: dict[str, Any] = {started: (0.5,)}
+        model = scvi_codegen.Model(system=pushed, method=METHOD, q=(1.0,), h=0.1, steps=1, **given)
+        for variable in _variables(model):
+            told = {name: variable.attrib[name] for name in variable.attrib.keys() - {"valueReference", "description"}}
+            words = " ".join(f"{key}={value}" for key, value in sorted(told.items()) if key != "name")
+            yield f"in an FMU from {started}: {told['name']} {variable.tag} {words}"
+
+
+def _variables(model: scvi_codegen.Model) -> list[ElementTree.Element]:
+    with tempfile.TemporaryDirectory() as folder:
+        made = scvi_codegen.generate_fmu(model, Path(folder) / "one.fmu")
+        described = zipfile.ZipFile(made).read("modelDescription.xml")
+    variables = ElementTree.fromstring(described).find("ModelVariables")
+    assert variables is not None
+    return variables[:]
 
 
 if __name__ == "__main__":

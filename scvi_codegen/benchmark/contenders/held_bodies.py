@@ -177,6 +177,8 @@ def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callab
     """
     import mujoco
 
+    mujoco.set_mju_user_warning(lambda _: None)  # of steps too large: else it writes MUJOCO_LOG.TXT where it is run
+
     def move(h: float, steps: int) -> HeldRun:
         model = mujoco.MjModel.from_xml_string(_document(held, integrator, h, stiff=stiff))
         data = mujoco.MjData(model)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import click
 
 from scvi_codegen.benchmark import PEERS, Plan, benchmark
-from scvi_codegen.cli.frame import INTERRUPTED, CommandFailure, check_writable
+from scvi_codegen.cli.frame import INTERRUPTED, CommandFailure, check_writable, note, reporting, tell
 
 __all__ = ["bench"]
 
@@ -16,15 +15,16 @@ __all__ = ["bench"]
 @click.command()
 @click.argument("sections", nargs=-1, metavar="[SECTION ...]")
 @click.option("--peers", metavar="NAME,..", help="Only these of heyoka, rebound, cyrk, jitcode, scipy; none: ''.")
-@click.option("--json", "json_path", type=click.Path(), metavar="FILE", help="All measurements as JSON.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="All measurements as JSON, into a file.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
-@click.option("--resume", is_flag=True, help="Keep what FILE of --json has, and add to it.")
+@click.option("--resume", is_flag=True, help="Keep what FILE of -o has, and add to it.")
 @click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
+@reporting
 def bench(
     sections: tuple[str, ...],
     peers: str | None,
-    json_path: str | None,
+    output: str | None,
     plot: str | None,
     repeats: int,
     resume: bool,
@@ -48,15 +48,16 @@ def bench(
     \b
     Examples:
       scvi-codegen bench kepler:0.5 --peers heyoka --plot kepler.svg
-      scvi-codegen bench drift hand-written --json measured.json
+      scvi-codegen bench drift hand-written -o measured.json
     """
-    if resume and json_path is None:
-        raise click.UsageError("--resume goes on from the FILE of --json: give it")
-    for path, hint in ((json_path, "'--json'"), (plot, "'--plot'")):
+    if resume and output is None:
+        raise click.UsageError("--resume goes on from the FILE of -o: give it")
+    for path, hint in ((output, "'-o'"), (plot, "'--plot'")):
         if path is not None:
             check_writable(Path(path), hint)
     names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
-    plan, say = Plan(peers=names, repeats=repeats, quick=quick), partial(click.echo, err=True)
-    report = benchmark(sections, plan, json_path=json_path, plot_path=plot, resume=resume, say=say, show=click.echo)
+    plan = Plan(peers=names, repeats=repeats, quick=quick)
+    report = benchmark(sections, plan, json_path=output, plot_path=plot, resume=resume, say=note, show=tell)
+    tell(**report.data())
     if report.interrupted:
         raise CommandFailure(f"interrupted in '{report.interrupted}'; what was measured before is above", INTERRUPTED)

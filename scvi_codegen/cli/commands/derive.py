@@ -8,9 +8,10 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.choices import Choices, model_arguments, read_model
-from scvi_codegen.cli.frame import check_writable, emit
+from scvi_codegen.cli.frame import check_writable, emit, reporting
 from scvi_codegen.cli.sums import refuse
 from scvi_codegen.derivation import Start, derivation_html
+from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
 from scvi_codegen.derivation.indexed import derive_sums
 from scvi_codegen.models.indexed_model import IndexedModel
@@ -26,6 +27,7 @@ __all__ = ["derive"]
 @click.option(
     "--html", type=click.Path(), metavar="FILE", help="Write a page: everything from L to the C, side by side."
 )
+@reporting
 def derive(model_name: str, latex: bool, radicals: bool, output: str | None, html: str | None, **choices: Any) -> None:
     """Print the equations of one step of MODEL: unknowns, stage equations, end state.
 
@@ -44,13 +46,31 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
             raise click.UsageError("--html writes a page of its own: leave out --latex, --radicals and -o")
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, Choices(**choices))
+    about = {"system": model.system.name, "method": model.method.name}
     if isinstance(model, IndexedModel):
         refuse({"html": html, "radicals": radicals})
-        emit(derive_sums(model.system, model.method, as_latex=latex), output)
+        text = derive_sums(model.system, model.method, as_latex=latex)
+        emit(text, output, **about, text=text)
         return
     if html is not None:
         start = Start(q=model.q, velocity=model.velocity, p=model.p, h=model.step, t=model.t)
-        emit(derivation_html(model.system, model.method, start=start), html)
+        emit(derivation_html(model.system, model.method, start=start), html, **about)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)
-    emit(equations.to_latex() if latex else equations.to_text(), output)
+    text = equations.to_latex() if latex else equations.to_text()
+    emit(text, output, **about, **_formulas(equations), text=text)
+
+
+def _formulas(of: StepEquations) -> dict[str, Any]:
+    """What ``--json`` says: formulas as text, of the equations what is to be 0, of the end the new values in order."""
+    return {
+        "unknowns": [symbol.name for symbol in of.unknowns],
+        "equations": [{"number": each.number, "residual": str(each.residual)} for each in of.equations],
+        "end": {
+            "q": [str(each.residual) for each in of.end_position],
+            "p": [str(each.residual) for each in of.end_momentum],
+        },
+        "first_guess": {symbol.name: str(value) for symbol, value in of.initial_guess.items()},
+        "entries": {entry.symbol.name: float(entry.value) for entry in of.entries},
+        "conserved": [str(symmetry) for symmetry in of.symmetries],
+    }

@@ -13,6 +13,7 @@ from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import generate_sums
 from scvi_codegen.models.package import generate_package
+from scvi_codegen.native.cross import TARGETS
 from scvi_codegen.rendering.text import Embedded
 
 __all__ = ["generate"]
@@ -37,6 +38,13 @@ __all__ = ["generate"]
 )
 @click.option("--single-file", is_flag=True, help="One C file without support headers beside it, as for --embedded.")
 @click.option("--fmu", is_flag=True, help="An FMU 3.0 for co-simulation in the place of a folder: -o NAME.fmu.")
+@click.option(
+    "--platform",
+    "platforms",
+    type=click.Choice([*TARGETS]),
+    multiple=True,
+    help="Of an FMU: a machine that it has a library for besides this one, repeatable (extra 'compiler').",
+)
 @reporting
 def generate(
     model_name: str,
@@ -46,6 +54,7 @@ def generate(
     embedded: Embedded | None,
     single_file: bool,
     fmu: bool,
+    platforms: tuple[str, ...],
     **choices: Any,
 ) -> None:
     """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
@@ -67,6 +76,8 @@ def generate(
     model = read_model(model_name, Choices(**choices))
     if fmu and (embedded or single_file):
         raise click.UsageError("--fmu excludes --embedded and --single-file")
+    if platforms and not fmu:
+        raise click.UsageError("--platform is for --fmu: the C of a folder is for any machine")
     if isinstance(model, IndexedModel):
         refuse(
             {
@@ -78,7 +89,7 @@ def generate(
         )
         folder, python = generate_sums(model, output, force=force), ""
     elif fmu:
-        folder, python = generate_fmu(model, output, solver=solver, force=force), ""
+        folder, python = generate_fmu(model, output, solver=solver, platforms=platforms, force=force), ""
     else:
         folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
         python = "" if embedded else f", or 'import {folder.resolve().name}'"

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import click
 
-from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable
+from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable, is_quiet, reporting, tell
 from scvi_codegen.cli.wording import counted
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.pictures.canvas import check_plot_path
@@ -34,6 +35,7 @@ SHOWN_NAMES = 40
 @click.option("--html", type=click.Path(), metavar="FILE", help="All results on one page that needs no network.")
 @click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Experiments at a time [as many as processors].")
 @click.option("--list", "listing", is_flag=True, help="Print the names, and run nothing.")
+@reporting
 def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int | None, listing: bool) -> None:
     """Run figures, tables and claims of the paper again, and judge them by what is measured (needs matplotlib).
 
@@ -51,7 +53,8 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
       scvi-codegen reproduce figure-4 figure-5 -o figures --jobs 1
     """
     if listing:
-        click.echo(experiments_table(names or (EVERYTHING,)))
+        titles = experiments_titles(names or (EVERYTHING,))
+        tell(experiments_table(titles), experiments=titles)
         return
     if not names:
         raise click.UsageError("say what to reproduce: 'all', or names that 'scvi-codegen reproduce --list' prints")
@@ -60,9 +63,8 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
         raise click.BadParameter(f"'{folder}' is not a folder", param_hint="'-o'")
     if html is not None:
         check_writable(Path(html), "'--html'")
-    done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs)
-    if done.files:
-        click.echo(f"\n{done.summary()}")
+    done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs, say=tell)
+    tell(f"\n{done.summary()}" if done.files else "", **done.numbers())
     if done.interrupted:
         raise CommandFailure("interrupted; what was written before is kept", INTERRUPTED)
     if done.failures:
@@ -94,26 +96,47 @@ class Reproduction:
         folders = sorted({str(path.parent) for path in self.files})
         return f"{', '.join(counts)}\nwrote {counted(len(self.files), 'file')} to {' and '.join(folders)}"
 
+    def numbers(self) -> dict[str, Any]:
+        """What ``--json`` says."""
+        return {
+            "results": [
+                {"name": each.name, "title": each.title, "verdict": each.verdict.value} for each in self.results
+            ],
+            "failures": {failure.name: failure.message for failure in self.failures},
+            "written": self.files,
+            "interrupted": self.interrupted,
+        }
+
     def failed(self) -> str:
         """A line for each failure."""
         lines = [f"  {failure.name}: {failure.message}" for failure in self.failures]
         return "\n".join([f"{counted(len(lines), 'experiment')} failed to run", *lines])
 
 
-def experiments_table(names: Sequence[str] = (EVERYTHING,), *, module: str = CATALOGUE) -> str:
-    """A line for each experiment that is to be run: its name and what it is."""
+def experiments_titles(names: Sequence[str] = (EVERYTHING,), *, module: str = CATALOGUE) -> dict[str, str]:
+    """What each experiment that is to be run is, by its name."""
     experiments = catalogue(module)
-    chosen = _chosen(names, experiments)
-    width = max(map(len, chosen), default=0)
-    return "\n".join(f"{name:{width}}  {experiments[name].title}" for name in chosen)
+    return {name: experiments[name].title for name in _chosen(names, experiments)}
+
+
+def experiments_table(titles: Mapping[str, str]) -> str:
+    """A line for each."""
+    width = max(map(len, titles), default=0)
+    return "\n".join(f"{name:{width}}  {title}" for name, title in titles.items())
 
 
 def reproduce_experiments(
-    names: Sequence[str], folder: Path, html: Path | None, jobs: int | None, *, module: str = CATALOGUE
+    names: Sequence[str],
+    folder: Path,
+    html: Path | None,
+    jobs: int | None,
+    *,
+    module: str = CATALOGUE,
+    say: Callable[[str], None] = click.echo,
 ) -> Reproduction:
     """Run experiments and what they need; write files of each result when it is there, and the page at the end.
 
-    A line a result is printed. Ctrl-C ends it; what was written stays.
+    Each result is a line to ``say``. Ctrl-C ends it; what was written stays.
 
     Raises:
         StateError: for an unknown name.
@@ -127,7 +150,7 @@ def reproduce_experiments(
     done, width = Reproduction(), max(map(len, chosen), default=0)
     try:
         with (
-            _progress(len(chosen)) as progress,
+            _progress(len(chosen), say) as progress,
             closing(run_experiments(chosen, jobs, module=module, watch=progress.show)) as outcomes,
         ):
             for outcome in outcomes:
@@ -170,10 +193,10 @@ class _Progress:
 
 
 @contextmanager
-def _progress(length: int) -> Iterator[_Progress]:
-    """A bar on stderr if that is a terminal, with the lines printed above it."""
-    if not sys.stderr.isatty() or not length:
-        yield _Progress(lambda names: None, click.echo)
+def _progress(length: int, say: Callable[[str], None]) -> Iterator[_Progress]:
+    """A bar on stderr if that is a terminal, with the lines said above it."""
+    if not sys.stderr.isatty() or not length or is_quiet():
+        yield _Progress(lambda names: None, say)
         return
 
     def show(names: Sequence[str]) -> None:
@@ -181,12 +204,12 @@ def _progress(length: int) -> Iterator[_Progress]:
         bar.current_item = text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + ".."
         bar.render_progress()
 
-    def say(line: str) -> None:
+    def say_above(line: str) -> None:
         click.echo("\r\x1b[K", nl=False, err=True)
-        click.echo(line)
+        say(line)
         bar.update(1)
 
     with click.progressbar(
         length=length, label="reproducing", show_eta=False, item_show_func=lambda item: item, file=sys.stderr
     ) as bar:
-        yield _Progress(show, say)
+        yield _Progress(show, say_above)

@@ -10,7 +10,7 @@ import click
 
 from scvi_codegen import verification
 from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
-from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, reporting, tell
+from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, note, reporting, tell
 from scvi_codegen.cli.sums import refuse
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.indexed_model import IndexedModel
@@ -57,7 +57,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     tell(certificate.to_text(), nl=False, **json.loads(certificate.to_json()))
     if path is not None:
         certificate.save(path)
-        click.echo(f"wrote {path}", err=True)
+        note(f"wrote {path}")
     if not certificate.passed:
         raise CommandFailure(f"broken: {', '.join(check.name for check in certificate.broken)}", FAILURE)
 

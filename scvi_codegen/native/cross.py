@@ -1,0 +1,43 @@
+"""A source as a library for another machine, by the cross compiler of the extra ``compiler``."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import tempfile
+from pathlib import Path
+
+from scvi_codegen.errors import BuildError
+from scvi_codegen.native.building import run_compiler
+from scvi_codegen.native.waiting import waiting_for
+from scvi_codegen.rendering.source import Source
+
+__all__ = ["TARGETS", "library_for"]
+
+TARGETS = {
+    "aarch64-darwin": "aarch64-macos",
+    "aarch64-linux": "aarch64-linux-gnu.2.17",
+    "aarch64-windows": "aarch64-windows-gnu",
+    "x86_64-darwin": "x86_64-macos",
+    "x86_64-linux": "x86_64-linux-gnu.2.17",
+    "x86_64-windows": "x86_64-windows-gnu",
+}
+"""What the compiler calls the platforms that FMI names; for Linux with the oldest C library that one of the two has."""
+
+
+def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> bytes:
+    """A shared library for a platform of :data:`TARGETS`: equal sources and flags give equal bytes.
+
+    Raises:
+        BuildError: without the extra ``compiler``, or if it refuses the text.
+    """
+    if importlib.util.find_spec("ziglang") is None:
+        raise BuildError(f"for {platform} it takes a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)")
+    with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as name:
+        folder, made = Path(name), "library"
+        source.write(folder)
+        texts = [f"{each.prefix}.c" for each in source.sources]
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], "-shared", "-fPIC", "-s"]
+        with waiting_for(f"compiling for {platform}, which takes longest when it is done first"):
+            run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", made], folder)
+        return (folder / made).read_bytes()
