@@ -165,7 +165,7 @@ def test_every_way_to_choose_steps_is_as_good_as_it_says(output_of):
     steps, _, energy, _, error = zip(*(map(float, row) for row in rows), strict=True)
     fixed, controlled, loose, transformed, reversible = range(5)
     assert steps[fixed] > 5 * max(steps[controlled:])
-    assert energy[loose] > 1e-10 > 1e-11 > energy[fixed]
+    assert energy[loose] > 2e-11 > 1e-11 > energy[fixed]
     assert max(energy[way] for way in (controlled, transformed, reversible)) < 2e-12
     assert max(error[way] for way in (controlled, transformed, reversible)) < 1e-8 < error[fixed]
 
