@@ -343,8 +343,8 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
     told = [free[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist() if free[k]]
     if len(told) < 2:
         raise FitError(
-            f"these measurements do not tell {' '.join(told) or 'the states of segments'}: changed together with states "
-            "of later segments, it leaves all that is measured as it is. Take more as known"
+            f"these measurements do not tell {' '.join(told) or 'the states of segments'}: changed together with "
+            "states of later segments, it leaves all that is measured as it is. Take more as known"
         )
     raise FitError(
         f"these measurements do not tell {', '.join(told[:-1])} and {told[-1]} apart: changed together, they leave all "
