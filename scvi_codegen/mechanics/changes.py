@@ -40,7 +40,7 @@ def vary(system: MechanicalSystem, count: int) -> LagrangianSystem:
     Raises:
         SystemDefinitionError: for other systems; their changes are told by :meth:`Trajectory.tangent` alone.
     """
-    twin, number = lagrangian_twin(system), checked_count(count, "the number of changes", least=1)
+    twin, number = lagrangian_twin(system), checked_count(count, "count", least=1)
     found = with_changes(twin, number) if twin else None
     if found is None:
         raise SystemDefinitionError(
