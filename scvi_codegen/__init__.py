@@ -43,6 +43,7 @@ _HOMES = {
     "runtime.linearised": ("Sensitivity",),
     "mechanics.hamiltonian": ("HamiltonianSystem", "hamiltonian_of", "lagrangian_of"),
     "mechanics.reparametrisation": ("reparametrise",),
+    "mechanics.changes": ("vary",),
     "mechanics.coordinate_change": ("change_coordinates",),
     "derivation.equations": ("StepEquations", "derive"),
     "errors": (

@@ -47,6 +47,7 @@ from scvi_codegen.frameworks.rebound import to_rebound as to_rebound
 from scvi_codegen.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.frameworks.torch import torch_flow as torch_flow
 from scvi_codegen.indexed_compiler import compile_indexed as compile_indexed
+from scvi_codegen.mechanics.changes import vary as vary
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of

@@ -12,12 +12,42 @@ from dataclasses import replace
 import sympy
 from sympy import Expr
 
+from scvi_codegen.counts import checked_count
+from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.kinds import takes
 from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 
-__all__ = ["with_changes"]
+__all__ = ["vary", "with_changes"]
+
+
+@takes(system=SYSTEM)
+def vary(system: MechanicalSystem, count: int) -> LagrangianSystem:
+    """The system, and beside it ``count`` small changes of its motion, as coordinates of their own: ``x_change_1``.
+
+    By SVI and collocation they are the exact derivatives of the computed motion along so many directions, as
+    :meth:`Trajectory.tangent` has them, at a third of a step each: solved by the sweeps of the motion itself. A run
+    starts from q with the directions of q behind it, one after the other, and from p with those of p.
+
+    Args:
+        system: with constant masses, one a coordinate, and forces of position and time alone.
+        count: of changes, at least 1.
+
+    Raises:
+        SystemDefinitionError: for other systems; their changes are told by :meth:`Trajectory.tangent` alone.
+    """
+    twin, number = lagrangian_twin(system), checked_count(count, "count", least=1)
+    found = with_changes(twin, number) if twin else None
+    if found is None:
+        raise SystemDefinitionError(
+            f"changes of '{system.name}' do not follow by its own sweeps: that takes constant masses, one a "
+            "coordinate, forces of position and time alone, and no constraints. Take run.tangent(), which all have"
+        )
+    return found
 
 
 def with_changes(system: LagrangianSystem, count: int) -> LagrangianSystem | None:

@@ -1,8 +1,21 @@
 """Motions beside small changes of them: the variational equations of what can be written down."""
 
+import numpy as np
+import pytest
 import sympy
+from numpy.testing import assert_allclose
+from samples import QUICK_FLAGS
 
-from scvi_codegen import LagrangianSystem, problem
+from scvi_codegen import (
+    SVI,
+    Gauss,
+    LagrangianSystem,
+    SystemDefinitionError,
+    compile_stepper,
+    hamiltonian_of,
+    problem,
+    vary,
+)
 from scvi_codegen.mechanics.changes import with_changes
 from scvi_codegen.mechanics.forms import forms_of
 
@@ -46,3 +59,22 @@ def test_masses_that_move_have_no_changes_of_this_kind():
         name="magnetic", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2"
     )
     assert with_changes(magnetic, 1) is None
+
+
+@pytest.mark.parametrize("method", [SVI(5), SVI(3, "gauss-lobatto:5"), Gauss(3)], ids=["svi", "other points", "gauss"])
+def test_changes_by_sweeps_are_the_derivative_of_the_computed_motion(method):
+    """Steps commute with differentiation: the tangent map of the run, also of a Hamiltonian, and symplectic."""
+    kepler, (q, p) = problem("kepler").system, ([0.5, 0.0], [0.0, 3**0.5])
+    tangent = compile_stepper(kepler, method, flags=QUICK_FLAGS).integrate(q, p, h=0.1, steps=63).tangent()[-1]
+    made, directions = compile_stepper(vary(hamiltonian_of(kepler), 4), method, flags=QUICK_FLAGS), np.eye(4)
+    starts = (np.concatenate([own, of.T.ravel()]) for own, of in ((q, directions[:2]), (p, directions[2:])))
+    end = made.integrate(*starts, h=0.1, steps=63)
+    found = np.vstack([end.q[-1, 2:].reshape(4, 2).T, end.p[-1, 2:].reshape(4, 2).T])
+    assert_allclose(found, tangent, rtol=0, atol=1e-11 * np.abs(tangent).max())
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
+    assert np.abs(found.T @ omega @ found - omega).max() < 1e-14 * np.abs(found).max() ** 2
+
+
+def test_what_has_no_changes_of_its_own_is_refused():
+    with pytest.raises(SystemDefinitionError, match=r"'double pendulum' do not follow by its own sweeps.*run.tangent"):
+        vary(problem("double-pendulum").system, 2)
