@@ -89,12 +89,10 @@ def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
             f"for (int e = 0; e < {len(each.table)}; e++) {{",
             f"  const int *at = {_table_name(each, 'places')}[e], *to = {aims}[e];",
             f"  {real} slot[{each.term.arguments}], term[{values}];",
-            f"  for (int a = 0; a < {slots}; a++)",
-            "    slot[a] = u[at[a]];",
+            *(f"  slot[{a}] = u[at[{a}]];" for a in range(slots)),
             *(f"  slot[{slots + k}] = {text};" for k, text in enumerate(given)),
             f"  {each.term.name}(slot, t, parameters, term);",
-            f"  for (int a = 0; a < {values}; a++)",
-            "    value[to[a]] += term[a];",
+            *(f"  value[to[{a}]] += term[{a}];" for a in range(values)),
             "}",
         ]
     return lines
