@@ -51,7 +51,9 @@ def _text(system: IndexedSystem) -> Iterator[str]:
         yield "Constraints, each with what it adds to the forces:"
     for term in system.constraints:
         yield f"  {constraint_text(term)}"
-        pushed = zip(held_slots(system, term), slopes_of(system, term), strict=False)
+        pushed = zip(
+            held_slots(term, system.coordinates), slopes_of(term, system.coordinates, system.time), strict=False
+        )
         yield from (f"    on {access}: lambda*({slope})" for (_, access), slope in pushed)
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))

@@ -53,7 +53,9 @@ def _pushes(system: IndexedSystem) -> Iterator[_Pushes]:
     for force in system.forces:
         yield _Pushes(force.targets, tuple(slot for slot, _ in force.slots))
     for term in system.constraints:  # G^T lambda, with any lambda
-        pairs = zip(held_slots(system, term), slopes_of(system, term), strict=False)
+        pairs = zip(
+            held_slots(term, system.coordinates), slopes_of(term, system.coordinates, system.time), strict=False
+        )
         yield _Pushes(tuple((access, slope) for (_, access), slope in pairs), tuple(slot for slot, _ in term.slots))
 
 
