@@ -18,7 +18,7 @@ from scvi_codegen.runtime.indexed_problem import IndexedProblem
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "project"]
 
 
-class HeldRun(Protocol):
+class RunOfArrays(Protocol):
     """What is asked of a run.
 
     Attributes:
@@ -41,14 +41,14 @@ class HeldRun(Protocol):
         ...
 
 
-def constraint_values(run: HeldRun) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
+def constraint_values(run: RunOfArrays) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
     """g, and its rate, of each constraint as it was written, an array over its loops."""
     found = np.zeros(_count(run)), np.zeros(_count(run))
     run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, found))
     return _apart(run, found[0]), _apart(run, found[1])
 
 
-def multipliers(run: HeldRun) -> tuple[Numbers, ...]:
+def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
     """Multipliers lambda of the forces G^T lambda that keep the state on each constraint, an array over its loops."""
     found = np.zeros(_count(run))
     if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
@@ -56,7 +56,7 @@ def multipliers(run: HeldRun) -> tuple[Numbers, ...]:
     return _apart(run, found)
 
 
-def consistent(run: HeldRun) -> None:
+def consistent(run: RunOfArrays) -> None:
     """Put the state a run begins with on the constraints: silently by what rounding and typing explain, or say so.
 
     Raises:
@@ -78,7 +78,7 @@ def consistent(run: HeldRun) -> None:
     warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=5)
 
 
-def project(run: HeldRun) -> tuple[Numbers, tuple[float, float]]:
+def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
     """Put the state on the constraints; returned are the one before, and how far positions and momenta were off.
 
     Raises:
@@ -96,7 +96,7 @@ def project(run: HeldRun) -> tuple[Numbers, tuple[float, float]]:
     return before, (_relative(before[:half], run.state[:half]), _relative(before[half:], run.state[half:]))
 
 
-def check_reachable(run: HeldRun) -> None:
+def check_reachable(run: RunOfArrays) -> None:
     """Raise :class:`StateError` where changed parameters put constraints elsewhere; momenta follow rates that jump."""
     before, (moved, _) = project(run)
     if moved > TYPED:
@@ -108,13 +108,13 @@ def check_reachable(run: HeldRun) -> None:
     run.state[: len(before) // 2] = before[: len(before) // 2]
 
 
-def _count(run: HeldRun) -> int:
+def _count(run: RunOfArrays) -> int:
     if not run.problem.interface.constraints:
         raise MethodError(f"{run.problem.interface.system} has no constraints")
     return sum(int(np.prod(_shape(loops, run.problem.arrays.sizes))) for loops in run.problem.interface.constraints)
 
 
-def _apart(run: HeldRun, values: Numbers) -> tuple[Numbers, ...]:
+def _apart(run: RunOfArrays, values: Numbers) -> tuple[Numbers, ...]:
     """By constraints as they were written."""
     found, start = [], 0
     for loops in run.problem.interface.constraints:
