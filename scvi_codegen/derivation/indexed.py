@@ -12,7 +12,7 @@ from scvi_codegen.ir.indexed import HeldSteps, IndexedProgram
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 from scvi_codegen.lowering.indexed import lower_indexed
-from scvi_codegen.mechanics.indexed.constraints import constraint_text, held_slots, slopes_of
+from scvi_codegen.mechanics.indexed.constraints import constraint_text, pushes_of
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
@@ -51,8 +51,8 @@ def _text(system: IndexedSystem) -> Iterator[str]:
         yield "Constraints, each with what it adds to the forces:"
     for term in system.constraints:
         yield f"  {constraint_text(term)}"
-        pushed = zip(held_slots(system, term), slopes_of(system, term), strict=False)
-        yield from (f"    on {access}: lambda*({slope})" for (_, access), slope in pushed)
+        pushed = pushes_of(term, system.coordinates, system.time)
+        yield from (f"    on {access}: lambda*({slope})" for access, slope in pushed)
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"

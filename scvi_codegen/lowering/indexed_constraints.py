@@ -65,10 +65,10 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
 def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
     """Of each constraint: its condition, and how straight motions bend away from it."""
     for number, term in enumerate(system.constraints):
-        held = held_slots(system, term)
+        held = held_slots(term, system.coordinates)
         u, accesses = [slot for slot, _ in held], tuple(access for _, access in held)
         v = tuple(Symbol(f"{slot.name} along", real=True) for slot in u)
-        *slopes, rate = slopes_of(system, term)
+        *slopes, rate = slopes_of(term, system.coordinates, system.time)
         values = [term.formula, rate, *slopes]
         condition = LoopedKernel(
             text=comment_text(constraint_text(term)),
@@ -79,5 +79,6 @@ def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel
             kernel=kernel_of(system, f"condition_{number}", values, term.slots, u, "g, g_t, and the slopes of g."),
         )
         both = [*term.slots, *zip(v, accesses, strict=True)]
-        bend = kernel_of(system, f"bend_{number}", [bend_of(system, term, v)], both, [*u, *v], "d^2 g / dt^2 along v.")
+        second = [bend_of(term, system.coordinates, system.time, v)]
+        bend = kernel_of(system, f"bend_{number}", second, both, [*u, *v], "d^2 g / dt^2 along v.")
         yield condition, replace(condition, slots=(*accesses, *accesses), along=len(accesses), kernel=bend)

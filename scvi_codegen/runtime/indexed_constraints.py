@@ -4,38 +4,59 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
 from scvi_codegen.indices import Loop
-from scvi_codegen.native.options import STATUS
+from scvi_codegen.native.options import STATUS, SolverOptions
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
 from scvi_codegen.runtime.indexed_interface import Numbers
-
-if TYPE_CHECKING:
-    from scvi_codegen.runtime.indexed_run import IndexedRun
+from scvi_codegen.runtime.indexed_problem import IndexedProblem
 
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "project"]
 
 
-def constraint_values(run: IndexedRun) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
+class RunOfArrays(Protocol):
+    """What is asked of a run.
+
+    Attributes:
+        problem: what moves.
+        options: of the solver.
+        state: positions and momenta, in a row.
+    """
+
+    problem: IndexedProblem
+    options: SolverOptions | None
+    state: Numbers
+
+    @property
+    def t(self) -> float:
+        """The time."""
+        ...
+
+    def call(self, name: str, *arguments: Any) -> int:
+        """What a function of C says of it."""
+        ...
+
+
+def constraint_values(run: RunOfArrays) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
     """g, and its rate, of each constraint as it was written, an array over its loops."""
     found = np.zeros(_count(run)), np.zeros(_count(run))
     run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, found))
     return _apart(run, found[0]), _apart(run, found[1])
 
 
-def multipliers(run: IndexedRun) -> tuple[Numbers, ...]:
+def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
     """Multipliers lambda of the forces G^T lambda that keep the state on each constraint, an array over its loops."""
     found = np.zeros(_count(run))
     if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
-        raise StateError(f"the constraints of {run.interface.system} leave no forces here ({STATUS[status]})")
+        raise StateError(f"the constraints of {run.problem.interface.system} leave no forces here ({STATUS[status]})")
     return _apart(run, found)
 
 
-def consistent(run: IndexedRun) -> None:
+def consistent(run: RunOfArrays) -> None:
     """Put the state a run begins with on the constraints: silently by what rounding and typing explain, or say so.
 
     Raises:
@@ -57,7 +78,7 @@ def consistent(run: IndexedRun) -> None:
     warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=5)
 
 
-def project(run: IndexedRun) -> tuple[Numbers, tuple[float, float]]:
+def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
     """Put the state on the constraints; returned are the one before, and how far positions and momenta were off.
 
     Raises:
@@ -68,12 +89,14 @@ def project(run: IndexedRun) -> tuple[Numbers, tuple[float, float]]:
     if status:
         same = "do constraints say the same there, or contradict each other?"
         hint = f"; {same if 'singular' in STATUS[status] else 'give positions that are nearer to them'}"
-        raise StateError(f"the constraints of {run.interface.system} cannot be met near there ({STATUS[status]}{hint})")
+        raise StateError(
+            f"the constraints of {run.problem.interface.system} cannot be met near there ({STATUS[status]}{hint})"
+        )
     half = len(before) // 2
     return before, (_relative(before[:half], run.state[:half]), _relative(before[half:], run.state[half:]))
 
 
-def check_reachable(run: IndexedRun) -> None:
+def check_reachable(run: RunOfArrays) -> None:
     """Raise :class:`StateError` where changed parameters put constraints elsewhere; momenta follow rates that jump."""
     before, (moved, _) = project(run)
     if moved > TYPED:
@@ -85,17 +108,17 @@ def check_reachable(run: IndexedRun) -> None:
     run.state[: len(before) // 2] = before[: len(before) // 2]
 
 
-def _count(run: IndexedRun) -> int:
-    if not run.interface.constraints:
-        raise MethodError(f"{run.interface.system} has no constraints")
-    return sum(int(np.prod(_shape(loops, run.sizes))) for loops in run.interface.constraints)
+def _count(run: RunOfArrays) -> int:
+    if not run.problem.interface.constraints:
+        raise MethodError(f"{run.problem.interface.system} has no constraints")
+    return sum(int(np.prod(_shape(loops, run.problem.arrays.sizes))) for loops in run.problem.interface.constraints)
 
 
-def _apart(run: IndexedRun, values: Numbers) -> tuple[Numbers, ...]:
+def _apart(run: RunOfArrays, values: Numbers) -> tuple[Numbers, ...]:
     """By constraints as they were written."""
     found, start = [], 0
-    for loops in run.interface.constraints:
-        shape = _shape(loops, run.sizes)
+    for loops in run.problem.interface.constraints:
+        shape = _shape(loops, run.problem.arrays.sizes)
         size = int(np.prod(shape))
         found.append(values[start : start + size].reshape(shape))
         start += size

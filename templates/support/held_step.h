@@ -1,4 +1,4 @@
-/* A step that constraints hold: parts of RATTLE. Before it: add_forces, find_conditions, held_matrix.h,
+/* A step that constraints hold: parts of RATTLE. Before it: increments.h, add_forces, find_conditions, held_matrix.h,
  * indexed_iteration.h, PARTS of a step, PART and where they end, PART_END. */
 
 #define NEAR_ENOUGH 1e-3 /* of a system: corrections are to make what is left less than that */
@@ -32,12 +32,6 @@ static held_run held_run_of(run_memory *run, const problem *given, const solver_
   const long long n = NAME(coordinates)(given);
   const held_run of = {run, given, divide(run, n), held_of(run, n), n, options, report};
   return of;
-}
-
-static void add_to(double *restrict x, const double *restrict y, double by, long long n)
-{
-  for (long long i = 0; i < n; i++)
-    x[i] += by * y[i];
 }
 
 /* x = G^T lambda. */
@@ -192,16 +186,6 @@ static int hold(const held_run *of, double h, double t)
         (fabs(run->p[i] + parts->dp[i]) + fabs(h / 2) * (fabs(parts->F[i]) + fabs(parts->R[i])));
   }
   return turn(of, h / 2, h, size);
-}
-
-/* x += y, and what rounding cuts off (Knuth). */
-static void add_all(double *restrict x, const double *restrict y, double *restrict rest, long long n)
-{
-  for (long long i = 0; i < n; i++) {
-    const double sum = x[i] + y[i], part = sum - x[i];
-    rest[i] = (x[i] - (sum - part)) + (y[i] - part);
-    x[i] = sum;
-  }
 }
 
 /* Increments begin with what rounding cut off the state; a step that fails leaves the state, and begins anew. */

@@ -1,5 +1,5 @@
 /* A step of any number of coordinates by kicks of h KICK[n] F, each followed by a drift of h DRIFT[n] v. Before it:
- * add_forces, LEAPS, CHUNK, the tables. */
+ * increments.h, add_forces, LEAPS, CHUNK, the tables. */
 
 /* The parts of work: where forces are taken, forces at the end of a step, increments of positions and momenta. */
 typedef struct {
@@ -16,28 +16,12 @@ static void drift_by(double by, const double *restrict inverse_mass, const doubl
   }
 }
 
-static void add_to(double *restrict x, const double *restrict y, double by, long long n)
-{
-  for (long long i = 0; i < n; i++)
-    x[i] += by * y[i];
-}
-
 static int all_sums_finite(const double *x, const double *y, long long n)
 {
   int faults = 0;
   for (long long i = 0; i < n; i++)
     faults |= 0.0 * (x[i] + y[i]) != 0.0;
   return !faults;
-}
-
-/* x += y, and what rounding cuts off (Knuth). */
-static void add_all(double *restrict x, const double *restrict y, double *restrict rest, long long n)
-{
-  for (long long i = 0; i < n; i++) {
-    const double sum = x[i] + y[i], part = sum - x[i];
-    rest[i] = (x[i] - (sum - part)) + (y[i] - part);
-    x[i] = sum;
-  }
 }
 
 /* Whether the last kick of a step is at its end: its forces are those of the first of the next. */

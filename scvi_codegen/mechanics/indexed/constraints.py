@@ -9,21 +9,18 @@ G M^-1 G^T is a sparse matrix, whose pattern is that of the net: known when a ru
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Iterator, Sequence
 
-from sympy import Add, Expr, Symbol
+from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
-from scvi_codegen.indices import Access
+from scvi_codegen.indices import Access, Array
 
-if TYPE_CHECKING:
-    from scvi_codegen.mechanics.indexed.system import IndexedSystem
-
-__all__ = ["bend_of", "check_constraints", "constraint_text", "held_slots", "slopes_of"]
+__all__ = ["bend_of", "check_constraint", "constraint_text", "held_slots", "pushes_of", "slopes_of"]
 
 
 def constraint_text(term: IndexedTerm) -> str:
@@ -36,45 +33,51 @@ def _named(term: IndexedTerm) -> Iterator[object]:
     return (loop for loop in term.loops if loop.index not in behind)
 
 
-def check_constraints(system: IndexedSystem) -> None:
-    """Raise :class:`SystemDefinitionError` for constraints of a Hamiltonian, of nothing, of velocities, of inputs."""
-    if system.constraints and system.momenta:
-        raise SystemDefinitionError("constraints stand beside a lagrangian, whose masses they are held by")
-    for term in system.constraints:
-        shown = constraint_text(term)
-        if problem := unsupported_part(term.formula):
-            raise SystemDefinitionError(f"in the constraint '{shown}' of '{system.name}': {problem}")
-        arrays = {access.array for _, access in term.slots}
-        if moving := arrays - {*system.state, *system.fields}:
-            name = min(array.name for array in moving)
-            raise SystemDefinitionError(
-                f"the constraint '{shown}' names the velocity {name}: those of sums over indices are of positions"
-            )
-        if not held_slots(system, term):
-            raise SystemDefinitionError(f"there is no coordinate in the constraint '{shown}'")
-        driven = {each for each in term.formula.free_symbols if each.name.rsplit("_", 1)[0] in system.inputs}
-        if driven:
-            raise SystemDefinitionError(
-                f"the constraint '{shown}' depends on an input, which may jump: make it a parameter or a formula in t"
-            )
+def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
+    """Raise :class:`SystemDefinitionError` for a constraint of nothing, of velocities, of inputs.
+
+    Args:
+        term: the constraint.
+        coordinates, fields: arrays that it may name.
+        inputs: a pattern of the symbols that are parts of inputs.
+    """
+    shown = constraint_text(term)
+    if problem := unsupported_part(term.formula):
+        raise SystemDefinitionError(f"in the constraint '{shown}': {problem}")
+    if moving := {access.array for _, access in term.slots} - {*coordinates, *fields}:
+        name = min(array.name for array in moving)
+        raise SystemDefinitionError(
+            f"the constraint '{shown}' names the velocity {name}: those of sums over indices are of positions"
+        )
+    if not held_slots(term, coordinates):
+        raise SystemDefinitionError(f"there is no coordinate in the constraint '{shown}'")
+    if inputs and any(re.fullmatch(inputs, each.name) for each in term.formula.free_symbols):
+        raise SystemDefinitionError(
+            f"the constraint '{shown}' depends on an input, which may jump: make it a parameter or a formula in t"
+        )
 
 
-def held_slots(system: IndexedSystem, term: IndexedTerm) -> tuple[tuple[Symbol, Access], ...]:
+def held_slots(term: IndexedTerm, coordinates: Sequence[Array]) -> tuple[tuple[Symbol, Access], ...]:
     """The coordinates in a constraint."""
-    return tuple(pair for pair in term.slots if pair[1].array in system.coordinates)
+    return tuple(pair for pair in term.slots if pair[1].array in coordinates)
 
 
-def slopes_of(system: IndexedSystem, term: IndexedTerm) -> tuple[Expr, ...]:
+def slopes_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
     """G of one element, by its coordinates, and g_t behind."""
-    variables = [*(slot for slot, _ in held_slots(system, term)), system.time]
+    variables = [*(slot for slot, _ in held_slots(term, coordinates)), time]
     slopes = gradient(term.formula, variables)
-    return tuple(slopes.get(k, Add()) for k in range(len(variables)))
+    return tuple(slopes.get(k, S.Zero) for k in range(len(variables)))
 
 
-def bend_of(system: IndexedSystem, term: IndexedTerm, velocities: tuple[Symbol, ...]) -> Expr:
+def pushes_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[tuple[Access, Expr], ...]:
+    """On what a multiplier of 1 pushes, and how much."""
+    slopes = slopes_of(term, coordinates, time)
+    return tuple((access, slopes[k]) for k, (_, access) in enumerate(held_slots(term, coordinates)))
+
+
+def bend_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]) -> Expr:
     """d^2 g / dt^2 along a straight motion with these velocities, one a coordinate: v^T g_qq v + 2 g_qt v + g_tt."""
-    variables = [*(slot for slot, _ in held_slots(system, term)), system.time]
-    rates = [*velocities, Add(1)]
-    slopes = gradient(term.formula, variables)
-    rate = Add(*(slope * rates[k] for k, slope in slopes.items()))
+    variables = [*(slot for slot, _ in held_slots(term, coordinates)), time]
+    rates = [*velocities, S.One]
+    rate = Add(*(slope * rates[k] for k, slope in gradient(term.formula, variables).items()))
     return Add(*(slope * rates[k] for k, slope in gradient(rate, variables).items()))

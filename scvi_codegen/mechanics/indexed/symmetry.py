@@ -17,7 +17,7 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, IndexedMap, Place
-from scvi_codegen.mechanics.indexed.constraints import held_slots, slopes_of
+from scvi_codegen.mechanics.indexed.constraints import pushes_of
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.tables.precision import mp
 
@@ -53,8 +53,8 @@ def _pushes(system: IndexedSystem) -> Iterator[_Pushes]:
     for force in system.forces:
         yield _Pushes(force.targets, tuple(slot for slot, _ in force.slots))
     for term in system.constraints:  # G^T lambda, with any lambda
-        pairs = zip(held_slots(system, term), slopes_of(system, term), strict=False)
-        yield _Pushes(tuple((access, slope) for (_, access), slope in pairs), tuple(slot for slot, _ in term.slots))
+        entries = pushes_of(term, system.coordinates, system.time)
+        yield _Pushes(entries, tuple(slot for slot, _ in term.slots))
 
 
 def _maps(system: IndexedSystem, array: Array) -> Iterator[IndexedMap]:

@@ -28,7 +28,7 @@ from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
-from scvi_codegen.mechanics.indexed.constraints import check_constraints, constraint_text
+from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, velocity_slots
 
 __all__ = ["INDEXED", "IndexedSystem"]
@@ -80,7 +80,10 @@ class IndexedSystem:
             for access, formula in force.targets:
                 if problem := unsupported_part(formula):
                     raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
-        check_constraints(self)
+        if self.constraints and self.momenta:
+            raise SystemDefinitionError("constraints stand beside a lagrangian, whose masses they are held by")
+        for term in self.constraints:
+            check_constraint(term, self.coordinates, self.fields, "|".join(f"{name}_[0123t]" for name in self.inputs))
         for array in () if self.momenta else self.coordinates:
             if not any(mass.access.array == array for mass in self.masses):
                 raise SystemDefinitionError(
