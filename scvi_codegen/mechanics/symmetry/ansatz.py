@@ -174,4 +174,4 @@ def _rank(found: Sequence[Terms]) -> int:
     for k, terms in enumerate(found):
         for monomial, coefficient in terms.items():
             matrix[k, places[monomial]] = complex(coefficient.xreplace(numbers))
-    return int(np.linalg.matrix_rank(matrix))
+    return int(np.linalg.matrix_rank(matrix)) if matrix.size else 0  # NumPy 1.26 knows no rank of an empty one
