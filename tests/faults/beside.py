@@ -77,7 +77,7 @@ RATTLES = tuple(
     for what, *edit in (
         ("slopes of the next point", r"slope = now->slope \+ e \* B, \*own", "slope = now->slope + e * B + 1, *own"),
         (
-            "positions but for what was cut off",
+            "positions off by 1e-12 of a step",
             r"HELD_POSITION\[b\]\[r\] \* z",
             "HELD_POSITION[b][r] * (1 + 1e-12) * z",
         ),
