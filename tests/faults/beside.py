@@ -76,9 +76,8 @@ RATTLES = tuple(
     text(f"{what}, rods/lobatto-svi", case("rods/lobatto-svi"), *edit)
     for what, *edit in (
         ("slopes of the next point", r"slope = now->slope \+ e \* B, \*own", "slope = now->slope + e * B + 1, *own"),
-        ("velocities of the forces before", r"HELD_MOMENTUM\[n\]\[b\] \* f", "HELD_MOMENTUM[0][b] * f"),
         (
-            "positions but for what was cut off",
+            "positions off by 1e-12 of a step",
             r"HELD_POSITION\[b\]\[r\] \* z",
             "HELD_POSITION[b][r] * (1 + 1e-12) * z",
         ),
