@@ -23,6 +23,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import Makers, race
 from scvi_codegen.benchmark.references import (
     Extended,
+    Field,
     Reference,
     field_of,
     remembered,
@@ -177,9 +178,7 @@ def _shortest(runs: Sequence[Array]) -> Extended:
     return np.diff(np.array(times, dtype=np.longdouble))
 
 
-def _with_two_steps(
-    field: Callable[[Extended], Extended], start: Extended, steps: Extended
-) -> tuple[Extended, Extended]:
+def _with_two_steps(field: Field, start: Extended, steps: Extended) -> tuple[Extended, Extended]:
     """The ends by these steps and by halves of them, or, where the longest cannot be solved, by shorter ones."""
     for parts in 2 ** np.arange(HALVINGS + 1):
         short = np.repeat(steps / parts, parts)
