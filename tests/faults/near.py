@@ -34,7 +34,18 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
     "templates/support/events": ("runtime/test_events.py",),
     "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
-    "templates/support/legendre": ("runtime/test_given_velocities.py", "runtime/test_stepper.py"),
+    "templates/support/legendre": (
+        "runtime/test_given_velocities.py",
+        "runtime/test_stepper.py",
+        "rendering/test_c_text.py",
+    ),
+    "templates/parts/newton": (
+        "lowering/test_iterations.py",
+        "lowering/test_newton.py",
+        "runtime/test_sensitivity.py",
+        "runtime/test_stepper.py",
+        "methods/test_constraints.py",
+    ),
     "templates/support/newton": (
         "lowering/test_iterations.py",
         "lowering/test_newton.py",
