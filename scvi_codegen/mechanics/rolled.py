@@ -21,8 +21,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["LEAST_ROLLED", "Rolled", "RolledTerms", "rolled"]
 
-LEAST_ROLLED = 1000
-"""Terms of one kind: fewer are written out, which shares what they have in common, as distances."""
+LEAST_ROLLED = 300
+"""Terms of one kind: of fewer the code is short enough written out, and shares what they have in common."""
 MOST_KINDS = 64
 
 
