@@ -77,7 +77,8 @@ typedef struct {{ double tolerance; long long max_iterations; int absolute; }} s
 static double larger(double a, double b) {{ return a > b ? a : b; }}
 static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
 static double number_of(double x) {{ return x; }}
-#include "{header}"
+#include "{folder}/contraction.h"
+#include "{folder}/inverse_sizes.h"
 int verdict(double change, double last, double tolerance, int absolute, int k)
 {{
   const solver_options options = {{tolerance, 40, absolute}};
@@ -94,10 +95,10 @@ void scales(double absolute, double *size)
 
 @cache
 def header(folder: Path, after: int):
-    """The functions of the header alone, of changes that are not squared."""
+    """The functions of the headers alone, of changes that are not squared."""
     compiler = shutil.which("cc") or pytest.skip("there is no C compiler")
-    path = Path(__file__).parents[2] / "templates/support/contraction.h"
-    (folder / f"{after}.c").write_text(VERDICTS.format(after=after, header=path))
+    headers = Path(__file__).parents[2] / "templates/support"
+    (folder / f"{after}.c").write_text(VERDICTS.format(after=after, folder=headers))
     command = [compiler, "-std=c99", "-shared", "-fPIC", f"{after}.c", "-o", f"{after}.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True, capture_output=True)
     found = ctypes.CDLL(str(folder / f"{after}.so"))
