@@ -465,8 +465,8 @@ def test_a_table_of_one_axis() -> None:
 
 
 def test_the_error_of_a_step_from_rest_at_0() -> None:
-    """Where nothing but a drive moves anything, it is a part of where that leads; too large by what the coefficient below
-    the highest has to say of a step as short as this."""
+    """Where nothing but a drive moves anything, it is a part of where that leads; it is held against the coefficient
+    below the highest, which is far too much for so short a step."""
     driven = sc.IndexedSystem.from_text(
         name="driven", coordinates=["q[N]"], lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2)", forces={"q[0]": "cos(t)"}
     )
