@@ -19,7 +19,14 @@ from typing import Any, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
-from scvi_codegen.errors import BuildError, MethodWarning, RecordingError, ScviCodegenError, StepFailedError
+from scvi_codegen.errors import (
+    AccuracyWarning,
+    BuildError,
+    MethodWarning,
+    RecordingError,
+    ScviCodegenError,
+    StepFailedError,
+)
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native.waiting import told_to
 
@@ -121,7 +128,8 @@ def _warnings_as_lines() -> Iterator[None]:
             click.echo(f"Warning: {message}", err=True)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("always", MethodWarning)
+        for kind in (MethodWarning, AccuracyWarning):
+            warnings.simplefilter("always", kind)
         warnings.showwarning = show
         yield
 

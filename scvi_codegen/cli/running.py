@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,7 @@ from scvi_codegen.cli.conservation import energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration, in_known_digits
-from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -258,13 +259,20 @@ def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory) -> Iterat
 
 
 def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) -> Iterator[str]:
-    """How well the worst step was resolved."""
-    if math.isnan(trajectory.step_error):
+    """How well the worst step was resolved; a warning where it was too long, so that no option silences it."""
+    error, begun = trajectory.step_error, f"from t = {trajectory.step_error_t:g}"
+    if math.isnan(error):
         yield "worst step: its error is not known, nothing tells it here"
     else:
-        said = f"worst step: relative error about {trajectory.step_error:.1e}, from t = {trajectory.step_error_t:g}"
-        too_long = "; too long: take a shorter step, or --tolerance"
-        yield said + too_long * (trajectory.step_error > TOLERABLE_ERROR)
+        too_long = error > TOLERABLE_ERROR
+        yield f"worst step: relative error about {error:.1e}, {begun}{': too long' * too_long}"
+        if too_long:
+            warnings.warn(
+                f"the step {begun} is too long: the relative error of its end is about {error:.1e}; take a shorter "
+                "--step, or --tolerance",
+                AccuracyWarning,
+                stacklevel=2,
+            )
 
 
 def final_state(names: Sequence[str], positions: Array, momenta: Array, known: Known | None = None) -> Iterator[str]:

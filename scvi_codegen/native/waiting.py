@@ -13,24 +13,30 @@ __all__ = ["tell", "told_to", "waiting_for"]
 PATIENCE_SECONDS = 2.0
 
 
-def _tell_the_terminal(what: str) -> None:
-    """A line on stderr where a person sees it."""
-    if sys.stderr is not None and sys.stderr.isatty():
+def _print(what: str) -> None:
+    """A line on stderr, be it a terminal or a file."""
+    if sys.stderr is not None:
         print(f"scvi-codegen: {what} ...", file=sys.stderr, flush=True)
 
 
-_listener: ContextVar[Callable[[str], None]] = ContextVar("listener", default=_tell_the_terminal)
+def _tell_the_terminal(what: str) -> None:
+    """A line where a person waits for it."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        _print(what)
+
+
+_listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", default=None)
 
 
 def tell(what: str) -> None:
-    """Say it now, where a person sees it."""
-    _listener.get()(what)
+    """Say it now, also where nobody looks until the work is done: how long that takes, say."""
+    (_listener.get() or _print)(what)
 
 
 @contextmanager
 def waiting_for(what: str) -> Iterator[None]:
     """Say what is being done if it takes longer than two seconds."""
-    timer = threading.Timer(PATIENCE_SECONDS, _listener.get(), [what])
+    timer = threading.Timer(PATIENCE_SECONDS, _listener.get() or _tell_the_terminal, [what])
     timer.daemon = True
     timer.start()
     try:

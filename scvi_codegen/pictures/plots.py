@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from scvi_codegen.pictures.conserved import plot_energy, plot_momentum_maps
@@ -27,7 +27,7 @@ class Plots:
     Each draws on the axes ``ax`` or on new ones, writes to a .png or .svg if a path is given, and returns the axes.
     """
 
-    trajectory: DrawnMotion
+    trajectory: DrawnMotion = field(repr=False)
 
     def __call__(self, path: Path = None) -> tuple[Axes, ...]:
         """Where it goes and how well it keeps its energy, as :func:`scvi_codegen.plot_trajectory`."""

@@ -302,6 +302,15 @@ class TestRun:
             "run", "kepler", "--method", "explicit-euler", "--step", "0.1", "--span", "10"
         )
 
+    @pytest.mark.parametrize("option", ["--quiet", "--json"])
+    def test_a_step_that_is_far_too_long_is_warned_of_whatever_is_printed(self, option):
+        """One point and a step of a quarter of the period: the energy of so few states is constant, by chance."""
+        words = ("run", "harmonic-oscillator", "--degree", "2", "--quadrature", "gauss-legendre:1", "--steps", "40")
+        result = invoke(*words, "--step", "1.5", option)
+        assert result.exit_code == 0
+        assert re.search(r"Warning: the step from t = \S+ is too long: .* take a shorter --step", result.stderr)
+        assert "too long" not in invoke("run", "harmonic-oscillator", option).stderr
+
     def test_the_largest_energy_error_is_told_and_not_the_last(self):
         run = compile_stepper(problem("kepler").system, StoermerVerlet()).integrate(
             problem("kepler").q, problem("kepler").velocity, h=0.01, steps=628

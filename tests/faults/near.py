@@ -23,7 +23,11 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/density": ("runtime/test_density.py",),
     "templates/support/exchanges": ("runtime/test_exchanges.py", "promises/test_forced_motion.py"),
     "templates/support/inputs": ("runtime/test_driven.py", "models/test_package_inputs.py"),
-    "templates/support/push": ("runtime/test_sensitivity.py", "runtime/test_deviations.py"),
+    "templates/support/push": (
+        "runtime/test_sensitivity.py",
+        "runtime/test_deviations.py",
+        "rendering/test_support.py",
+    ),
     "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
     "templates/support/flow": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
     "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
@@ -32,7 +36,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/support/lent": ("runtime/test_fallback.py",),
     "templates/support/borrowed": ("runtime/test_fallback.py",),
     "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
-    "templates/support/events": ("runtime/test_events.py",),
+    "templates/support/events": ("runtime/test_events.py", "rendering/test_support.py"),
     "templates/support/event_": ("runtime/test_events.py", "runtime/test_clock.py"),
     "templates/support/legendre": (
         "runtime/test_given_velocities.py",
@@ -50,6 +54,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "lowering/test_iterations.py",
         "lowering/test_newton.py",
         "lowering/test_stiff_newton.py",
+        "rendering/test_support.py",
     ),
     "templates/support/band": ("lowering/test_band.py", "lowering/test_newton.py"),
     "templates/support/crowd": ("runtime/test_ensemble.py",),
@@ -59,6 +64,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         f"templates/support/{stem}": (
             "runtime/test_controlled_steps.py",
             "lowering/test_ladder.py",
+            "rendering/test_support.py",
             "runtime/test_step_error.py",
             "results/test_controlled_recording.py",
         )

@@ -116,21 +116,21 @@ def test_what_is_derived_is_shown() -> None:
     """A slope for every slot; the formula as a mathematician writes it."""
     net = system(
         "q[N]",
-        "sum(i in N, mass[i]*q_dot[i]**2/2) - sum(b in B, cos(q[ends[b, 0]] - q[ends[b, 1]])) - q[N-1]**2"
+        "sum(i in N, mass[i]*q_dot[i]**2/2) - sum(b in B, cos(q[ends_of[b, 0]] - q[ends_of[b, 1]])) - q[N-1]**2"
         "- sum(i < j in N, q[i]*q[j]) - sum(i in N periodic, q[i-1]*q[i])",
         parameters={"mass[N]": 1},
-        tables=["ends[B, 2]"],
+        tables=["ends_of[B, 2]"],
     )
     slopes = {str(term): found for term, found in net.kernels}
-    a, b = (sympy.Symbol(f"q[ends[b, {k}]]", real=True) for k in (0, 1))
-    assert slopes["sum(b in B, -cos(q[ends[b, 0]] - q[ends[b, 1]]))"] == {
+    a, b = (sympy.Symbol(f"q[ends_of[b, {k}]]", real=True) for k in (0, 1))
+    assert slopes["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"] == {
         a.name: sympy.sin(a - b),
         b.name: -sympy.sin(a - b),
     }
     shown = net._repr_latex_()
     for part in (
         r"\sum_{i=0}^{N-1} \left(\frac{\mathrm{mass}_{i} \dot{q}_{i}^{2}}{2}\right)",
-        r"\cos{\left(q_{\mathrm{ends}_{b 0}} - q_{\mathrm{ends}_{b 1}} \right)}",
+        r"\cos{\left(q_{\mathrm{ends\_of}_{b 0}} - q_{\mathrm{ends\_of}_{b 1}} \right)}",
         r"\sum_{0 \le i < j < N} \left(- q_{i} q_{j}\right)",
         r"\sum_{i \in \mathbb{Z}_{N}}",
         "- q_{N-1}^{2}",

@@ -6,6 +6,7 @@ SciPy's DOP853 on the equations of motion.
 
 import numpy as np
 import pytest
+import sympy
 from samples import QUICK_FLAGS
 from scipy.integrate import solve_ivp
 
@@ -216,6 +217,12 @@ def test_who_does_not_take_it():
         compile_stepper(plain, Composition(8))
     with pytest.raises(SystemDefinitionError, match="damping acts on 'damped'"):
         reparametrise(plain, "1 + x**2")
+    x, c = sympy.Function("x")(sympy.Symbol("t", real=True)), sympy.Symbol("c", real=True)
+    for rate in (sympy.zeta(c), sympy.Heaviside(c), sympy.I * c, sympy.oo):
+        with pytest.raises(SystemDefinitionError, match="in the damping of 'odd'"):
+            LagrangianSystem.from_sympy(
+                name="odd", coordinates=[x], lagrangian=x.diff() ** 2, parameters={"c": 1.0}, damping=rate
+            )
     for rate, symbol in (("c*x", "x"), ("c*t", "t"), ("c + y_dot", "y_dot")):
         with pytest.raises(SystemDefinitionError, match=rf"depends on '{symbol}'.*as forces"):
             LagrangianSystem.from_text(

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -242,6 +243,22 @@ def test_a_type_checker_knows_them_and_the_code_of_the_pages(tmp_path):
         'typed.py:5: error: Module has no attribute "no_such_name"  [attr-defined]',
         f"Found 1 error in 1 file (checked {len(files)} source files)",
     ]
+
+
+@pytest.mark.full
+def test_another_type_checker_does_too(tmp_path):
+    if shutil.which("pyright") is None:
+        pytest.skip("pyright is not installed")
+    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    (tmp_path / "readme.py").write_text(
+        "\n".join(re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL))
+    )
+    (tmp_path / "typed.py").write_text(TYPED)
+    words = ["pyright", "--pythonpath", sys.executable, "."]
+    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    assert 'Type of "sc.SVI(4)" is "SVI"' in said
+    assert re.findall(r"(\w+\.py:\d+):\d+ - error", said) == ["typed.py:5"]
+    assert "1 error, " in said
 
 
 def test_public_names_are_all_there_and_come_from_where_they_are_said_to():

@@ -227,7 +227,7 @@ def test_verify_a_model_file_and_what_was_generated_from_it(tmp_path: Path) -> N
     assert command(str(folder), "--degree", "3")[0] == 2
 
 
-def test_a_certificate_says_what_takes_long_and_how_long(quickly_compiled, monkeypatch):
+def test_a_certificate_says_what_takes_long_and_how_long(quickly_compiled, monkeypatch, capsys):
     entry = problem("harmonic-oscillator")
     said: list[str] = []
     monkeypatch.setattr(waiting, "PATIENCE_SECONDS", 0.0)
@@ -236,5 +236,8 @@ def test_a_certificate_says_what_takes_long_and_how_long(quickly_compiled, monke
     given = subject.State(np.array([1.0]), np.array([0.5]), 0.0, 0.1)
     with waiting.told_to(said.append):
         next(step_checks(subject.Subject(entry.system, SVI(1), stepper, None, given)))
+    assert capsys.readouterr().err == ""
+    next(step_checks(subject.Subject(entry.system, SVI(1), stepper, None, given)))
+    assert "which takes some" in capsys.readouterr().err  # which is no terminal
     assert "measuring stage equations" in said
-    assert any("so the certificate takes some" in line for line in said)
+    assert any("unknowns a step are solved in 60 digits, which takes some" in line for line in said)

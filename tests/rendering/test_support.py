@@ -1,0 +1,157 @@
+"""Parts of the C text called alone, where the end of a step would hide what they do wrong: what is chosen, and read."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from scvi_codegen import SVI, SolverOptions, compile_stepper, problem
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.lowering.solvers.ladder import REACH
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.rendering.source import Source
+
+SUPPORT = Path(__file__).parents[2] / "templates/support"
+SANITIZED = ("gcc", "-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+@cache
+def is_sanitized() -> bool:
+    """Whether there is a compiler that has the sanitizers."""
+    words = [*SANITIZED, "-x", "c", "-", "-o", os.devnull]
+    empty = "int main(void) { return 0; }"
+    found = shutil.which(words[0]) is not None
+    return found and subprocess.run(words, input=empty, text=True, capture_output=True, check=False).returncode == 0
+
+
+def said(program: str, folder: Path, *flags: str) -> str:
+    """What a program prints, compiled in a folder under the sanitizers."""
+    if not is_sanitized():
+        pytest.skip("no gcc with sanitizers here")
+    (folder / "main.c").write_text(program)
+    for command in ([*SANITIZED, *flags, "main.c", "-lm", "-o", "main"], [str(folder / "main")]):
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def written(source: Source, folder: Path) -> str:
+    """The source as one file, beside its header; its prefix."""
+    alone = source.amalgamated()
+    (folder / f"{alone.prefix}.h").write_text(alone.header)
+    (folder / f"{alone.prefix}.c").write_text(alone.code)
+    return alone.prefix
+
+
+LADDER = """
+#include <stdio.h>
+typedef double real;
+typedef struct { int guess; long long change, change_before; } run_memory;
+struct guess_tables { const real *alone, *last, *before; };
+static const real LADDER_ALONE[5][1] = {{0}}, LADDER_LAST[5][5][1] = {{{0}}}, LADDER_BEFORE[5][5][1] = {{{0}}};
+#include "ladder_tables.h"
+int main(void)
+{
+  for (int guess = 1; guess <= 2; guess++)
+    for (int before = -6; before <= 6; before++)
+      for (int change = -6; change <= 6; change++) {
+        const run_memory run = {guess, change, before};
+        struct guess_tables found = {NULL, NULL, NULL};
+        printf("%d %d %d %d", guess, before, change, choose_tables(&run, &found));
+        printf(" %td", found.alone ? found.alone - LADDER_ALONE[0] : -1);
+        printf(" %td", found.last ? found.last - LADDER_LAST[0][0] : -1);
+        printf(" %td\\n", found.before ? found.before - LADDER_BEFORE[0][0] : -1);
+      }
+  return 0;
+}
+"""
+
+
+def test_a_guess_is_continued_as_far_as_there_are_tables_and_no_further(tmp_path):
+    """From the last step for every change of length that has a table; from two for every pair; from none beyond."""
+    assert REACH == 2
+    lines = [list(map(int, line.split())) for line in said(LADDER, tmp_path, f"-I{SUPPORT}").splitlines()]
+    assert len(lines) == 2 * 13 * 13
+    for guess, before, change, *found in lines:
+        reached = abs(change) <= REACH and (guess == 1 or abs(before) <= REACH)
+        pair = 5 * (before + REACH) + change + REACH if guess == 2 else -1
+        assert found == ([1, change + REACH, pair, pair] if reached else [0, -1, -1, -1])
+
+
+DOUBT = """
+int main(void)
+{{
+  const double line[EVENT_DEGREE + 1] = {{0, 1}}, cubic[EVENT_DEGREE + 1] = {{0, -0.25, 0, 1}};
+  const double bowl[EVENT_DEGREE + 1] = {{0.26, -1, 1}}, *all[] = {{line, cubic, bowl}};
+  const double doubts[][2] = {{{{0.12, 0.13}}, {{0.03, 0.04}}, {{0.009, 0.011}}}};
+  for (int i = 0; i < 3; i++)
+    for (int k = 0; k < 2; k++) {{
+      double extrema[EVENT_DEGREE];
+      int count;
+      printf("%.6f ", doubtful_place(all[i], doubts[i][k], extrema, &count));
+    }}
+  return 0;
+}}
+"""
+
+
+def test_a_step_is_split_where_a_zero_is_in_doubt_and_nowhere_else(tmp_path):
+    """x: slope 1, x^3 - x/4: slope -1/4 in the middle and 1/2 outside, both against eight doubts; a bowl 0.01 deep."""
+    stepper = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=["q"])
+    beside = stepper.source.beside
+    assert beside is not None
+    written(stepper.source, tmp_path)
+    program = f'#include <stdio.h>\n#include "{written(beside, tmp_path)}.c"\n{DOUBT.format()}'
+    flags = ("-Wno-unused-function", f"{stepper.source.prefix}.c")
+    found = [float(place) for place in said(program, tmp_path, *flags).split()]
+    assert found == pytest.approx([2.0, 0.0, 2.0, 0.0, 2.0, 0.5], abs=1e-6)
+
+
+def test_an_unknown_momentum_counts_in_how_far_newtons_iteration_has_come():
+    """A body that falls from q0 = q1: its velocity is guessed at once, its momentum off by g h / 2."""
+    falling = LagrangianSystem.from_text(name="falling", coordinates=["x"], lagrangian="x_dot**2/2 - 10*x")
+    stepper = compile_stepper(falling, SVI(1), solver="newton")
+    once = SolverOptions(tolerance=1e-9, max_iterations=1, absolute=True)
+    with pytest.raises(StepFailedError, match=r"\b5(\.0+)?(e\+00)?\b"):
+        stepper.discrete_legendre_minus([0.0], [0.0], 1.0, options=once)
+
+
+DERIVATIVES = """
+int main(void)
+{{
+  enum {{ m = COORDINATES, given = GIVEN, count = 3, steps = 2 }};
+  double *workspace = malloc(sizeof(double) * LINEARISED_WORKSPACE), t[steps] = {{0.0, 0.1}}, h[steps] = {{0.1, 0.1}};
+  double q[steps * m], p[steps * m], *vectors = calloc((steps + 1) * count * given, sizeof(double));
+  const double parameters[] = {{{defaults}}};
+  int status = 0;
+  report found;
+  for (int i = 0; i < steps * m; i++)
+    q[i] = 0.7 - 0.1 * i, p[i] = 0.3 + 0.2 * i;
+  for (int i = 0; i < (steps + 1) * count * given; i++)
+    vectors[i] = 0.1 * i;
+  for (int back = 0; back < 2; back++)
+    status |= linearise(steps, t, h, q, p, parameters, NULL, back, count, vectors, NULL, NULL, &found, workspace);
+  free(workspace), free(vectors);
+  return status;
+}}
+"""
+
+
+@pytest.mark.parametrize(
+    "system", [problem("harmonic-oscillator").system, problem("kepler").system], ids=lambda system: system.name
+)
+def test_derivatives_read_and_write_nothing_but_their_own(system, tmp_path):
+    """Forward and back, in a workspace of exactly the length that they ask for."""
+    stepper = compile_stepper(system, SVI(2))
+    assert stepper.derivatives is not None
+    prefix = written(stepper.derivatives, tmp_path)
+    names = re.sub(r"\b([A-Z_]{5,})\b", rf"{prefix.upper()}_\1", DERIVATIVES.format(defaults="1.0, 1.0"))
+    names = names.replace(f"{prefix.upper()}_NULL", "NULL")
+    names = re.sub(r"\b(linearise\(|report found)", rf"{prefix}_\1", names)
+    said(f'#include <stdlib.h>\n#include "{prefix}.h"\n{names}', tmp_path, f"{prefix}.c")
