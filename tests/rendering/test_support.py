@@ -88,9 +88,12 @@ DOUBT = """
 int main(void)
 {{
   const double line[EVENT_DEGREE + 1] = {{0, 1}}, cubic[EVENT_DEGREE + 1] = {{0, -0.25, 0, 1}};
-  const double bowl[EVENT_DEGREE + 1] = {{0.26, -1, 1}}, *all[] = {{line, cubic, bowl}};
-  const double doubts[][2] = {{{{0.12, 0.13}}, {{0.03, 0.04}}, {{0.009, 0.011}}}};
-  for (int i = 0; i < 3; i++)
+  const double bowl[EVENT_DEGREE + 1] = {{0.26, -1, 1}}, hollow[EVENT_DEGREE + 1] = {{0.017, -0.12, 0, 1}};
+  double high[EVENT_DEGREE + 1] = {{-0.5}};
+  const double *all[] = {{line, cubic, bowl, hollow, high}};
+  const double doubts[][2] = {{{{0.12, 0.13}}, {{0.03, 0.04}}, {{0.009, 0.011}}, {{0.0005, 0.002}}, {{0.1, 0.6}}}};
+  high[EVENT_DEGREE] = 1;
+  for (int i = 0; i < 5; i++)
     for (int k = 0; k < 2; k++) {{
       double extrema[EVENT_DEGREE];
       int count;
@@ -102,7 +105,8 @@ int main(void)
 
 
 def test_a_step_is_split_where_a_zero_is_in_doubt_and_nowhere_else(tmp_path):
-    """x: slope 1, x^3 - x/4: slope -1/4 in the middle and 1/2 outside, both against eight doubts; a bowl 0.01 deep."""
+    """x: slope 1, x^3 - x/4: slope -1/4 in the middle and 1/2 outside, both against eight doubts; hollows
+    0.01 and 0.001 above zero, of one extremum and of two; the highest power alone."""
     stepper = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=["q"])
     beside = stepper.source.beside
     assert beside is not None
@@ -110,7 +114,7 @@ def test_a_step_is_split_where_a_zero_is_in_doubt_and_nowhere_else(tmp_path):
     program = f'#include <stdio.h>\n#include "{written(beside, tmp_path)}.c"\n{DOUBT.format()}'
     flags = ("-Wno-unused-function", f"{stepper.source.prefix}.c")
     found = [float(place) for place in said(program, tmp_path, *flags).split()]
-    assert found == pytest.approx([2.0, 0.0, 2.0, 0.0, 2.0, 0.5], abs=1e-6)
+    assert found == pytest.approx([2.0, 0.0, 2.0, 0.0, 2.0, 0.5, 2.0, 0.2, 2.0, 0.0], abs=1e-6)
 
 
 def test_an_unknown_momentum_counts_in_how_far_newtons_iteration_has_come():
