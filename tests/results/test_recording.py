@@ -24,9 +24,8 @@ from scvi_codegen.methods import SVI, Gauss, StoermerVerlet
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import dump_model
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native import building
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run, writing
+from scvi_codegen.results.recording import RecordedRun, load_run, manifest, record_run, resume_run, writing
 from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.stepper import Stepper
@@ -145,7 +144,7 @@ class TestRecording:
     def test_another_compiler_or_processor_is_told_and_kept(self, kepler, monkeypatch):
         recorded(kepler, 500, stop=StopsAfter(3))
         step = load_run("a.run").steps
-        monkeypatch.setattr(building, "fingerprint", lambda source, flags: "another")
+        monkeypatch.setattr(manifest, "fingerprint", lambda source, flags: "another")
         with pytest.warns(RecordingWarning, match=f"from step {step} on other code runs"):
             resume_run("a.run", steps=600)
         with warnings.catch_warnings():

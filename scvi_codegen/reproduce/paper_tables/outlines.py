@@ -81,6 +81,12 @@ REPEAT = Step(
     },
 )
 LINE = "newton_from_line"
+GUESSES = {
+    "solve": ("guess_from(", LINE),
+    "guess_from": ("gather(EXTRAPOLATION",),
+    LINE: ("line_from(",),
+    "line_from": (f"{PREFIX}_velocity(", "place_on_line("),
+}
 
 SVI_STEPS = (
     POINTS,
@@ -95,7 +101,7 @@ SVI_STEPS = (
         number=3,
         text="choose an initial guess for the solution at the collocation points Q_k",
         counterpart="The curve of the step before, continued; the straight line where there is none or it fails.",
-        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "place_on_line(")},
+        evidence=GUESSES,
     ),
     Step(
         number=4,
@@ -126,7 +132,7 @@ SCVI_STEPS = (
         "inverting the continuous Legendre transformation",
         counterpart="The curve of the step before, continued; the straight line with the velocity that belongs to p_k "
         "where there is none or it fails.",
-        evidence={"solve": ("gather(EXTRAPOLATION", LINE), LINE: (f"{PREFIX}_velocity(", "place_on_line(")},
+        evidence=GUESSES,
     ),
     Step(
         number=4,
