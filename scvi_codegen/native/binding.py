@@ -110,8 +110,9 @@ class Binding:
 
     def pointer(self, array: NDArray[Any]) -> Any:
         """To the first element of a contiguous float64 or int32 array; NULL for an empty one."""
-        kind = "int[]" if array.dtype == np.int32 else "double[]"
-        return self._ffi.from_buffer(kind, array) if array.size else self.null
+        if not array.size:
+            return self.null
+        return self._ffi.from_buffer("int[]" if array.dtype == np.int32 else "double[]", array)
 
     def workspace(self) -> Any:
         """Memory for one call."""

@@ -30,6 +30,8 @@ __all__ = ["Memory"]
 
 UNHEARD_STEPS = 10**5
 """Between looks at the keyboard."""
+NOTHING = np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.int32)
+"""Where times, states and counts go that nobody keeps."""
 
 
 class Memory:
@@ -220,9 +222,9 @@ class Memory:
 
     def skip(self, steps: int) -> None:
         """Advance by ``steps``, no more than lead to the goal, and keep nothing."""
-        nothing, count = np.empty(0), checked_count(steps, "steps", least=0)
+        count = checked_count(steps, "steps", least=0)
         never = self.steps + count + 1
-        status, report = self.advance(count, never, nothing, nothing, nothing, np.empty(0, dtype=np.int32))
+        status, report = self.advance(count, never, *NOTHING)
         if status:
             raise step_failure(status, report, step=self.steps, h=self.h)
 
