@@ -65,7 +65,8 @@ for number in map(int, sys.argv[2:]):
 def loading(folder: Path, *numbers: int, **environment: str) -> subprocess.Popen[str]:
     """A process that loads these sources, one after the other, once it is given a line."""
     path = folder.parent / "sources.json"
-    path.write_text(json.dumps([asdict(source(number)) for number in range(8)]))
+    if not path.exists():  # which the processes before this one may be reading
+        path.write_text(json.dumps([asdict(source(number)) for number in range(8)]))
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-c", LOADING, str(path), *map(str, numbers)],
         env=os.environ | environment,
@@ -80,7 +81,7 @@ def at_once(processes: list[subprocess.Popen[str]]) -> list[tuple[str, str]]:
     """What they print and complain of, all let loose together."""
     for process in processes:
         assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+        assert process.stdout.readline() == "ready\n", process.communicate(timeout=60)[1]
     for process in processes:
         assert process.stdin is not None
         process.stdin.write("\n")
