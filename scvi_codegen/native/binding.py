@@ -38,10 +38,11 @@ class Binding:
         self._lacks_fallback = self._fallback is not None
         self._lender: Self | None = None
 
-    def function(self, name: str) -> Callable[..., Any]:
-        """``<prefix>_<name>``; releases the GIL while it runs."""
+    def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
+        """``<prefix>_<name>``, of this memory if one is given; releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
-        return partial(self._call, function) if self._lacks_fallback else function
+        own = () if memory is None else (memory,)
+        return self._borrowing(function, *own) if self._lacks_fallback else partial(function, *own)
 
     def with_function(self, name: str) -> Self:
         """This one, or that of the fallback where the function is there alone."""
@@ -68,17 +69,20 @@ class Binding:
     def _has(self, name: str) -> bool:
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
-    def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """The call; if it asks for the fallback, that is borrowed, and it is made again on the memory it began with."""
-        memory = self._ffi.buffer(arguments[0]) if isinstance(arguments[0], self._ffi.CData) else None
-        before = None if memory is None else bytes(memory)
-        status = function(*arguments)
-        if status != NEEDED:
-            return status
-        self.borrow_fallback()
-        if memory is not None:
+    def _borrowing(self, function: Callable[..., Any], *own: Any) -> Callable[..., Any]:
+        """The function; a call that asks for the fallback is made again with it, on the memory it began with."""
+        memory = self._ffi.buffer(*own) if own else bytearray()
+
+        def call(*arguments: Any) -> Any:
+            before = bytes(memory)
+            status = function(*own, *arguments)
+            if status != NEEDED:
+                return status
+            self.borrow_fallback()
             memory[:] = before
-        return function(*arguments)
+            return function(*own, *arguments)
+
+        return call
 
     def constant(self, name: str) -> int:
         """``<PREFIX>_<NAME>``, of an enumeration."""

@@ -79,13 +79,13 @@ def _steps_from(states: KeptStates, kept: int) -> tuple[Array, Array, Array, flo
     count = round((states.tau[kept + 1] - states.tau[kept]) / h) if kept + 1 < len(states) else 1
     if count <= 1:
         return t, q, p, h
-    from scvi_codegen.runtime.memory import Memory
+    from scvi_codegen.runtime.memory import Memory, fill
 
     run = Memory.started(
         states.stepper, q[0], p[0], h=h, t=float(t[0]), parameters=states.parameters, options=states.options
     )
     times, positions, momenta = np.empty(count - 1), *np.empty((2, count - 1, q.shape[1]))
-    status, report = run.advance(count - 1, 1, times, positions, momenta, np.empty(count - 1, dtype=np.int32))
+    status, report = fill(run, count - 1, 1, times, positions, momenta, np.empty(count - 1, dtype=np.int32))
     if status:
         raise step_failure(status, report, step=run.steps, h=h)
     return np.append(t, times), np.concatenate([q, positions]), np.concatenate([p, momenta]), h

@@ -122,7 +122,7 @@ def _takewhole_steps(
                 parameters=states.parameters,
                 options=states.options,
             )
-        run.skip(int(whole[k]) - run.steps)
+        run.advance(int(whole[k]) - run.steps)
         t[k], q[k], p[k] = run.t, run.q, run.p
 
 

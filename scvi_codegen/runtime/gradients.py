@@ -20,7 +20,7 @@ from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.levels import time_of
 from scvi_codegen.runtime.linearised import LinearisedMethod, Sensitivity, Starts
-from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.memory import Memory, fill
 from scvi_codegen.runtime.retaken import refuse_strays, steps_between
 
 __all__ = [
@@ -228,7 +228,7 @@ def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArra
         options=states.options,
     )
     times = np.empty(count)
-    status, report = run.advance(count, 1, times, starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
+    status, report = fill(run, count, 1, times, starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
     if status:
         raise step_failure(status, report, step=run.steps, h=length)
     if states.tau is not None:

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.counts import checked_count
+from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
@@ -25,13 +25,13 @@ from scvi_codegen.runtime.inputs import (
 )
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["Memory"]
+__all__ = ["Memory", "fill"]
 
 
 UNHEARD_STEPS = 10**5
 """Between looks at the keyboard."""
-NOTHING = np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.int32)
-"""Where times, states and counts go that nobody keeps."""
+NEVER = LARGEST_COUNT
+"""No step's number: of states that are to be kept."""
 
 
 class Memory:
@@ -39,10 +39,10 @@ class Memory:
 
     Attributes:
         stepper: the compiled integrator.
-        goal: where steps that choose their length lead, ``None`` for steps of h.
         longest: the most time between states that were kept, so far.
 
-    A step of a system with inputs waits until each of them was given (:meth:`hold`, or its parameters).
+    A step of a system with inputs waits until each of them was given (:meth:`hold`, or its parameters). What C is given
+    with each call stays where it is as long as the run lasts, so that a call costs little more than its steps.
     """
 
     def __init__(
@@ -55,6 +55,13 @@ class Memory:
         awaited: tuple[str, ...] = (),
     ) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
+        binding, m = stepper.binding, stepper.dimension
+        self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
+        self._given = binding.pointer(parameters), binding.options(options)
+        self._dropped = *map(binding.pointer, np.empty((3, m))), binding.pointer(np.empty(1, dtype=np.int32))
+        self._report, self._workspace = binding.new("report *"), binding.workspace()
+        firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
+        self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
         self.goal, self._awaited, self.longest = goal, awaited, 0.0
 
     @classmethod
@@ -118,6 +125,16 @@ class Memory:
         return cls(stepper, memory, values, checked_options(options), goal, awaited)
 
     @property
+    def goal(self) -> Goal | None:
+        """Where steps that choose their length lead, ``None`` for steps of h."""
+        return self._goal
+
+    @goal.setter
+    def goal(self, goal: Goal | None) -> None:
+        self._goal, self._way = goal, (goal.t_end, goal.tau or goal.tolerance) if goal else ()
+        self._go = self.stepper.binding.function("advance_to" if goal else "advance", self._memory)
+
+    @property
     def h(self) -> float:
         """Step size, 0 where steps choose their length."""
         return float(self._memory.h)
@@ -162,14 +179,13 @@ class Memory:
     def hold(self, **inputs: float) -> None:
         """Go on with inputs held at numbers: between the samples of a controller.
 
-        >>> run.hold(u=-1.5); run.skip(10)  # doctest: +SKIP
+        >>> run.hold(u=-1.5); run.advance(10)  # doctest: +SKIP
         """
-        names, values = self.stepper.interface.inputs, self._parameters.copy()
+        values = self._parameters.copy()
         for name, value in inputs.items():
-            if name not in names:
-                raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
-            first = parameter_index(self.stepper.interface, f"{name}_0")
-            values[first : first + 5] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
+            if name not in self._inputs:
+                raise StateError(f"{name!r} is no input of this system, which has {', '.join(self._inputs) or 'none'}")
+            values[self._inputs[name]] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
         self._go_on_with(values)
         if self._awaited:
             self._awaited = tuple(name for name in self._awaited if name not in inputs)
@@ -178,7 +194,7 @@ class Memory:
         """These values of the parameters, unless constraints of positions jump with them."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
-        self._parameters = values
+        self._parameters[:] = values
 
     @property
     def steps(self) -> int:
@@ -188,12 +204,12 @@ class Memory:
     @property
     def q(self) -> Array:
         """(m,) positions."""
-        return np.array(list(self._memory.q))
+        return self._q.copy()
 
     @property
     def p(self) -> Array:
         """(m,) momenta."""
-        return np.array(list(self._memory.p))
+        return self._p.copy()
 
     @property
     def carries(self) -> tuple[Array, Array]:
@@ -220,53 +236,29 @@ class Memory:
         """Back to when :meth:`save` gave these bytes."""
         self.stepper.binding.buffer(self._memory)[:] = saved
 
-    def skip(self, steps: int) -> None:
-        """Advance by ``steps``, no more than lead to the goal, and keep nothing."""
-        count = checked_count(steps, "steps", least=0)
-        never = self.steps + count + 1
-        status, report = self.advance(count, never, *NOTHING)
-        if status:
-            raise step_failure(status, report, step=self.steps, h=self.h)
+    def advance(self, steps: int) -> None:
+        """So many steps; of those that choose their length no more than lead to the goal.
+
+        Raises:
+            StepFailedError: if one fails; the run stands before it.
+        """
+        left = checked_count(steps, "steps", least=0)
+        while left > 0 and not self.arrived:
+            if status := self._advance(min(left, UNHEARD_STEPS), NEVER, self._dropped):
+                raise step_failure(status, self._report, step=self.steps, h=self.h)
+            left -= UNHEARD_STEPS
 
     def run_to_goal(self) -> None:
         """Advance to the goal and keep nothing but the state there."""
-        m = self.stepper.dimension
         while not self.arrived:
-            last = np.empty(1), np.empty((1, m)), np.empty((1, m)), np.empty(1, dtype=np.int32)
-            status, report = self.advance(UNHEARD_STEPS, self.steps + UNHEARD_STEPS + 1, *last)
-            if status:
-                raise step_failure(status, report, step=self.steps, h=self.h)
+            self.advance(UNHEARD_STEPS)
 
-    def advance(
-        self, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
-    ) -> tuple[int, Any]:
-        """By ``steps`` in one call of C, which fills the arrays with each state whose number ``every`` divides.
-
-        With a goal, by no more steps than lead there; the state there is stored whatever its number, and the report
-        says how many are ``stored``.
-
-        Returns:
-            The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
-        """
-        if steps:
-            self.check_inputs()
-        binding, goal = self.stepper.binding, self.goal
-        report = binding.new("report *")
-        status = binding.function("advance_to" if goal else "advance")(
-            self._memory,
-            *((goal.t_end, goal.tau or goal.tolerance) if goal else ()),
-            steps,
-            every,
-            binding.pointer(self._parameters),
-            binding.options(self._options),
-            binding.pointer(t),
-            binding.pointer(q),
-            binding.pointer(p),
-            binding.pointer(iterations),
-            report,
-            binding.workspace(),
-        )
-        return status, report
+    def _advance(self, steps: int, every: int, places: tuple[Any, ...]) -> int:
+        """The status of so many in one call of C, which writes the states whose numbers ``every`` divides to places."""
+        if self._awaited and steps:
+            raise missing_input(self._awaited[0])
+        status: int = self._go(*self._way, steps, every, *self._given, *places, self._report, self._workspace)
+        return status
 
     @property
     def iterations(self) -> int:
@@ -294,6 +286,22 @@ class Memory:
             return np.nan, np.nan
         error = float(self.stepper.binding.function("step_error")(self._memory))
         return (error, float(self._memory.error_t)) if error >= 0.0 else (np.nan, np.nan)
+
+
+def fill(
+    memory: Memory, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
+) -> tuple[int, Any]:
+    """Advance by ``steps`` in one call of C, which fills the arrays with each state whose number ``every`` divides.
+
+    With a goal, by no more steps than lead there; the state there is stored whatever its number, and the report
+    says how many are ``stored``.
+
+    Returns:
+        The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
+    """
+    pointer = memory.stepper.binding.pointer
+    status = memory._advance(steps, every, (pointer(t), pointer(q), pointer(p), pointer(iterations)))
+    return status, memory._report
 
 
 def _time(memory: Any) -> float:

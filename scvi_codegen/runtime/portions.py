@@ -15,7 +15,7 @@ from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
-from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.memory import Memory, fill
 from scvi_codegen.runtime.stalling import Watch, lost_level
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -56,7 +56,7 @@ def record_states(
     while done < steps:
         size = min(portion, steps - done)
         began = time.perf_counter()
-        status, report = memory.advance(size, every, t[filled:], q[filled:], p[filled:], iterations[filled:])
+        status, report = fill(memory, size, every, t[filled:], q[filled:], p[filled:], iterations[filled:])
         done += report.steps
         filled = 1 + (first + done) // every - first // every
         if status:
@@ -99,7 +99,7 @@ def record_until(
     while not memory.arrived and (steps is None or done < steps):
         size, began, before = portion if steps is None else min(portion, steps - done), time.perf_counter(), memory.t
         piece = _Piece.empty(memory, size // every + 2)
-        status, report = memory.advance(size, every, *piece)
+        status, report = fill(memory, size, every, *piece)
         pieces.append(piece.first(report.stored))
         done += report.steps
         if status:

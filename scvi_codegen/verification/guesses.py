@@ -65,7 +65,7 @@ def _left(subject: Subject, stepper: Stepper, h: float, steps: int) -> tuple[flo
     """After so many steps of h what one iteration leaves, in parts of the state: from the line, from former steps."""
     first, parameters = subject.states[0], subject.parameters
     run = stepper.start(first.q, first.p, h=h, t=first.t, parameters=parameters)
-    run.skip(steps)
+    run.advance(steps)
     here, saved = State(run.q, run.p, run.t, h), run.save()
     runs = (
         stepper.restore(saved, parameters=parameters),
@@ -73,6 +73,6 @@ def _left(subject: Subject, stepper: Stepper, h: float, steps: int) -> tuple[flo
         stepper.restore(saved, parameters=parameters, options=ONE_ITERATION),
     )
     for each in runs:
-        each.skip(1)
+        each.advance(1)
     solved, line, guess = (np.concatenate([each.q, each.p]) / subject.scales(here) for each in runs)
     return float(np.max(np.abs(line - solved))), float(np.max(np.abs(guess - solved)))

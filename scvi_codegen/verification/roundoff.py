@@ -96,7 +96,7 @@ def _advanced(
     run = stepper.start(state.q, state.p, h=state.h, t=state.t, parameters=subject.parameters)
     if carry is not None:
         run.resume_at(0, (state.t, 0.0), (carry[: len(state.q)], carry[len(state.q) :]))
-    run.skip(steps)
+    run.advance(steps)
     return np.concatenate([run.q, run.p]), np.concatenate(run.carries)
 
 
@@ -277,7 +277,7 @@ def _runs(subject: Subject, options: SolverOptions | None, q: Array, p: Array, s
     given: dict[str, Any] = {"h": subject.given.h, "t": subject.given.t, "parameters": subject.parameters}
     for start in zip(q, p, strict=True):
         own = subject.stepper.start(*start, **given, options=options)
-        own.skip(steps)
+        own.advance(steps)
         ends.append((own.q, own.p))
     return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
 

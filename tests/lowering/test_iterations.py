@@ -74,10 +74,10 @@ def test_two_former_steps_say_more_than_one(name):
     given, left = case(name), []
     for steps in (1, 3):
         run = stepper(name, "fixed-point").start(given.q, given.p, h=CONTINUED[name] * given.h)
-        run.skip(steps)
+        run.advance(steps)
         ends = [stepper(name, "fixed-point").restore(run.save(), options=options) for options in (None, ONE_ITERATION)]
         for each in ends:
-            each.skip(1)
+            each.advance(1)
         left.append(max(abs(ends[0].q - ends[1].q)))
     assert left[0] > 2.0**-48
     assert left[1] < left[0] / 4
@@ -86,7 +86,7 @@ def test_two_former_steps_say_more_than_one(name):
 def test_factors_of_newtons_matrix_serve_the_next_step_where_steps_are_short():
     given = case("chain/svi-4")
     run = stepper("chain/svi-4", "newton").start(given.q, given.p, h=given.h / 64)
-    run.skip(3)
+    run.advance(3)
     assert run._memory.guess == 2
 
 

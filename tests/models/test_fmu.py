@@ -113,7 +113,7 @@ def test_inputs_are_held_and_parameters_may_change_on_the_way(fmu):
         assert one.set(u=u, w=w) == OK
         run.hold(u=u, w=w)
         assert one.step(0.5 + 2 * k * H, 2 * H) == OK
-        run.skip(2)
+        run.advance(2)
         assert one.get("q", "p_q") == [*run.q, *run.p]
     before = one.get("energy")
     assert one.set(m=2.5) == OK

@@ -60,7 +60,7 @@ def test_a_model_is_driven_as_by_hand(file, monkeypatch, tmp_path):
     expected = stepper.drive([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
     run = model.start(stepper)
     for steps in model.stretches(run):
-        run.skip(steps)
+        run.advance(steps)
     assert (run.t, run.q[0], run.p[0]) == (expected.t[-1], expected.q[-1, 0], expected.p[-1, 0])
 
 

@@ -143,7 +143,7 @@ def test_a_run_waits_for_the_inputs_that_were_not_given(held: tuple[str, ...]) -
     for each in (run, copy):
         for name in {"u", "w"} - set(held):
             with pytest.raises(sc.StateError, match=name):
-                each.skip(1)
+                each.advance(1)
             each.hold(**{name: 0.2})
-        each.skip(2)
+        each.advance(2)
     assert copy.save() == run.save()

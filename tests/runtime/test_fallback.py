@@ -69,7 +69,7 @@ def test_the_error_of_a_borrowed_step_is_that_of_ones_own(start):
     errors = []
     for stepper in both(SVI(4)):
         run = stepper.start(*start, h=LONG)
-        run.skip(6)
+        run.advance(6)
         errors.append(run.step_error)
     assert errors[0][0] == pytest.approx(errors[1][0], rel=1e-12)
     assert errors[0][1] == errors[1][1]
@@ -126,5 +126,5 @@ def test_a_run_that_fails_stands_before_the_step(start):
     run = borrowing.start(*start, h=40.0)
     before = run.save()
     with pytest.raises(StepFailedError):
-        run.skip(1)
+        run.advance(1)
     assert run.save() == before

@@ -193,7 +193,7 @@ class TestInputs:
             for run in runs:
                 run.hold(F=force)
             runs[0].advance(5)
-            runs[1].skip(5)
+            runs[1].advance(5)
         assert np.abs(runs[0].q["q"] - runs[1].q).max() < 1e-14
         with pytest.raises(StateError, match="'G' is no input"):
             runs[0].hold(G=1.0)

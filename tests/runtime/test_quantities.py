@@ -245,7 +245,7 @@ def test_of_runs_saved_pickled_and_gone_on_with(number):
     compiled, own = stepper(given.system.name), arguments(given)["parameters"]
     options = sc.SolverOptions(tolerance=3e-15, max_iterations=47)
     begun = compiled.start(Q, velocity=V, h=given.h, t=given.t, parameters=own, options=options)
-    begun.skip(2 * given.every)
+    begun.advance(2 * given.every)
     copies = (pickle.loads(pickle.dumps(begun)), compiled.restore(begun.save(), parameters=own, options=options))
     rest = begun.record(STEPS + 1 - 2 * given.every, every=given.every)
     assert np.allclose(rest.q, run.q[2:], rtol=0, atol=1e-13)

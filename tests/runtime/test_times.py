@@ -40,7 +40,7 @@ def test_the_time_of_a_run_is_the_sum_of_its_steps_rounded(free, t, h):
 
 def test_it_still_is_after_a_million_steps(free):
     run = free.start([0.0], [0.0], h=0.1, t=0.7)
-    run.skip(1_000_000)
+    run.advance(1_000_000)
     assert in_last_places(run.t, 0.7, 0.1, 1_000_000) <= 0.5 + 1e-9
 
 
@@ -60,10 +60,10 @@ def test_runs_and_ensembles_have_the_same_times(free):
 
 def test_a_run_restored_has_the_time_it_had(free):
     run = free.start([0.1], [0.0], h=0.1, t=0.3)
-    run.skip(1234)
+    run.advance(1234)
     again = free.restore(run.save())
     for each in (run, again):
-        each.skip(777)
+        each.advance(777)
     assert again.t == run.t
 
 

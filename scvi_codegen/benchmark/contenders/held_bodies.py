@@ -150,7 +150,7 @@ def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float])
         run, seconds, energies, worst = stepper.start(q, p, h=h), 0.0, [float(stepper.energy(q, p))], 0.0
         for _ in range(PARTS):
             began = time.process_time()
-            run.skip(steps // PARTS)
+            run.advance(steps // PARTS)
             seconds += time.process_time() - began
             energies.append(float(stepper.energy(run.q, run.p)))
             worst = max(worst, stretch(run.q))
