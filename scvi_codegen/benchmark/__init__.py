@@ -18,6 +18,7 @@
     compile_times the same for larger systems (in compile_systems), by what takes the time
     mechanisms    from SymPy's bodies and loads to a motion, beside lambdify and PyDy (in multibody)
     held          bodies held by rods, beside MuJoCo (in held_bodies): energies and lengths at equal time
+    samples       what a sample of a controller costs, beside C called bare
     sums          sums over indices at equal error, beside C by hand (lattices.c), SciPy and REBOUND; and how time grows
     builds        the same text by several compilers, and for several processors
 
@@ -52,6 +53,7 @@ from scvi_codegen.benchmark.paper_tables import run_paper_tables
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
+from scvi_codegen.benchmark.samples import run_samples
 from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.sums import run_growth, run_sums
 from scvi_codegen.benchmark.tables import ResultTable
@@ -77,6 +79,7 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "compile": run_compile_times,
     "mechanisms": run_mechanisms,
     "held": run_held,
+    "samples": run_samples,
     "sums": run_sums,
     "growth": run_growth,
     "builds": run_builds,

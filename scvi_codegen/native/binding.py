@@ -92,8 +92,8 @@ class Binding:
         """A zeroed ``<prefix>_<what>``, as in ``"run *"``."""
         return self._ffi.new(f"{self._prefix}_{what}")
 
-    def number(self, what: str) -> Any:
-        """A zeroed number of C, as in ``"long long *"``."""
+    def numbers(self, what: str) -> Any:
+        """Zeroed numbers of C, as in ``"long long *"`` and ``"double[3]"``."""
         return self._ffi.new(what)
 
     def buffer(self, struct: Any) -> Any:

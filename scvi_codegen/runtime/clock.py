@@ -33,7 +33,7 @@ def part_of_step(
     """
     binding = stepper.binding
     start_q, start_p, q1, p1 = (np.array(x, dtype=float) for x in (q, p, q, p))
-    part, report = binding.number("double *"), binding.new("report *")
+    part, report = binding.numbers("double *"), binding.new("report *")
     status = binding.function("part_of_step")(
         t,
         h,

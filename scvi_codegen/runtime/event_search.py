@@ -62,7 +62,7 @@ class CrossingSearch:
         workspace, report = self.binding.workspace(), self.binding.new("report *")
         done = 0
         while True:
-            crossings, filled = self.binding.new(f"crossing[{self._room}]"), self.binding.number("long long *")
+            crossings, filled = self.binding.new(f"crossing[{self._room}]"), self.binding.numbers("long long *")
             status = self.binding.function("crossings")(
                 self.watch,
                 len(t) - done,

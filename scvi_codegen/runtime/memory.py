@@ -55,10 +55,10 @@ class Memory:
         awaited: tuple[str, ...] = (),
     ) -> None:
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
-        binding, m = stepper.binding, stepper.dimension
+        binding = stepper.binding
         self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
         self._given = binding.pointer(parameters), binding.options(options)
-        self._dropped = *map(binding.pointer, np.empty((3, m))), binding.pointer(np.empty(1, dtype=np.int32))
+        self._dropped = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}

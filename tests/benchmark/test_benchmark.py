@@ -28,6 +28,7 @@ from scvi_codegen.benchmark import (
     mechanisms,
     paper_tables,
     report,
+    samples,
     start_up,
     sums,
 )
@@ -626,6 +627,20 @@ class TestTables:
         assert {row["build"] for row in table.rows} >= {f"{name}, portable" for name in ("gcc",) if shutil.which(name)}
         assert all(0.0 < row[f"kepler, SVI({degree})"] < 1e3 for row in table.rows for degree in (4, 8))
         assert os.environ["CC"] == "cc"
+
+    @pytest.mark.parametrize("name", ["pendulum", "cart-pole"])
+    def test_a_sample_is_the_step_of_c_called_bare(self, name):
+        sampling = samples.Sampling(samples.SYSTEMS[name], "svi:2")
+        for call in [sampling.calls[each] for each in ("assign", "hold", "bare", "advance", "sample")] * 50:
+            call()
+        q = sampling.states()
+        assert q[0] == q[1] == q[2] != [0.3] * len(q[0])
+        assert next(part.tolist() for part in sampling.calls["look"]()) == q[0]
+
+    def test_samples_are_measured(self):
+        rows = samples.run_samples(bench.Plan(quick=True), lambda text: None).rows
+        assert [row["system"] for row in rows] == ["pendulum"] * 2 + ["cart-pole"] * 2
+        assert all(row[name] > 0.0 for row in rows for name in ("bare", "assign", "hold", "advance", "sample", "look"))
 
     def test_start_up(self):
         cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows

@@ -1,0 +1,115 @@
+"""Runs that go on without keeping states: by steps, to a goal, with inputs held between samples."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.errors import StateError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.galerkin import SVI
+from scvi_codegen.runtime import memory
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.stepper import Stepper
+
+pytestmark = pytest.mark.usefixtures("as_users_compile")
+
+PUSHED = LagrangianSystem.from_text(
+    name="pushed pendulum",
+    coordinates=["q"],
+    lagrangian="q_dot**2/2 + k*cos(q)",
+    parameters={"k": 1.0},
+    forces={"q": "u"},
+    inputs=["u"],
+)
+
+
+@pytest.fixture(scope="module")
+def pushed() -> Stepper:
+    return compile_stepper(PUSHED, SVI(3))
+
+
+def standing(run):
+    return run.t, run.q.tolist(), run.p.tolist()
+
+
+@pytest.mark.parametrize("portion", [1, 7, 1000])
+def test_steps_without_states_are_those_with_them(pushed, monkeypatch, portion):
+    """In however many calls of C they are done."""
+    kept = pushed.integrate([0.3], [0.1], h=0.05, steps=100, parameters={"u_0": 0.2})
+    monkeypatch.setattr(memory, "UNHEARD_STEPS", portion)
+    run = pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2})
+    run.advance(100)
+    assert run.steps == 100
+    assert standing(run) == (kept.t[-1], kept.q[-1].tolist(), kept.p[-1].tolist())
+
+
+@pytest.mark.parametrize("portion", [3, 10**5])
+def test_at_its_goal_a_run_goes_no_farther(pushed, monkeypatch, portion):
+    goal = {"t_end": 3.0, "tolerance": 1e-9}
+    kept = pushed.integrate([0.3], [0.1], parameters={"u_0": 0.2}, **goal)
+    monkeypatch.setattr(memory, "UNHEARD_STEPS", portion)
+    for steps in ([10**6], [1] * (kept.steps - 1) + [10, 10]):
+        run = pushed.start([0.3], [0.1], parameters={"u_0": 0.2}, **goal)
+        for each in steps:
+            run.advance(each)
+        assert run.arrived
+        assert run.steps == kept.steps
+        assert standing(run) == (3.0, kept.q[-1].tolist(), kept.p[-1].tolist())
+
+
+def test_so_does_one_whose_steps_a_monitor_chooses():
+    kepler = LagrangianSystem.from_text(
+        name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
+    )
+    stepper = compile_stepper(kepler, SVI(3), monitor="frequency")
+    kept = stepper.integrate([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
+    run = stepper.start([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
+    run.advance(10**6)
+    assert standing(run) == (5.0, kept.q[-1].tolist(), kept.p[-1].tolist())
+
+
+def test_an_input_that_is_no_number_changes_none(pushed):
+    run = pushed.start([0.3], [0.1], h=0.05)
+    run.hold(u=0.4)
+    before = run.parameters
+    for wrong in (float("nan"), "1", [0.1]):
+        with pytest.raises(StateError, match="the input u"):
+            run.hold(u=wrong)
+    with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
+        run.hold(u=0.1, w=0.2)
+    assert np.array_equal(run.parameters, before)
+
+
+def test_goals_and_parameters_are_changed_on_the_way(pushed):
+    """By what is heard of in the next call, whatever was given to the last."""
+    run = pushed.start([0.3], [0.1], t_end=1.0, tolerance=1e-9, parameters={"u_0": 0.2})
+    run.advance(10**6)
+    run.change(parameters={"k": 2.0, "u_0": -0.1}, goal=Goal(t_end=2.0, tolerance=1e-9))
+    run.advance(10**6)
+    first = pushed.integrate([0.3], [0.1], t_end=1.0, tolerance=1e-12, parameters={"u_0": 0.2})
+    then = {"k": 2.0, "u_0": -0.1}
+    second = pushed.integrate(first.q[-1], first.p[-1], t=1.0, t_end=2.0, tolerance=1e-12, parameters=then)
+    assert run.t == 2.0
+    assert run.q == pytest.approx(second.q[-1], abs=1e-8)
+
+
+def test_runs_of_one_stepper_share_nothing(pushed):
+    given = np.array(pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2}).parameters)
+
+    def held(force):
+        run = pushed.start([0.3], [0.1], h=0.05, parameters=given)
+        for k in range(200):
+            run.hold(u=force * (-1) ** k)
+            run.advance(5)
+        return standing(run)
+
+    forces = [0.1 * k for k in range(8)] * 4
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(held, forces))
+    assert together == [held(force) for force in forces]
+    assert len({each[1][0] for each in together}) == 8
+    assert given[pushed.parameters.index("u_0")] == 0.2
