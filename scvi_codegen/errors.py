@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import sys
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -29,13 +31,24 @@ __all__ = [
     "StepFailedError",
     "SystemDefinitionError",
     "closest",
+    "warn",
 ]
+
+PACKAGE = __name__.partition(".")[0]
 
 
 def closest(name: str, known: Iterable[str]) -> str:
     """``"; did you mean 'x'?"`` for the known name nearest to ``name``, or a full stop."""
     matches = difflib.get_close_matches(name, list(known), n=1)
     return f"; did you mean '{matches[0]}'?" if matches else "."
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Of the line that called this package, from however deep inside it."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
 
 
 class ScviCodegenError(Exception):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import MethodWarning, StateError
+from scvi_codegen.errors import MethodWarning, StateError, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
@@ -40,10 +39,9 @@ def _verdict(error: float) -> str:
     """What is said of an error that is no small one, with a warning."""
     if error < LARGE_ERROR:
         return ""
-    warnings.warn(
+    warn(
         f"what the motion conserves is off by {error:.2g} of its size: take a smaller step, or more stages",
         MethodWarning,
-        stacklevel=2,
     )
     return ": NOT conserved" if error >= LOST else ": hardly conserved"
 

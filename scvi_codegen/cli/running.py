@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +14,7 @@ from scvi_codegen.cli.conservation import energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration, in_known_digits
-from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -267,11 +266,10 @@ def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) ->
         too_long = error > TOLERABLE_ERROR
         yield f"worst step: relative error about {error:.1e}, {begun}{': too long' * too_long}"
         if too_long:
-            warnings.warn(
+            warn(
                 f"the step {begun} is too long: the relative error of its end is about {error:.1e}; take a shorter "
                 "--step, or --tolerance",
                 AccuracyWarning,
-                stacklevel=2,
             )
 
 

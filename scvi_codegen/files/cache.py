@@ -15,7 +15,6 @@ import re
 import stat
 import tempfile
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from pathlib import Path
 
 import platformdirs
 
-from scvi_codegen.errors import BuildError, CacheWarning
+from scvi_codegen.errors import BuildError, CacheWarning, warn
 from scvi_codegen.files.atomic import remove
 
 __all__ = [
@@ -68,11 +67,10 @@ def trusted_folder() -> Path | None:
     folder = cache_folder()
     if not exposed(folder):
         return folder
-    warnings.warn(
+    warn(
         f"the cache folder '{folder}' is not used, because every user of this machine may write into it, and what lies "
         f"there is run: chmod o-w '{folder}', or name another folder in {CACHE_VARIABLE}",
         CacheWarning,
-        stacklevel=2,
     )
     return None
 

@@ -13,11 +13,10 @@ integrand: then dL/dt = L_q v + L_v a + L_t along the curve is summed, too (pape
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
-from scvi_codegen.errors import MethodError, MethodWarning
+from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import (
     resolve_nodes,
@@ -81,11 +80,10 @@ class SVI(Method):
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
         size = self.curves.dimension(self.degree)
         if self.rule.conditions < size:
-            warnings.warn(
+            warn(
                 f"{len(self.rule)} quadrature points do not determine a curve of degree {self.degree}: the stage "
                 f"equations are singular for most systems and no order is claimed; use at least {size} points",
                 MethodWarning,
-                stacklevel=3,
             )
 
     @property

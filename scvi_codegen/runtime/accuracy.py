@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import AccuracyWarning, StateError
+from scvi_codegen.errors import AccuracyWarning, StateError, warn
 from scvi_codegen.runtime.goal import Goal
 
 if TYPE_CHECKING:
@@ -113,11 +112,10 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
     controlled = trajectory.goal is not None and not trajectory.goal.tau
     if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
         return
-    warnings.warn(
+    warn(
         f"the step from t = {trajectory.step_error_t:g} with h = {trajectory.h:g} is too long: the relative error of "
         f"its end is about {error:.1e}; take a shorter h{remedy}",
         AccuracyWarning,
-        stacklevel=3,
     )
 
 
@@ -158,7 +156,7 @@ def warn_of_energies(
         why: what may be the cause, and what to do.
     """
     if lost_part(first, last, size) > tolerable and _heard.get():
-        warnings.warn(f"the energy{where} went from {first:.3g} to {last:.3g} {why}", AccuracyWarning, stacklevel=4)
+        warn(f"the energy{where} went from {first:.3g} to {last:.3g} {why}", AccuracyWarning)
 
 
 def lost_part(first: float, last: float, size: float) -> float:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
+from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import STATUS
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
@@ -84,16 +83,24 @@ def consistent(
         return q0, p0
     if moved <= TYPED:
         return q1, p1
-    g, rate = constraint_values(stepper, q0, p0, t, parameters)[:, 0]
-    k, j = int(np.abs(g).argmax()), int(np.abs(rate).argmax())
-    said = (
-        f"the initial state is {moved:.1e} (relative) off the constraints: {stepper.constraints[k]} = {g[k]:.3g}, and "
-        f"the rate of {stepper.constraints[j]} is {rate[j]:.3g}, not 0"
-    )
+    said = f"the initial state is {moved:.1e} (relative) off the constraints: {_worst(stepper, q0, p0, t, parameters)}"
     if moved > NEAR:
         raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
-    warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=4)
+    warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning)
     return q1, p1
+
+
+def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parameters) -> str:
+    """The constraint that a state is farthest off, and the rate; one of them where the other is 0 but for rounding."""
+    values = constraint_values(stepper, q, p, t, parameters)[:, 0]
+    worst = np.abs(values).argmax(axis=1)
+    largest = values[np.arange(2), worst]
+    told = [
+        f"{what}{stepper.constraints[k]} is {value:.3g}"
+        for what, k, value in zip(("", "the rate of "), worst, largest, strict=True)
+        if abs(value) > ROUNDED * np.finfo(float).eps * np.abs(largest).max()
+    ]
+    return f"{' and '.join(told)}, not 0"
 
 
 def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:

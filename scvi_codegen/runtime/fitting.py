@@ -6,7 +6,6 @@ times, and what is minimised is a smooth function of the unknowns whose slopes a
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest
+from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
 from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
@@ -163,7 +162,7 @@ def fit(
     chain, x, held, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
     if told := _told_by_steps(chain, fitted, x, ~held):
-        warnings.warn(told, AccuracyWarning, stacklevel=3)
+        warn(told, AccuracyWarning)
     return fitted
 
 

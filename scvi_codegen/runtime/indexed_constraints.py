@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
-from scvi_codegen.errors import AccuracyWarning, MethodError, StateError
+from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.indices import Loop
 from scvi_codegen.native.options import STATUS, SolverOptions
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
@@ -75,7 +74,7 @@ def consistent(run: RunOfArrays) -> None:
     )
     if max(moved) > NEAR:
         raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
-    warnings.warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning, stacklevel=5)
+    warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning)
 
 
 def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:

@@ -211,7 +211,7 @@ def test_initial_states_are_projected_or_refused():
     assert np.abs(run.constraint_values()[0]).max() < 1e-15
     with pytest.warns(AccuracyWarning, match=r"moved to the nearest"):
         stepper.integrate([1.061, -1.061], [0.0, 0.0], h=0.1, steps=1)
-    with pytest.raises(StateError, match=r"-l\*\*2 \+ x\*\*2 \+ y\*\*2 = -1\.25, .*stepper\.project"):
+    with pytest.raises(StateError, match=r"-l\*\*2 \+ x\*\*2 \+ y\*\*2 is -1\.25, .*stepper\.project"):
         stepper.integrate([1.0, 0.0], [0.0, 0.0], h=0.1, steps=1)
     q, p = stepper.project([1.0, 0.0], [3.0, 4.0])
     assert_allclose(q, [1.5, 0.0], atol=1e-15)

@@ -6,7 +6,6 @@ import json
 import os
 import shlex
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.counts import checked_count
-from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError
+from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
 from scvi_codegen.kinds import FUNCTION, PATH, REAL, TEXT, of, takes
@@ -390,10 +389,9 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _warn_of_another_build(before: Build, now: Build) -> None:
-    warnings.warn(
+    warn(
         f"from step {now.step} on other code runs than before ({now.compiler}; before: {before.compiler}): another "
         "compiler, processor or Python. States may differ in the last bits from those of a run that was never "
         "interrupted; the manifest keeps this",
         RecordingWarning,
-        stacklevel=3,
     )

@@ -1,0 +1,52 @@
+"""Warnings name the line of the user's that they are about."""
+
+from __future__ import annotations
+
+import pytest
+
+import scvi_codegen as sc
+
+ROD = sc.LagrangianSystem.from_text(
+    name="rod",
+    coordinates=["x", "y"],
+    lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+    constraints=["x**2 + y**2 - 1"],
+)
+
+
+def too_long():
+    sc.compile_stepper(ROD, "svi:2").integrate([1.0, 0.0], velocity=[0.0, 3.0], h=0.4, steps=10)
+
+
+def off_its_constraints():
+    sc.compile_stepper(ROD, "svi:2").start([1.001, 0.0], velocity=[0.0, 0.0], h=0.01)
+
+
+def of_few_points():
+    sc.SVI(4, "gauss-legendre:3")
+
+
+@pytest.mark.parametrize("act", [too_long, off_its_constraints, of_few_points])
+def test_a_warning_names_the_line_that_called(act):
+    with pytest.warns((sc.AccuracyWarning, sc.MethodWarning)) as heard:
+        act()
+    assert {warning.filename for warning in heard} == {__file__}
+    first = act.__code__.co_firstlineno
+    assert {warning.lineno for warning in heard} == {first + 1}
+
+
+@pytest.mark.parametrize(
+    ("q", "velocity", "told"),
+    [
+        ([1.001, 0.0], [0.0, 1.0], r"constraints: x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),
+        ([1.0, 0.0], [0.001, 1.0], r"constraints: the rate of x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),
+        (
+            [1.001, 0.0],
+            [0.001, 1.0],
+            r"x\*\*2 \+ y\*\*2 - 1 is 0.002 and the rate of x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0",
+        ),
+    ],
+)
+def test_a_start_off_its_constraints_is_told_of_by_what_is_off(q, velocity, told):
+    with pytest.warns(sc.AccuracyWarning, match=told):
+        sc.compile_stepper(ROD, "svi:2").start(q, velocity=velocity, h=0.01)
