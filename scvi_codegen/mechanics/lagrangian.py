@@ -229,7 +229,7 @@ class LagrangianSystem(MechanicalSystem):
         cls,
         method: LagrangesMethod,
         *,
-        name: str,
+        name: str = "mechanism",
         parameters: Mapping[Any, float] | None = None,
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
@@ -260,7 +260,7 @@ class LagrangianSystem(MechanicalSystem):
         cls,
         method: KanesMethod,
         *,
-        name: str,
+        name: str = "mechanism",
         parameters: Mapping[Any, float] | None = None,
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
@@ -293,7 +293,7 @@ class LagrangianSystem(MechanicalSystem):
         cls,
         system: System,
         *,
-        name: str,
+        name: str = "mechanism",
         parameters: Mapping[Any, float] | None = None,
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:

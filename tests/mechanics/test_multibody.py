@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -215,6 +216,10 @@ def test_loads_of_lagranges_method_need_a_frame() -> None:
         LagrangesMethod(energy, [Q1], frame=frame, **options), name="taken", parameters=NAMED
     )
     assert found == text("q1", "m*q1_dot**2/2", forces={"q1": "-c*q1_dot"})
+    unnamed = LagrangianSystem.from_lagranges_method(
+        LagrangesMethod(energy, [Q1], frame=frame, **options), parameters=NAMED
+    )
+    assert unnamed == replace(found, name="mechanism")
     with pytest.raises(SystemDefinitionError, match="no inertial frame"):
         LagrangianSystem.from_lagranges_method(LagrangesMethod(energy, [Q1], **options), name="taken", parameters=NAMED)
 
