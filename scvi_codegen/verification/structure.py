@@ -100,16 +100,15 @@ def _along(tangents: Array, around: Linearised, shrunk: float) -> tuple[Array, A
 
 def _constraints(subject: Subject) -> Finding:
     """G and its rate at states along a run, in units of what rounding each number of the state changes them by."""
-    first = subject.states[0]
-    run = subject.stepper.integrate(first.q, first.p, h=first.h, steps=STEPS, t=first.t, parameters=subject.parameters)
+    first, stepper, parameters = subject.states[0], subject.stepper, subject.held
+    q, p = stepper.project(first.q, first.p, t=first.t, parameters=parameters)
+    run = stepper.integrate(q, p, h=first.h, steps=STEPS, t=first.t, parameters=parameters)
     worst = 0.0
     for k in range(0, len(run), STEPS // LOOKED_AT):
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
         units = EPSILON * np.maximum(np.abs(state.z), subject.scales(state))
         slopes = np.abs(subject.constraint_slopes(state, units / EPSILON)).sum(axis=1) + _by_time(subject, state)
-        values = np.abs(
-            np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t, subject.parameters))
-        )
+        values = np.abs(np.concatenate(stepper.constraint_values(state.q, state.p, state.t, parameters)))
         said = slopes > 0.0  # a constraint of velocities says nothing of positions
         worst = max(worst, float(np.max(values[said] / (EPSILON * slopes[said]))))
     return Finding(worst, ROUNDINGS, f"in units of rounding, steps of {first.h:g}")
@@ -119,7 +118,7 @@ def _by_time(subject: Subject, state: State) -> Array:
     """(2c,) what a rounding of the time of a state changes constraints and their rates by, in units of rounding."""
     moment = 1e-5 * (abs(state.t) + abs(state.h))
     values = [
-        np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t + sign * moment, subject.parameters))
+        np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t + sign * moment, subject.held))
         for sign in (1, -1)
     ]
     return np.abs(values[0] - values[1]) / 2e-5

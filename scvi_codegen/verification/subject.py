@@ -85,6 +85,12 @@ class Subject:
         return dict(self._defaults)
 
     @property
+    def held(self) -> dict[str, float]:
+        """:attr:`parameters` with inputs that stay what they are: for long runs, on which cubics would grow."""
+        rates = [f"{name}_{power}" for name in self.stepper.interface.inputs for power in "123"]
+        return self.parameters | dict.fromkeys(rates, 0.0)
+
+    @property
     def damping(self) -> float:
         """The rate at :attr:`parameters`, 0 without one."""
         values = {parameter: self.parameters[parameter.name] for parameter in self.system.parameters}

@@ -22,6 +22,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.exact.motion import exact_motion
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import save_model
@@ -32,6 +33,7 @@ from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification import subject
 from scvi_codegen.verification.certificate import BrokenError, Check, Finding, Outcome, checked
 from scvi_codegen.verification.stepping import step_checks
+from scvi_codegen.verification.structure import structure_checks
 
 pytestmark = pytest.mark.long
 
@@ -134,6 +136,23 @@ def test_inputs_are_certified_at_small_values(method) -> None:
     certificate = verify(pushed_pendulum(), method, flags=QUICK_FLAGS)
     assert certificate.passed, certificate.to_text()
     assert len(certificate.checks) > 15
+
+
+def test_constraints_are_certified_under_inputs_that_stay_what_they_are() -> None:
+    """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
+    pushed = LagrangianSystem.from_text(
+        name="pushed rod",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - y",
+        constraints=["x**2 + y**2 = w**2"],
+        forces={"x": "u"},
+        inputs=["u", "w"],
+    ).with_parameters(w_0=1.0)
+    method = SVI(2, "gauss-lobatto:3")
+    stepper = compile_stepper(pushed, method, flags=QUICK_FLAGS)
+    given = subject.State(np.array([0.6, -0.8]), np.array([0.4, 0.3]), 0.0, 0.05)
+    checks = structure_checks(subject.Subject(pushed, method, stepper, None, given))
+    assert {check.name: check.outcome for check in checks}["constraints"] is Outcome.KEPT
 
 
 def test_another_integrator_than_the_one_promised_is_not_certified() -> None:
