@@ -256,7 +256,7 @@ class Memory:
     def _advance(self, steps: int, every: int, places: tuple[Any, ...]) -> int:
         """The status of so many in one call of C, which writes the states whose numbers ``every`` divides to places."""
         if self._awaited and steps:
-            raise missing_input(self._awaited[0])
+            self.check_inputs()
         status: int = self._go(*self._way, steps, every, *self._given, *places, self._report, self._workspace)
         return status
 
