@@ -45,7 +45,11 @@ class IndexedProblem:
     @property
     def parameters(self) -> dict[str, Any]:
         """Numbers and arrays by name."""
-        return dict(zip(self.interface.parameters, self.arrays.numbers, strict=True)) | self.arrays.fields
+        return self._numbers | self.arrays.fields
+
+    @property
+    def _numbers(self) -> dict[str, float]:
+        return dict(zip(self.interface.parameters, self.arrays.numbers, strict=True))
 
     def with_parameters(self, given: Mapping[str, ArrayLike] | Sequence[float] | Numbers) -> Self:
         """The same with others: by name, the rest staying; or all numbers in order.
@@ -73,4 +77,5 @@ class IndexedProblem:
                 raise StateError(f"{name!r} is no input of this system, which has {known}")
             values |= {f"{name}_0": checked_number(value, f"the input {name}")}
             values |= {f"{name}_{part}": 0.0 for part in "123t"}
-        return self.with_parameters(values)
+        numbers = number_values(self.interface, self._numbers | values)
+        return type(self)(self.interface, self.binding, replace(self.arrays, numbers=numbers))
