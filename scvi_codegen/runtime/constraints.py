@@ -95,9 +95,12 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
     values = constraint_values(stepper, q, p, t, parameters)[:, 0]
     worst = np.abs(values).argmax(axis=1)
     largest = values[np.arange(2), worst]
+    names = [stepper.constraints[k] for k in worst]
+    if not any(f"{q}_dot" in names[1] for q in stepper.coordinates):  # else it is of velocities, and a rate itself
+        names[1] = f"the rate of {names[1]}"
     told = [
-        f"{what}{stepper.constraints[k]} is {value:.3g}"
-        for what, k, value in zip(("", "the rate of "), worst, largest, strict=True)
+        f"{name} is {value:.3g}"
+        for name, value in zip(names, largest, strict=True)
         if abs(value) > ROUNDED * np.finfo(float).eps * np.abs(largest).max()
     ]
     return f"{' and '.join(told)}, not 0"

@@ -50,3 +50,14 @@ def test_a_warning_names_the_line_that_called(act):
 def test_a_start_off_its_constraints_is_told_of_by_what_is_off(q, velocity, told):
     with pytest.warns(sc.AccuracyWarning, match=told):
         sc.compile_stepper(ROD, "svi:2").start(q, velocity=velocity, h=0.01)
+
+
+def test_a_constraint_of_velocities_is_a_rate_itself():
+    blade = sc.LagrangianSystem.from_text(
+        name="blade",
+        coordinates=["x", "y", "a"],
+        lagrangian="(x_dot**2 + y_dot**2 + a_dot**2)/2",
+        constraints=["x_dot*sin(a) - y_dot*cos(a)"],
+    )
+    with pytest.raises(sc.StateError, match=r"constraints: x_dot\*sin\(a\) - y_dot\*cos\(a\) is -1, not 0"):
+        sc.compile_stepper(blade, "svi:2").start([0.0, 0.0, 0.0], velocity=[0.0, 1.0, 0.0], h=0.1)
