@@ -1,4 +1,4 @@
-/* Runs over arrays in the caller's memory. Before it: take_step of a solver, ERROR_POWER. */
+/* Runs over arrays in the caller's memory. Before it: indexed_threads.h, take_step of a solver, ERROR_POWER. */
 
 solver_options NAME(default_options)(void)
 {
@@ -6,18 +6,13 @@ solver_options NAME(default_options)(void)
   return options;
 }
 
-int NAME(advance)(run_memory *run, const problem *given, long long steps, const solver_options *options,
-    solver_report *report)
+static int take_steps(run_memory *run, const travel *way, solver_report *report)
 {
-  const solver_options standard = NAME(default_options)();
-  const long long n = NAME(coordinates)(given);
-  solver_report unread;
-  report = report ? report : &unread;
-  memset(report, 0, sizeof *report);
-  for (long long k = 0; k < steps; k++) {
+  const long long n = NAME(coordinates)(way->given);
+  while (report->steps < way->steps) {
     int status;
     report->t = run->t;
-    status = take_step(run, given, n, options ? options : &standard, report);
+    status = take_step(run, way->given, n, way->options, report);
     if (status != OK)
       return status;
     add_compensated(&run->t, &run->t_low, run->h, 0.0);
@@ -25,6 +20,17 @@ int NAME(advance)(run_memory *run, const problem *given, long long steps, const 
     report->steps++;
   }
   return OK;
+}
+
+int NAME(advance)(run_memory *run, const problem *given, long long steps, const solver_options *options,
+    solver_report *report)
+{
+  const solver_options standard = NAME(default_options)();
+  const travel way = {.go = take_steps, .given = given, .options = options ? options : &standard, .steps = steps};
+  solver_report unread;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  return go_together(run, &way, report);
 }
 
 double NAME(step_error)(const run_memory *run)
