@@ -81,7 +81,7 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
         start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
             moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, every).
     """
-    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, **start}
+    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
     templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
     return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
