@@ -51,7 +51,7 @@ def run_energies(plan: Plan, say: Say) -> ResultTable:
     errors = dict.fromkeys(("first_tenth", "largest", "at_the_end", "drift", "uncertainty"), ".1e")
     return ResultTable(
         name="energies",
-        title=f"error of the energy over {steps} steps, relative to the sizes of its two parts",
+        title=f"error of the energy over {steps} steps, relative to the largest kinetic energy",
         columns=columns | errors,
         rows=tuple(rows),
         remarks=(
@@ -70,8 +70,7 @@ def _row(each: Lattice, method: str, h: float, steps: int) -> dict[str, Any]:
         each.q, velocity=each.v, h=h, steps=steps, every=steps // SAMPLES or 1, observe=lambda run: run.t, **given
     )
     seconds = time.process_time() - began
-    size = np.abs(run.energies[:, :2]).sum(axis=1).max()
-    error = (run.energy() - run.energy()[0]) / size
+    error = (run.energy() - run.energy()[0]) / run.energies[:, 0].max()
     drift, uncertainty = fitted_slope(error)
     return {
         "problem": each.name,

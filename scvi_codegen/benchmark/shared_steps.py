@@ -20,7 +20,7 @@ __all__ = ["run_threads"]
 METHODS = ("svi:8", "stoermer-verlet")
 TURN = 0.003
 """Seconds that a turn is to take: other programs seldom break in."""
-LOOK = 1.0
+LOOK = 0.5
 """Seconds for a problem, a method and a number of threads."""
 
 

@@ -91,7 +91,7 @@ class Nest:
         lines = list(self._found(level))
         outer = [k for k, target in enumerate(self.looped.targets) if self.level(target) == level]
         if level == len(self.looped.loops):
-            return [*lines, *self._passed_over(), *innermost]
+            return [*lines, *innermost]
         lines += [line for k in outer for line in prepare(k)]
         loop, inner = self.looped.loops[level], self._inside(level + 1, prepare, innermost, finish, behind)
         last = level + 1 == len(self.looped.loops)
@@ -170,6 +170,8 @@ class Nest:
         for k, target in enumerate(self.looped.targets if self.sharing is Sharing.BY_PLACES else ()):
             if self.level(target) == level and not self._in_a_part(k):
                 yield self._named(k)
+        if level == len(self.looped.loops):
+            yield from self._passed_over()
         for k, slot in enumerate(self.looped.slots):
             if self.level(slot) == level and self.source:
                 source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
