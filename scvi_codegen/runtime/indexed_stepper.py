@@ -272,9 +272,8 @@ class IndexedStepper:
             inputs: by name, as of :meth:`Stepper.drive`: ``(t, values)``, ``(t, values, "cubic")``, a ``CubicSpline``.
             h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
             steps, t_end: with h one of both; without it ``t_end``.
-            q, p, velocity, tolerance, every, t, parameters, tables, observe, options, threads, progress, events: as
-                of
-                :meth:`integrate`; states at breakpoints are kept, too.
+            q, p, velocity, tolerance, every, t, parameters, tables: as of :meth:`integrate`.
+            observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are kept, too.
 
         Raises:
             StateError: for inputs that are not given for all of the run, or make no function of time.
