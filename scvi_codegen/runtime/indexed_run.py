@@ -53,8 +53,7 @@ class IndexedRun:
         problem: what moves.
         q: positions by name, of the shapes of the problem.
         moving: momenta, velocities or nothing, by name, and what they are.
-        h: the step; 0 where steps choose their length.
-        t: the time.
+        h, t: the step, 0 where steps choose their length; the time.
         goal: where such steps lead.
         options: when sweeps end.
         threads: how many share each step.

@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -270,6 +271,84 @@ def test_what_is_refused() -> None:
     )
     with pytest.raises(MethodError, match="one thread"):
         sc.compile_indexed(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
+
+
+WINDOWS = """
+#include "shared.c"
+#include <stdio.h>
+static void tell(const char *what, long long size, sharing how)
+{
+  for (long long round = 0; round < how.rounds; round++)
+    for (long long k = 0; k < tasks_in(&how, round); k++) {
+      const window here = window_of(&how, round, k);
+      printf("%s %lld %lld %lld %lld %lld %lld\\n", what, size, round, here.of.first, here.of.end, here.behind.first,
+             here.behind.end);
+    }
+}
+int main(void)
+{
+  static const long long sizes[] = {1, 63, 64, 100, 191, 192, 800, 3500, 5000, 70000, 1000003};
+  for (int k = 0; k < 11; k++) {
+    tell("turn", sizes[k], in_turn(3, 3 + sizes[k], 5, 1));
+    tell("wide", sizes[k], in_turn(3, 3 + sizes[k], 5, 2000));
+    if (sizes[k] < 10000)
+      tell("tiles", sizes[k], in_tiles(sizes[k]));
+  }
+  return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
+    """Rounds and windows of families of several sizes, as C says them."""
+    folder = tmp_path_factory.mktemp("windows")
+    source, _ = generate_indexed(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
+    for path, text in {**source.files, "main.c": WINDOWS}.items():
+        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).write_text(text)
+    subprocess.run([*find_compiler(), "-std=c99", "-w", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
+    found: dict[tuple[str, int], list[list[int]]] = {}
+    for line in subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True).stdout.splitlines():
+        what, size, *numbers = line.split()
+        found.setdefault((what, int(size)), []).append([int(number) for number in numbers])
+    return found
+
+
+def test_neighbouring_blocks_are_never_done_at_a_time(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+    """Of a round; and every index is in one block."""
+    several = 0
+    for (what, size), each in windows.items():
+        if what == "tiles":
+            continue
+        assert sorted(each, key=lambda window: window[1])[0][1] == 3
+        assert sum(end - first for _, first, end, *_ in each) == size
+        for number in (0, 1):
+            blocks = sorted((first, end) for round_, first, end, *_ in each if round_ == number)
+            several += len(blocks) > 1
+            assert all(after - before >= 5 for (_, before), (after, _) in pairwise(blocks))
+    assert several >= 10
+
+
+def test_blocks_of_pairs_meet_once_and_one_another_a_round(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+    most = 0
+    for (what, size), each in windows.items():
+        if what != "tiles":
+            continue
+        met = np.zeros((size, size), dtype=int)
+        for _, first, end, behind, last in each:
+            met[first:end, behind:last] += 1
+        assert np.array_equal(np.triu(met, 1), np.triu(np.ones_like(met), 1))
+        for number in {window[0] for window in each}:
+            places = [
+                place
+                for round_, first, end, behind, last in each
+                if round_ == number
+                for place in {*range(first, end), *range(behind, last)}
+            ]
+            assert len(places) == len(set(places)) == size
+            most = max(most, number)
+    assert most == 31
 
 
 RACES = """
