@@ -20,6 +20,8 @@
     held          bodies held by rods, beside MuJoCo (in held_bodies): energies and lengths at equal time
     samples       what a sample of a controller costs, beside C called bare
     sums          sums over indices at equal error, beside C by hand (lattices.c), SciPy and REBOUND; and how time grows
+    large_cases   what these are of;  shared_steps: their steps by several threads
+    long_sums     their energies over a hundred thousand steps;  cluster: a thousand bodies beside REBOUND
     builds        the same text by several compilers, and for several processors
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
@@ -39,6 +41,7 @@ from scvi_codegen.benchmark.adaptive import run_adaptive
 from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
 from scvi_codegen.benchmark.builds import run_builds
 from scvi_codegen.benchmark.cases import CASES
+from scvi_codegen.benchmark.cluster import run_cluster
 from scvi_codegen.benchmark.compile_times import run_compile_times
 from scvi_codegen.benchmark.compositions import run_compositions
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
@@ -47,6 +50,7 @@ from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hand_written import run_hand_written
 from scvi_codegen.benchmark.held import run_held
+from scvi_codegen.benchmark.long_sums import run_energies
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.mechanisms import run_mechanisms
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
@@ -54,6 +58,7 @@ from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.samples import run_samples
+from scvi_codegen.benchmark.shared_steps import run_threads
 from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.sums import run_growth, run_sums
 from scvi_codegen.benchmark.tables import ResultTable
@@ -82,6 +87,9 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "samples": run_samples,
     "sums": run_sums,
     "growth": run_growth,
+    "threads": run_threads,
+    "energies": run_energies,
+    "cluster": run_cluster,
     "builds": run_builds,
 }
 """All that can be measured: name on the command line -> function that does it."""

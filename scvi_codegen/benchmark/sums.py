@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -19,17 +19,17 @@ from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.contenders.molecules import PLATFORMS, openmm_run
 from scvi_codegen.benchmark.curves import Point, time_at
+from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, field, ring
 from scvi_codegen.benchmark.machine_limits import machine_limits
 from scvi_codegen.benchmark.plan import Plan, Say
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.indexed_compiler import compile_indexed
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import unwarned
 
-__all__ = ["Lattice", "field", "ring", "run_growth", "run_sums"]
+__all__ = ["reference_of", "rms", "run_growth", "run_sums"]
 
 ERRORS = (1e-4, 1e-7, 1e-10)
 OWN = "composition"
@@ -42,145 +42,8 @@ DECLARATIONS = (
 GROWTH = (10**3, 10**4, 10**5, 10**6)
 SIDE = 512
 """Of the field."""
-SEED = 20261121
-SPACING = 0.98 * 2 ** (2 / 3)
-"""Of an argon crystal, in diameters of its atoms: neighbours stand a little closer than two atoms at rest would."""
 PATIENCE = 0.3
 """Seconds beyond which a setting is timed twice only."""
-
-
-class Lattice(NamedTuple):
-    """A problem: its system and start, how long it runs, steps to try, its accelerations by NumPy.
-
-    ``by_hand``: (is a field, places along an axis, strength) for the C by hand.
-    """
-
-    name: str
-    system: IndexedSystem
-    q: Array
-    v: Array
-    span: float
-    longest: float
-    accelerations: Callable[[Array], Array]
-    by_hand: tuple[int, int, float] | None
-    parameters: Mapping[str, float]
-
-
-def ring(count: int, span: float) -> Lattice:
-    """A Fermi-Pasta-Ulam-Tsingou ring in which all places move."""
-    beta, numbers = 0.25, np.random.default_rng(SEED)
-
-    def accelerations(q: Array) -> Array:
-        d = np.roll(q, -1) - q
-        pull = d + beta * d**3
-        return pull - np.roll(pull, 1)
-
-    return Lattice(
-        name="ring",
-        system=IndexedSystem.from_text(
-            name="ring",
-            coordinates=["q[N]"],
-            parameters={"beta": beta},
-            lagrangian="sum(i in N, q_dot[i]**2/2)"
-            "- sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
-        ),
-        q=np.zeros(count),
-        v=numbers.normal(size=count),
-        span=span,
-        longest=0.4,
-        accelerations=accelerations,
-        by_hand=(0, count, beta),
-        parameters={},
-    )
-
-
-def field(side: int, span: float) -> Lattice:
-    """Sine-Gordon on a torus, a smooth bump."""
-    dx = 0.1
-    x = dx * (np.arange(side) - side // 2)
-    bump = 2.0 * np.exp(-(x[:, np.newaxis] ** 2 + x**2) / 4.0)
-
-    def accelerations(u: Array) -> Array:
-        around = sum(np.roll(u, shift, axis) for shift in (1, -1) for axis in (0, 1))
-        found: Array = (around - 4.0 * u) / dx**2 - np.sin(u)
-        return found
-
-    return Lattice(
-        name="field",
-        system=IndexedSystem.from_text(
-            name="field",
-            coordinates=["u[NX, NY]"],
-            parameters={"w": 1 / dx**2},
-            lagrangian="sum(i in NX periodic, j in NY periodic, u_dot[i, j]**2/2"
-            "- w*((u[i+1, j] - u[i, j])**2 + (u[i, j+1] - u[i, j])**2)/2 + cos(u[i, j]))",
-        ),
-        q=bump,
-        v=np.zeros((side, side)),
-        span=span,
-        longest=0.06,
-        accelerations=accelerations,
-        by_hand=(1, side, 1 / dx**2),
-        parameters={},
-    )
-
-
-def bodies(count: int, span: float) -> Lattice:
-    """Gravity, softened, of a cluster."""
-    softening, numbers = 0.1, np.random.default_rng(SEED)
-
-    def accelerations(r: Array) -> Array:
-        d = r[np.newaxis] - r[:, np.newaxis]
-        cube = (np.sum(d**2, axis=-1) + softening**2) ** -1.5
-        found: Array = np.einsum("ij,ijk->ik", cube, d) / count
-        return found
-
-    return Lattice(
-        name="bodies",
-        system=IndexedSystem.from_text(
-            name="bodies",
-            coordinates=["r[N, 3]"],
-            parameters={"m": 1, "e": softening},
-            lagrangian="m*sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)"
-            "+ m**2*sum(i < j in N, 1/sqrt(sum(a in 3, (r[i, a] - r[j, a])**2) + e**2))",
-        ),
-        q=numbers.normal(size=(count, 3)),
-        v=0.4 * numbers.normal(size=(count, 3)),
-        span=span,
-        longest=0.25,
-        accelerations=accelerations,
-        by_hand=None,
-        parameters={"m": 1 / count},
-    )
-
-
-def atoms(cells: int, span: float) -> Lattice:
-    """A crystal of argon (face-centred cubic, free surfaces), slightly compressed, whose atoms move at random."""
-    corner = np.array([[0.0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
-    q = SPACING * np.concatenate([corner + np.array(cell) for cell in np.ndindex(cells, cells, cells)])
-
-    def accelerations(r: Array) -> Array:
-        d = r[np.newaxis] - r[:, np.newaxis]
-        square = np.sum(d**2, axis=-1)
-        np.fill_diagonal(square, np.inf)
-        found: Array = -np.einsum("ij,ijk->ik", 24.0 * (2.0 * square**-7 - square**-4), d)
-        return found
-
-    return Lattice(
-        name="atoms",
-        system=IndexedSystem.from_text(
-            name="atoms",
-            coordinates=["r[N, 3]"],
-            lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(i < j in N, "
-            "4/sum(a in 3, (r[i, a] - r[j, a])**2)**6 - 4/sum(a in 3, (r[i, a] - r[j, a])**2)**3)",
-        ),
-        q=q,
-        v=0.5 * np.random.default_rng(SEED).normal(size=q.shape),
-        span=span,
-        longest=0.05,
-        accelerations=accelerations,
-        by_hand=None,
-        parameters={},
-    )
 
 
 def lattices(plan: Plan) -> tuple[Lattice, ...]:
@@ -196,7 +59,7 @@ def run_sums(plan: Plan, say: Say) -> ResultTable:
     rows: list[dict[str, Any]] = []
     for each in lattices(plan):
         say(f"sums: {each.name} of {each.q.size} coordinates")
-        reference, doubt = _reference(each, plan)
+        reference, doubt = reference_of(each)
         curves = _curves(_contenders(each, plan), reference, plan)
         rows += [_row(each, error, curves, doubt) for error in ERRORS]
     names = (OWN, "leapfrog", "order_8", "DOP853", "IAS15", "REBOUND_leapfrog", *PLATFORMS)
@@ -227,11 +90,11 @@ def _row(each: Lattice, error: float, curves: Mapping[str, list[Point]], doubt: 
     return found | {"ours_ms": 1e3 * own[best], "by": best} | ratios
 
 
-def _reference(each: Lattice, plan: Plan) -> tuple[Array, float]:
+def reference_of(each: Lattice) -> tuple[Array, float]:
     """The end by SVI(10), and how far from it a composition of order 10 ends."""
     own = _ours(each, "svi:10", _count(each, each.longest / 8))()
     other = _ours(each, Composition(10), _count(each, each.longest / 32))()
-    return own, _error(other, own)
+    return own, rms(other, own)
 
 
 def _curves(
@@ -248,14 +111,15 @@ def _curves(
                     began = time.process_time()
                     end = setting()
                     known.append(time.process_time() - began)
-                    errors[name, k] = _error(end, reference)
+                    errors[name, k] = rms(end, reference)
     return {
         name: [Point(seconds=min(seconds[name, k]), error=errors[name, k]) for k in range(len(settings))]
         for name, settings in contenders.items()
     }
 
 
-def _error(end: Array, reference: Array) -> float:
+def rms(end: Array, reference: Array) -> float:
+    """Of the differences, over that of the reference."""
     return float(np.sqrt(np.mean((end - reference) ** 2) / np.mean(reference**2)))
 
 

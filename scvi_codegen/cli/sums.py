@@ -51,7 +51,13 @@ def refuse(what: dict[str, object]) -> None:
             raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices")
 
 
-def run_sums(model: IndexedModel, output: str | None, plot: str | None, options: SolverOptions | None) -> None:
+def run_sums(
+    model: IndexedModel,
+    output: str | None,
+    plot: str | None,
+    options: SolverOptions | None,
+    threads: int | None = None,
+) -> None:
     """Integrate, sum up, write what is asked for.
 
     Raises:
@@ -59,7 +65,7 @@ def run_sums(model: IndexedModel, output: str | None, plot: str | None, options:
     """
     if output is not None:
         check_npz(output)
-    outcome = _integrate(model, options)
+    outcome = _integrate(model, options, threads)
     tell("\n".join(_summary(model, outcome)), **_numbers(model, outcome))
     if output is not None:
         outcome.trajectory.save(output)
@@ -75,13 +81,13 @@ def run_sums(model: IndexedModel, output: str | None, plot: str | None, options:
         tell(f"wrote {path}")
 
 
-def _integrate(model: IndexedModel, options: SolverOptions | None) -> SumsOutcome:
+def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int | None) -> SumsOutcome:
     began, controlled = time.perf_counter(), model.h is None
     steps = math.inf if controlled else model.step_count
     if not controlled:
         check_states(sum(np.size(values) for values in model.q.values()), model.step_count, model.every)
     stepper = model.stepper()
-    run, failure = model.start(stepper, options=options), None
+    run, failure = model.start(stepper, options=options, threads=threads), None
     preparation, began = time.perf_counter() - began, time.perf_counter()
     record = IndexedRecord(run)
     with interruptions() as caught, progress_bar(PARTS if controlled else model.step_count) as reach:

@@ -111,9 +111,16 @@ class IndexedModel:
 
         return compile_indexed(self.system, self.method)
 
-    def start(self, stepper: IndexedStepper | None = None, *, options: SolverOptions | None = None) -> IndexedRun:
+    def start(
+        self,
+        stepper: IndexedStepper | None = None,
+        *,
+        options: SolverOptions | None = None,
+        threads: int | None = None,
+    ) -> IndexedRun:
         """The run of this model from its initial state; raises as :meth:`IndexedStepper.start`."""
-        return (stepper or self.stepper()).start(**self._beginning, **self._lengths, options=options)
+        beside: dict[str, Any] = {"options": options, "threads": threads}
+        return (stepper or self.stepper()).start(**self._beginning, **self._lengths, **beside)
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """All of it; raises as :meth:`IndexedStepper.integrate`."""

@@ -77,6 +77,9 @@ become a heap of scalars (leapfrog of 8 masses: half as long again). The lanes o
 WRITTEN_OUT = frozenset({"support/newton_solver.h", "support/shooting_sweep.h"})
 """Steps of one trajectory whose short loops, over unknowns or functions of points, take a tenth longer as loops."""
 
+SHARED_BY_THREADS, THREADS = "support/indexed_threads.h", ("-DSCVI_THREADS", "-pthread")
+"""A part of a text whose steps threads may share, and what it is compiled and linked with for that."""
+
 COMPILE_SECONDS = 600
 NOT_RUN = (126, 127)
 ATTEMPTS = 3
@@ -214,7 +217,8 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     """The parts at the same time, each in a process; then one library of them, and what describes it."""
     source.write(folder)
     cut = any("support/parts.h" in each.files for each in source.sources)
-    wanted = shlex.split(os.environ.get(FLAGS_VARIABLE, ""))
+    threads = THREADS if any(SHARED_BY_THREADS in each.files for each in source.sources) else ()
+    wanted = [*threads, *shlex.split(os.environ.get(FLAGS_VARIABLE, ""))]
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
     objects = ["-shared", *wanted, *(f"{name}.o" for name in parts)]
     for define, libraries in _mathematics(flags):

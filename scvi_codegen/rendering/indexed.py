@@ -12,8 +12,10 @@ from scvi_codegen.rendering.environment import support_text, template_environmen
 from scvi_codegen.rendering.functions import kernel_text
 from scvi_codegen.rendering.indexed_constraints import held_context
 from scvi_codegen.rendering.lanes import LIBRARY, POINTS, SweepText, sweep_text
-from scvi_codegen.rendering.nests import DIRECTION, Nest, product_text
+from scvi_codegen.rendering.nests import DIRECTION, Nest
 from scvi_codegen.rendering.printer import INVERSE_ROOT, scalar_functions
+from scvi_codegen.rendering.sharing import MOST_THREADS, Sharing, sharing_of, sharing_text
+from scvi_codegen.rendering.sizes import product_text, sizes_text
 from scvi_codegen.rendering.source import Source, included
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS
 from scvi_codegen.rendering.target import DOUBLE
@@ -42,6 +44,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
+        "most_threads": 1 if program.held else MOST_THREADS,
         "forces": [_force_text(program, each) for each in (*program.forces, *program.products, *program.diagonals)],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in program.masses],
@@ -78,7 +81,7 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
         start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
             moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, every).
     """
-    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, **start}
+    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
     templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
     return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
@@ -112,31 +115,48 @@ def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:
 def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     """A function that adds to the forces; of an explicit method so many times the forces."""
     explicit = program.sweep is None
-    nest = Nest(program, looped, "lanes", "X", chunked=explicit and bool(looped.loops))
+    chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
+    nest = Nest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
     slots = range(len(looped.targets))
-    places = [nest.place_of(target) for target in looped.targets]
     inner = [nest.is_innermost(target) for target in looped.targets]
-    targets = [f"F[{places[k]}]" if inner[k] else f"sum_{k}" for k in slots]
+
+    def added(k: int, value: str) -> list[str]:
+        return nest.adding(k, value) if inner[k] else [f"sum_{k} += {value};"]
+
     call = f"{looped.kernel.name}(u, t, parameters, value);"
     if nest.chunked:
         here = f"[index_{looped.loops[-1].index} - begin]"
         innermost = [call, *(f"values[{k}]{here} = by * value[{k}];" for k in slots)]
-        behind = [f"{targets[k]} += values[{k}]{here};" for k in slots]
+        behind = [added(k, f"values[{k}]{here}") for k in slots]
     else:
-        innermost = [call, *(f"{targets[k]} += {'by * ' * explicit}value[{k}];" for k in slots)]
+        innermost = [call, *(line for k in slots for line in added(k, f"{'by * ' * explicit}value[{k}]"))]
         behind = []
     lines = nest.text(
         prepare=lambda k: [f"lanes sum_{k} = zero;"],
         innermost=innermost,
         behind=behind,
-        finish=lambda k: [f"F[{places[k]}] += sum_{k};"],
+        finish=lambda k: nest.adding(k, f"sum_{k}"),
     )
     zero = [] if all(inner) else ["const lanes zero = {0};"]
     factor = ["double by"] if explicit else []
     direction = [f"const lanes *{DIRECTION}"] if looped.along else []
     arguments = ["const problem *given", "const lanes *restrict X", "times t", *direction, *factor, "lanes *restrict F"]
+    arguments += ["const window *here"]
+    if sharing is Sharing.BY_PLACES:
+        zero.append("const int whole = here->whole;")
+    unused = ["(void)here;"] if sharing is Sharing.ALONE else []
     values = f"lanes value[{len(looped.targets)}]"
-    return nest.function(f"static void add_{looped.kernel.name}", arguments, [*zero, *lines], values=values)
+    text = nest.function(f"static void add_{looped.kernel.name}", arguments, [*unused, *zero, *lines], values=values)
+    return f"{text}\n\n{_sharing_text(program, looped)}"
+
+
+def _sharing_text(program: IndexedProgram, looped: LoopedKernel) -> str:
+    """A function that says how threads share it."""
+    how = sharing_text(looped)
+    known = [*sizes_text(program, how), *(f"(void){name};" for name in ("run", "given", "n"))]
+    head = f"static sharing share_{looped.kernel.name}(const run_memory *run, const problem *given, long long n)"
+    lines = "\n".join(f"  {line}" for line in [*known, f"return {how};"])
+    return f"/* Its rounds. */\n{head}\n{{\n{lines}\n}}"
 
 
 def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) -> str:

@@ -8,7 +8,8 @@ from itertools import accumulate
 from typing import Any
 
 from scvi_codegen.ir.indexed import HeldSteps, IndexedProgram, LoopedKernel
-from scvi_codegen.rendering.nests import DIRECTION, Nest, count_text, sizes_text
+from scvi_codegen.rendering.nests import DIRECTION, Nest
+from scvi_codegen.rendering.sizes import count_text, sizes_text
 
 __all__ = ["held_context"]
 

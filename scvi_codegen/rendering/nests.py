@@ -10,11 +10,13 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
-from scvi_codegen.indices import Access, Array, Loop, Place, Size
+from scvi_codegen.indices import Access, Loop, Place
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
+from scvi_codegen.rendering.sharing import Sharing
+from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
 
-__all__ = ["DIRECTION", "Lines", "Nest", "count_text", "product_text", "size_text", "sizes_text"]
+__all__ = ["DIRECTION", "Lines", "Nest"]
 
 DIRECTION = "V"
 """What the slots along a direction are read from."""
@@ -31,28 +33,6 @@ def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
         sizes.append(product_text(array))
 
 
-def product_text(array: Array) -> str:
-    """The number of its entries, in C."""
-    return " * ".join(map(size_text, array.axes))
-
-
-def count_text(loops: Sequence[Loop]) -> str:
-    """How many elements loops have, in C."""
-    behind = {loop.behind: loop for loop in loops if loop.behind}
-    return " * ".join(_span_text(loop, loop.index in behind) for loop in loops if not loop.behind) or "1"
-
-
-def _span_text(loop: Loop, paired: bool) -> str:
-    size = f"({size_text(loop.end)} - {size_text(loop.first)})"
-    return f"(({size_text(loop.end)}) * ({size_text(loop.end)} - 1) / 2)" if paired else size
-
-
-def size_text(size: Size) -> str:
-    """A size in C."""
-    number = f"{size.number:+d}"
-    return f"size_{size.name}{f' {number[0]} {number[1:]}' if size.number else ''}" if size.name else str(size.number)
-
-
 class Nest:
     """The loops of a kernel, with arguments and parameters at the level where they are first known.
 
@@ -66,13 +46,21 @@ class Nest:
         source: what they are read from; nothing where they are not.
         chunked: whether all values of a part are found before any is added, in loops without conflicts, which a
             compiler turns into vectors.
+        sharing: how threads share it, of which a task is done; without any all of it is.
     """
 
     def __init__(
-        self, program: IndexedProgram, looped: LoopedKernel, scalar: str, source: str, *, chunked: bool = False
+        self,
+        program: IndexedProgram,
+        looped: LoopedKernel,
+        scalar: str,
+        source: str,
+        *,
+        chunked: bool = False,
+        sharing: Sharing = Sharing.ALONE,
     ) -> None:
         self.program, self.looped, self.scalar, self.source = program, looped, scalar, source
-        self.chunked = chunked
+        self.chunked, self.sharing = chunked, sharing
         self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
         self.loops = {loop.index: loop for loop in looped.loops}
         self.scalars = len(program.parameter_names)
@@ -85,18 +73,20 @@ class Nest:
         """Whether an entry moves with the innermost loop."""
         return self.level(access) == len(self.looped.loops)
 
-    def text(self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str] = ()) -> list[str]:
+    def text(
+        self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]] = ()
+    ) -> list[str]:
         """The nest.
 
         Args:
             prepare, finish: lines of targets before and behind the loops that do not move them.
             innermost: lines in the innermost loop.
-            behind: lines, each in a loop of its own over the same part.
+            behind: lines, those of each target in a loop of its own over the same part.
         """
         return self._inside(0, prepare, innermost, finish, behind)
 
     def _inside(
-        self, level: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[str]
+        self, level: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]]
     ) -> list[str]:
         lines = list(self._found(level))
         outer = [k for k, target in enumerate(self.looped.targets) if self.level(target) == level]
@@ -105,29 +95,68 @@ class Nest:
         lines += [line for k in outer for line in prepare(k)]
         loop, inner = self.looped.loops[level], self._inside(level + 1, prepare, innermost, finish, behind)
         last = level + 1 == len(self.looped.loops)
-        lines += self._parts(loop, inner, behind) if last else _loop(loop, _first(loop), size_text(loop.end), inner)
+        lines += self._parts(loop, inner, behind) if last else _loop(loop, *self._span(loop), inner)
         return lines + [line for k in outer for line in finish(k)]
 
-    def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[str]) -> list[str]:
+    def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
         """The innermost loop, in parts where it needs some."""
-        first, end = _first(loop), size_text(loop.end)
+        first, end = self._span(loop)
         offsets = self._offsets(loop)
         if not offsets and not self.chunked:
             return _loop(loop, first, end, inner)
         lines = [f"end = {end} - begin > CHUNK ? begin + CHUNK : {end};" if self.chunked else f"end = {end};"]
         lines += [
-            f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {end}, &end);"
+            f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {size_text(loop.end)}, &end);"
             for offset in offsets
         ]
-        lines += [f"lanes values[{len(self.looped.targets)}][CHUNK];"] if self.chunked else []
+        if self.chunked:
+            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.looped.targets)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
-        for line in behind:
-            lines += _loop(loop, "begin", "end", [line])
+        for each in behind:
+            lines += _loop(loop, "begin", "end", each)
         return [
             f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
             *(f"  {line}" for line in lines),
             "}",
         ]
+
+    def _span(self, loop: Loop) -> tuple[str, str]:
+        """From where to where a loop goes in a task."""
+        if self.sharing in (Sharing.IN_TURN, Sharing.IN_TILES) and loop is self.looped.loops[0]:
+            return "here->of.first", "here->of.end"
+        if self.sharing is Sharing.IN_TILES and loop is self.looped.loops[1]:
+            return f"between({_first(loop)}, here->behind.first, here->behind.end)", "here->behind.end"
+        return _first(loop), size_text(loop.end)
+
+    def adding(self, k: int, value: str) -> list[str]:
+        """What adds to the place of a target, if the task adds to that."""
+        if self.sharing is not Sharing.BY_PLACES:
+            return [f"F[{self.place_of(self.looped.targets[k])}] += {value};"]
+        named = [self._named(k)] if self._in_a_part(k) else []
+        return [*named, f"if (whole || within(here, place_{k}))", f"  F[place_{k}] += {value};"]
+
+    def _named(self, k: int) -> str:
+        return f"const long long place_{k} = {self.place_of(self.looped.targets[k])};"
+
+    def _in_a_part(self, k: int) -> bool:
+        """Whether a place is known in the loops over a part alone."""
+        return self.chunked and self.is_innermost(self.looped.targets[k])
+
+    def _passed_over(self) -> list[str]:
+        """What goes past an element that adds to nothing in a task."""
+        wanted = [f"within(here,\0place_{k})" for k in range(len(self.looped.targets))]
+        past = [f"if (!(whole || {' || '.join(wanted)}))", "  continue;"]
+        return past if self.sharing is Sharing.BY_PLACES and not self.chunked else []
+
+    def _part_passed_over(self, loop: Loop) -> list[str]:
+        """The same of a part of the innermost loop."""
+        if self.sharing is not Sharing.BY_PLACES:
+            return []
+        places = range(len(self.looped.targets))
+        named = [self._named(k) for k in places if self._in_a_part(k)]
+        asked = [f"wanted |= within(here, place_{k});" for k in places]
+        look = _loop(loop, "begin", "end && !wanted", [*named, *asked])
+        return ["int wanted = whole;", *look, "if (!wanted)", "  continue;"]
 
     def _offsets(self, loop: Loop) -> list[int]:
         """At which places of a ring stand from an index."""
@@ -137,7 +166,12 @@ class Nest:
         return sorted(moved - {0}) if loop.periodic else []
 
     def _found(self, level: int) -> Iterator[str]:
-        """What is known at a level: arguments, parameters."""
+        """What is known at a level: arguments, parameters, places that are not added to in every task."""
+        for k, target in enumerate(self.looped.targets if self.sharing is Sharing.BY_PLACES else ()):
+            if self.level(target) == level and not self._in_a_part(k):
+                yield self._named(k)
+        if level == len(self.looped.loops):
+            yield from self._passed_over()
         for k, slot in enumerate(self.looped.slots):
             if self.level(slot) == level and self.source:
                 source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
@@ -179,7 +213,8 @@ class Nest:
         known = [*self._arrays("\n".join(lines)), *self._unknowns(), *self._parameters(values)]
         body = [*sizes_text(self.program, "\n".join([*known, *lines])), *known, *lines]
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
-        signature = wrapped(f"{head}({', '.join(arguments)})", indent=0)
+        whole = (argument.replace(" ", "\0") for argument in arguments)
+        signature = wrapped(f"{head}({', '.join(whole)})", indent=0)
         return f"{wrapped_comment(self.looped.text)}\n{signature}\n{{\n{text}\n}}"
 
     def _unknowns(self) -> Iterator[str]:
@@ -206,13 +241,6 @@ class Nest:
             for k, array in enumerate(arrays):
                 if f"{kind}_{array.name}[" in text:
                     yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
-
-
-def sizes_text(program: IndexedProgram, text: str) -> Iterator[str]:
-    """Declarations of the sizes that occur in a text."""
-    for k, name in enumerate(program.sizes):
-        if re.search(rf"\bsize_{name}\b", text):
-            yield f"const long long size_{name} = given->size[{k}];"
 
 
 def _first(loop: Loop) -> str:

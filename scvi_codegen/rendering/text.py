@@ -225,6 +225,7 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
         "distances": (ROUNDED, TYPED, NEAR),
         "target": target,
         "real": target.scalar,
+        "threads": False,
     }
     environment = template_environment()
     return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}

@@ -53,14 +53,14 @@ class IndexedRun:
         problem: what moves.
         q: positions by name, of the shapes of the problem.
         moving: momenta, velocities or nothing, by name, and what they are.
-        h: the step; 0 where steps choose their length.
-        t: the time.
+        h, t: the step, 0 where steps choose their length; the time.
         goal: where such steps lead.
         options: when sweeps end.
+        threads: how many share each step.
 
     Attributes:
         problem: its parameters may change on the way.
-        goal, options: as given.
+        goal, options, threads: as given.
         state: positions and momenta of all coordinates, in a row.
         iterations: sweeps of all steps yet.
     """
@@ -75,8 +75,9 @@ class IndexedRun:
         t: float,
         goal: Goal | None = None,
         options: SolverOptions | None = None,
+        threads: int = 1,
     ) -> None:
-        self.problem, self.goal, self.iterations = problem, goal, 0
+        self.problem, self.goal, self.iterations, self.threads = problem, goal, 0, threads
         self._binding, self.options = problem.binding, options
         self._options = self._binding.options(options)
         self._start(q, moving, h, t)
@@ -111,7 +112,7 @@ class IndexedRun:
             flat = self._flat(values)
             self._numbers["p"][:] = flat if what == "momenta" else flat / self._numbers["inverse_mass"]
         self._run = self._binding.new("run *")
-        self._run.t, self._run.h = t, h
+        self._run.t, self._run.h, self._run.threads = t, h, self.threads
         if self.interface.constraints:
             self._numbers |= held_memory(self._binding, self._run, self.problem.struct, n)
         for name in self._numbers:
@@ -161,7 +162,8 @@ class IndexedRun:
 
     def apart(self, h: float, goal: Goal | None = None) -> IndexedRun:
         """A run of its own from the present state, to the last bit, by other steps."""
-        other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, goal=goal, options=self.options)
+        beside: dict[str, Any] = {"goal": goal, "options": self.options, "threads": self.threads}
+        other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, **beside)
         for name in ("carry_q", "carry_p"):
             other._numbers[name][:] = self._numbers[name]
         other._run.t_low = self._run.t_low
@@ -321,6 +323,7 @@ class IndexedRun:
         saved: bytes,
         options: SolverOptions | None,
         goal: Goal | None = None,
+        threads: int = 1,
     ) -> Self:
         """The run that :meth:`save` gave.
 
@@ -340,7 +343,8 @@ class IndexedRun:
                 {table.name: found[f"table {table.name}"] for table in interface.tables},
             )
             problem = IndexedProblem(interface, binding, arrays)
-            run = cls(problem, arrays.state, (None, ""), h=moments["h"], t=moments["t"], goal=goal, options=options)
+            beside: dict[str, Any] = {"goal": goal, "options": options, "threads": threads}
+            run = cls(problem, arrays.state, (None, ""), h=moments["h"], t=moments["t"], **beside)
             for name, array in run._numbers.items():
                 array[:] = found[f"memory {name}"]
             for name, value in moments.items():

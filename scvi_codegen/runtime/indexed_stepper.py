@@ -16,6 +16,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.sharing import MOST_THREADS
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import GROSS_ERROR, MET, warn_of_energies, warn_of_long_steps
 from scvi_codegen.runtime.compiled_method import no_text
@@ -93,6 +94,7 @@ class IndexedStepper:
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
         options: SolverOptions | None = None,
+        threads: int | None = None,
     ) -> IndexedRun:
         """A run by steps of h, or of their own lengths to t_end; arguments as of :meth:`integrate`.
 
@@ -111,10 +113,18 @@ class IndexedStepper:
             t=checked_number(t, "t"),
             goal=goal,
             options=options,
+            threads=self._threads(threads),
         )
         if self.interface.constraints:
             consistent(run)
         return run
+
+    def _threads(self, given: int | None) -> int:
+        """As many as are wanted; those of constraints have one."""
+        threads = checked_count(1 if given is None else given, "threads", least=1, most=MOST_THREADS)
+        if threads > 1 and self.interface.constraints:
+            raise MethodError("steps that constraints hold are made by one thread: leave out threads")
+        return threads
 
     def project(
         self,
@@ -156,6 +166,7 @@ class IndexedStepper:
         t_end: float | None = None,
         tolerance: float | None = None,
         options: SolverOptions | None = None,
+        threads: int | None = None,
     ) -> IndexedRun:
         """The run whose :meth:`IndexedRun.save` gave these bytes, to go on as it would have; give its goal again.
 
@@ -164,7 +175,7 @@ class IndexedStepper:
         """
         goal = None if t_end is None else Goal.checked(t_end, tolerance)
         binding = self._controlled if goal else self._binding
-        return IndexedRun.restored(self.interface, binding, saved, options, goal)
+        return IndexedRun.restored(self.interface, binding, saved, options, goal, self._threads(threads))
 
     @takes(StateError, parameters=MAPPING, tables=MAPPING, observe=FUNCTION, progress=FUNCTION)
     def integrate(
@@ -183,6 +194,7 @@ class IndexedStepper:
         tables: Mapping[str, ArrayLike] | None = None,
         observe: Callable[[IndexedRun], ArrayLike] | None = None,
         options: SolverOptions | None = None,
+        threads: int | None = None,
         progress: Callable[[int], None] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
     ) -> IndexedTrajectory:
@@ -201,6 +213,8 @@ class IndexedStepper:
             observe: what is kept of a state in place of all of it: a function of the run, whose ``t``, ``q``, ``p``,
                 ``velocity``, ``energy`` are those of the moment; a number or an array, always of one shape.
             options: when sweeps end.
+            threads: how many share each step, by default one; states are the same to the last bit. They pay where a
+                step takes longer than some tens of microseconds, and are begun at every state that is kept.
             progress: called now and then with the number of steps done.
             events: zeros to find, as ``events`` of the trajectory; a terminal one ends it. An
                 :class:`~scvi_codegen.Event`, its function alone, ``"q[0] - 1"``, ``"sum(i in N, q[i]**2) - 5"``, of
@@ -223,7 +237,8 @@ class IndexedStepper:
         if h is None and steps is not None:
             raise StateError("so many steps need their length h; those that choose theirs lead to t_end, alone")
         count = np.inf if steps is None else checked_count(steps, "steps", least=0)
-        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables, "options": options}
+        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
+        beside |= {"options": options, "threads": threads}
         run = self.start(q, p, velocity=velocity, h=h, t_end=t_end, tolerance=tolerance, **beside)
         record = IndexedRecord(run, observe, as_events(events))
         record.follow(count, every, progress=progress)
@@ -247,6 +262,7 @@ class IndexedStepper:
         tables: Mapping[str, ArrayLike] | None = None,
         observe: Callable[[IndexedRun], ArrayLike] | None = None,
         options: SolverOptions | None = None,
+        threads: int | None = None,
         progress: Callable[[int], None] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
     ) -> IndexedTrajectory:
@@ -256,8 +272,8 @@ class IndexedStepper:
             inputs: by name, as of :meth:`Stepper.drive`: ``(t, values)``, ``(t, values, "cubic")``, a ``CubicSpline``.
             h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
             steps, t_end: with h one of both; without it ``t_end``.
-            q, p, velocity, tolerance, every, t, parameters, tables, observe, options, progress, events: as of
-                :meth:`integrate`; states at breakpoints are kept, too.
+            q, p, velocity, tolerance, every, t, parameters, tables: as of :meth:`integrate`.
+            observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are kept, too.
 
         Raises:
             StateError: for inputs that are not given for all of the run, or make no function of time.
@@ -267,7 +283,8 @@ class IndexedStepper:
         data, end = checked_inputs(self.interface, inputs), end_of(t, h, steps, t_end)
         check_left_to_inputs(self.interface, parameters)
         controlled = {"t_end": end, "tolerance": tolerance} if h is None else {"h": h}
-        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables, "options": options}
+        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
+        beside |= {"options": options, "threads": threads}
         run = self.start(q, p, velocity=velocity, **controlled, **beside)
         numbers = np.array(run.problem.arrays.numbers)
         values = partial(parameters_at, self.interface.parameters, numbers, data)

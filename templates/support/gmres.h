@@ -1,6 +1,7 @@
 /* Linear systems that are known by their products alone: GMRES, restarted (Y. Saad, Iterative Methods for Sparse Linear
  * Systems, 2003, algorithm 9.5: preconditioned from the right), on vectors over all points of all coordinates. Before
- * it: points.h; linear_system with count, basis, residual, correction and product; multiply and precondition. */
+ * it: points.h, indexed_blocks.h; linear_system with run, n, own, count, basis, residual, correction and product;
+ * multiply and precondition. */
 
 enum {
   BASIS = 16, /* vectors until it begins anew */
@@ -9,30 +10,48 @@ enum {
 
 #define LINEAR_TOLERANCE 1e-6 /* of a system, relative: so much an iteration of Newton's gains */
 
-static double inner_product(const lanes *x, const lanes *y, long long count)
+static double inner_product(const linear_system *of, const lanes *x, const lanes *y)
 {
-  lanes a = lanes_of(0.0), b = lanes_of(0.0);
-  long long i = 0;
-  for (; i + 1 < count; i += 2) {
-    a += x[i] * y[i];
-    b += x[i + 1] * y[i + 1];
+  sums all;
+  begin_sums(&all, of->run, of->n);
+  while (next_block(&all)) {
+    lanes a = lanes_of(0.0), b = lanes_of(0.0);
+    for (int g = 0; g < GROUPS; g++) {
+      long long i = g * of->n + all.here.first;
+      const long long end = g * of->n + all.here.end;
+      for (; i + 1 < end; i += 2) {
+        a += x[i] * y[i];
+        b += x[i + 1] * y[i + 1];
+      }
+      if (i < end)
+        a += x[i] * y[i];
+    }
+    add_block(&all, lanes_total(a + b), 0.0);
   }
-  for (; i < count; i++)
-    a += x[i] * y[i];
-  return lanes_total(a + b);
+  wait_for_others(of->run);
+  return sum_of(&all, 0);
 }
 
-/* y += by x. */
-static void add_multiple(lanes *restrict y, double by, const lanes *restrict x, long long count)
+/* y += by x; of every thread its own coordinates. */
+static void add_multiple(const linear_system *of, lanes *restrict y, double by, const lanes *restrict x)
 {
-  for (long long i = 0; i < count; i++)
-    y[i] += by * x[i];
+  for (int g = 0; g < GROUPS; g++)
+    for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
+      y[i] += by * x[i];
 }
 
-static void scale(lanes *x, double by, long long count)
+/* x = by y. */
+static void scale(const linear_system *of, lanes *x, double by, const lanes *y)
 {
-  for (long long i = 0; i < count; i++)
-    x[i] *= by;
+  for (int g = 0; g < GROUPS; g++)
+    for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
+      x[i] = by * y[i];
+}
+
+static void make_zero(const linear_system *of, lanes *x)
+{
+  for (int g = 0; g < GROUPS; g++)
+    memset(x + g * of->n + of->own.first, 0, sizeof(lanes) * (size_t)(of->own.end - of->own.first));
 }
 
 /* The triangle that Givens' rotations make of the products of the basis with itself, and what they make of the norm. */
@@ -69,13 +88,13 @@ static int build_basis(linear_system *of, triangle *all, double enough, solver_r
     multiply(of, of->product, next);
     report->products++;
     for (int j = 0; j <= k; j++) {
-      const double part = inner_product(of->basis + j * of->count, next, of->count);
+      const double part = inner_product(of, of->basis + j * of->count, next);
       all->column[k][j] = part;
-      add_multiple(next, -part, of->basis + j * of->count, of->count);
+      add_multiple(of, next, -part, of->basis + j * of->count);
     }
-    all->column[k][k + 1] = sqrt(inner_product(next, next, of->count));
+    all->column[k][k + 1] = sqrt(inner_product(of, next, next));
     if (all->column[k][k + 1] > 0.0)
-      scale(next, 1.0 / all->column[k][k + 1], of->count);
+      scale(of, next, 1.0 / all->column[k][k + 1], next);
     left = rotate(all, k);
     if (!(left > enough))
       return k + 1;
@@ -92,29 +111,30 @@ static void add_combination(linear_system *of, triangle *all, int size)
       all->rest[k] -= all->column[j][k] * all->rest[j];
     all->rest[k] = all->column[k][k] != 0.0 ? all->rest[k] / all->column[k][k] : 0.0;
   }
-  memset(sum, 0, sizeof(lanes) * (size_t)of->count);
+  make_zero(of, sum);
   for (int k = 0; k < size; k++)
-    add_multiple(sum, all->rest[k], of->basis + k * of->count, of->count);
+    add_multiple(of, sum, all->rest[k], of->basis + k * of->count);
   precondition(of, sum, of->product);
-  add_multiple(of->correction, 1.0, of->product, of->count);
+  add_multiple(of, of->correction, 1.0, of->product);
 }
 
 /* The correction whose product is the residual, as nearly as LINEAR_TOLERANCE. */
 static void find_correction(linear_system *of, solver_report *report)
 {
-  const double size = sqrt(inner_product(of->residual, of->residual, of->count));
-  memset(of->correction, 0, sizeof(lanes) * (size_t)of->count);
+  const double size = sqrt(inner_product(of, of->residual, of->residual));
+  make_zero(of, of->correction);
   for (int cycle = 0; cycle < MOST_CYCLES; cycle++) {
     triangle all = {.rest = {0.0}};
     lanes *left = of->basis;
-    if (cycle > 0)
-      multiply(of, of->correction, left);
-    for (long long i = 0; i < of->count; i++)
-      left[i] = cycle > 0 ? of->residual[i] - left[i] : of->residual[i];
-    all.rest[0] = sqrt(inner_product(left, left, of->count));
+    scale(of, left, 1.0, of->residual);
+    if (cycle > 0) {
+      multiply(of, of->correction, of->product);
+      add_multiple(of, left, -1.0, of->product);
+    }
+    all.rest[0] = sqrt(inner_product(of, left, left));
     if (!(all.rest[0] > LINEAR_TOLERANCE * size && all.rest[0] < INFINITY))
       return;
-    scale(left, 1.0 / all.rest[0], of->count);
+    scale(of, left, 1.0 / all.rest[0], left);
     add_combination(of, &all, build_basis(of, &all, LINEAR_TOLERANCE * size, report));
   }
 }

@@ -46,7 +46,7 @@ static void find_reactions(const held *held, const double *lambda, double *x, lo
 static void find_forces(const held_run *of, const double *X, double t, double *F)
 {
   memset(F, 0, sizeof(double) * (size_t)of->n);
-  add_forces(of->given, X, t, 1.0, F);
+  add_forces(of->run, of->given, X, t, 1.0, F);
 }
 
 /* Forces, slopes and their matrix at the state. */

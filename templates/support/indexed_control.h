@@ -16,18 +16,15 @@ static void take_trial(run_memory *run, trial *now)
   run->step++;
 }
 
-int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double tolerance, long long steps,
-    const solver_options *options, solver_report *report)
+static int take_trials(run_memory *run, const travel *way, solver_report *report)
 {
   solver_options standard = NAME(default_options)();
-  solver_report unread;
-  trial now = {.given = given, .n = NAME(coordinates)(given), .t_end = t_end, .at = {run->t, run->t_low}};
-  begin_trials(run, &now, tolerance, &standard);
-  run->direction = t_end < run->t ? -1 : 1;
-  options = options ? options : &standard;
-  report = report ? report : &unread;
-  memset(report, 0, sizeof *report);
-  while (report->steps < steps && run->t != t_end) {
+  trial now = {
+      .given = way->given, .n = NAME(coordinates)(way->given), .t_end = way->t_end, .at = {run->t, run->t_low}};
+  const solver_options *options = way->options ? way->options : &standard;
+  begin_trials(run, &now, way->tolerance, &standard);
+  run->direction = way->t_end < run->t ? -1 : 1;
+  while (report->steps < way->steps && run->t != way->t_end) {
     const int status = find_step(run, &now, options, report);
     if (status != OK)
       return status;
@@ -35,4 +32,14 @@ int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double
     report->steps++;
   }
   return OK;
+}
+
+int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double tolerance, long long steps,
+    const solver_options *options, solver_report *report)
+{
+  const travel way = {take_trials, given, options, t_end, tolerance, steps};
+  solver_report unread;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  return go_together(run, &way, report);
 }

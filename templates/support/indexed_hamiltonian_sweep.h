@@ -19,26 +19,33 @@ static parts_of_work divide(const run_memory *run, long long n)
   return parts;
 }
 
-/* Slopes continued from former steps. */
-static void continue_slopes(const parts_of_work *parts, long long n, const struct guess_tables *tables, long long guess)
+/* Slopes continued from former steps, or none. */
+static void continue_slopes(const run_memory *run, const parts_of_work *parts, long long n,
+    const struct guess_tables *tables, long long guess)
 {
   const long long apart = 2 * n;
+  const section own = mine(run, n);
   for (int g = 0; g < GROUPS; g++)
-    for (long long i = 0; i < apart; i++)
-      parts->G[g * apart + i] = guess == 1 ? given_by_all(tables->alone, g, &parts->last[i], apart)
-                                           : given_by_all(tables->last, g, &parts->last[i], apart) +
+    for (long long half = 0; half < apart; half += n)
+      for (long long i = half + own.first; i < half + own.end; i++) {
+        lanes slope = lanes_of(0.0);
+        if (guess == 1)
+          slope = given_by_all(tables->alone, g, &parts->last[i], apart);
+        else if (guess > 1)
+          slope = given_by_all(tables->last, g, &parts->last[i], apart) +
               given_by_all(tables->before, g, &parts->before[i], apart);
+        parts->G[g * apart + i] = slope;
+      }
 }
 
-/* n places of y from `first` on by their rates, of which a table and weights make increments; returned is the sum of
- * the squares of what that changes, over that of their sizes if these are not absolute. */
-static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, const lanes *weights,
-    long long first, long long n, int absolute)
+/* A block of y from `first` on by its rates, of which a table and weights make increments; returned is the sum of the
+ * squares of what that changes, and that of its sizes. */
+static double improve_block(const run_memory *run, lanes *X, const lanes *rates, const lanes *table,
+    const lanes *weights, long long first, long long n, section here, double *size)
 {
   const long long apart = 2 * n;
   lanes total = lanes_of(0.0);
-  double size = 0.0;
-  for (long long i = first; i < first + n; i++) {
+  for (long long i = first + here.first; i < first + here.end; i++) {
     lanes scaled[GROUPS], increment[GROUPS];
     double of_one;
     for (int g = 0; g < GROUPS; g++)
@@ -51,18 +58,40 @@ static double improve(const run_memory *run, lanes *X, const lanes *rates, const
       X[g * apart + i] = y;
     }
     of_one = fabs(run->q[i]) + fabs(at_point(increment, 1, POINTS - 1));
-    size += of_one * of_one;
+    *size += of_one * of_one;
   }
-  return absolute || size == 0.0 ? lanes_total(total) + 0.0 * size : lanes_total(total) / size;
+  return lanes_total(total);
+}
+
+/* The same of n places; the sum of the squares over that of their sizes if these are not absolute. */
+static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, const lanes *weights,
+    long long first, long long n, const solver_options *options)
+{
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    double size = 0.0;
+    const double change = improve_block(run, X, rates, table, weights, first, n, all.here, &size);
+    add_block(&all, change, size);
+  }
+  wait_for_others(run);
+  return beside_state(sum_of(&all, 0), sum_of(&all, 1), options);
 }
 
 /* Whether all slopes are finite. */
-static int finite_slopes(const lanes *G, long long n)
+static int finite_slopes(const run_memory *run, const lanes *G, long long n)
 {
-  lanes faults = lanes_of(0.0);
-  for (long long i = 0; i < GROUPS * 2 * n; i++)
-    faults += 0.0 * G[i];
-  return lanes_total(faults) == 0.0;
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    lanes faults = lanes_of(0.0);
+    for (int half = 0; half < 2 * GROUPS; half++)
+      for (long long i = all.here.first; i < all.here.end; i++)
+        faults += 0.0 * G[half * n + i];
+    add_block(&all, lanes_total(faults), 0.0);
+  }
+  wait_for_others(run);
+  return sum_of(&all, 0) == 0.0;
 }
 
 /* About how far a coordinate moves in a step. */
@@ -71,15 +100,29 @@ static inline double moved_by(const run_memory *run, const lanes *velocity, long
   return fabs(run->h * at_point(&velocity[i], 2 * n, KEPT / 2));
 }
 
-/* What the highest coefficient of the velocities at the points moves a coordinate by, squared, over what they bend it
- * by: the largest of these, everything as a part of the largest coordinate. That coefficient is taken for at least
- * `decay` times the one below (coefficients.h). */
-static double unresolved(const run_memory *run, const lanes *velocity, long long n, double decay)
+/* The largest coordinate, and how far it moves. */
+static double largest_yet(const run_memory *run, const lanes *velocity, long long n)
 {
-  double largest = DBL_MIN, least = 0.0;
-  for (long long i = 0; i < n; i++)
-    largest = larger(largest, fabs(run->q[i]) + moved_by(run, velocity, n, i));
-  for (long long i = 0; i < n; i++) {
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    double largest = DBL_MIN;
+    for (long long i = all.here.first; i < all.here.end; i++)
+      largest = larger(largest, fabs(run->q[i]) + moved_by(run, velocity, n, i));
+    add_block(&all, largest, 0.0);
+  }
+  wait_for_others(run);
+  return largest_of(&all, 0);
+}
+
+/* What the highest coefficient of the velocities at the points moves a coordinate of a block by, squared, over what
+ * they bend it by: the largest of these, everything as a part of the largest coordinate. That coefficient is taken for
+ * at least `decay` times the one below (coefficients.h). */
+static double unresolved_of_block(const run_memory *run, const lanes *velocity, long long n, double decay,
+    double largest, section here)
+{
+  double least = 0.0;
+  for (long long i = here.first; i < here.end; i++) {
     const lanes *rate = &velocity[i];
     const double size = fabs(run->q[i]) + moved_by(run, velocity, n, i) + largest;
     const double start = at_point(rate, 2 * n, 0), middle = at_point(rate, 2 * n, KEPT / 2);
@@ -91,11 +134,24 @@ static double unresolved(const run_memory *run, const lanes *velocity, long long
   return least;
 }
 
+/* The same of all. */
+static double unresolved(const run_memory *run, const lanes *velocity, long long n, double decay)
+{
+  const double largest = largest_yet(run, velocity, n);
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all))
+    add_block(&all, unresolved_of_block(run, velocity, n, decay, largest, all.here), 0.0);
+  wait_for_others(run);
+  return largest_of(&all, 0);
+}
+
 /* The end of the step, of n places from `first` on. */
 static void move(run_memory *run, const lanes *rates, const lanes *end, const lanes *weights, long long first,
     long long n)
 {
-  for (long long i = first; i < first + n; i++) {
+  const section own = mine(run, n);
+  for (long long i = first + own.first; i < first + own.end; i++) {
     lanes scaled[GROUPS];
     for (int g = 0; g < GROUPS; g++)
       scaled[g] = run->h * weights[g] * rates[g * 2 * n + i - first];
@@ -112,22 +168,18 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   const parts_of_work parts = divide(run, n);
   iteration now = at_its_start();
   double change = 0.0;
-  if (*guess > 0)
-    continue_slopes(&parts, n, tables, *guess);
-  else
-    memset(parts.G, 0, sizeof(lanes) * GROUPS * 2 * (size_t)n);
+  continue_slopes(run, &parts, n, tables, *guess);
   for (int k = 0; now.status == 0; k++) {
-    const double of_q = improve(run, parts.X, parts.G + n, POSITION, POSITION_WEIGHT, 0, n, options->absolute);
-    const double of_p = improve(run, parts.X, parts.G, MOMENTUM, MOMENTUM_WEIGHT, n, n, options->absolute);
-    for (int g = 0; g < GROUPS; g++)
-      forces(given, parts.X + g * 2 * n, run->t + run->h * ABSCISSA[g], parts.G + g * 2 * n, 2 * n);
+    const double of_q = improve(run, parts.X, parts.G + n, POSITION, POSITION_WEIGHT, 0, n, options);
+    const double of_p = improve(run, parts.X, parts.G, MOMENTUM, MOMENTUM_WEIGHT, n, n, options);
+    forces(run, given, parts.X, 2 * n, parts.G, 2 * n);
     change = k % 2 ? of_q + of_p : change + of_q + of_p;
     if (k > 0 && k % 2 == 0)
       judge(&now, change, options, report);
   }
   if (now.status < 0)
     return failure_of(&now);
-  if (!finite_slopes(parts.G, n))
+  if (!finite_slopes(run, parts.G, n))
     return NOT_FINITE;
   *error = unresolved(run, parts.G + n, n, decay);
   *guess = steps_to_continue(*guess, now.first);

@@ -8,6 +8,7 @@ typedef struct {
   const problem *given;
   lengths by;
   long long n, count; /* coordinates, and vectors over all points */
+  section own; /* coordinates of this thread */
   const lanes *X;
   lanes *residual, *correction, *product, *forces, *inverse, *basis;
 } linear_system;
@@ -16,9 +17,8 @@ typedef struct {
 static void multiply(const linear_system *of, const lanes *x, lanes *y)
 {
   const long long n = of->n;
-  for (int g = 0; g < GROUPS; g++)
-    products(of->given, of->X + g * n, of->run->t + of->run->h * ABSCISSA[g], x + g * n, of->forces + g * n, n);
-  for (long long i = 0; i < n; i++) {
+  products(of->run, of->given, of->X, x, of->forces, n);
+  for (long long i = of->own.first; i < of->own.end; i++) {
     const double unit = of->by.square * of->run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++)
       y[g * n + i] = x[g * n + i] - unit * given_by_all(PRODUCT, g, &of->forces[i], n);
@@ -27,7 +27,7 @@ static void multiply(const linear_system *of, const lanes *x, lanes *y)
 
 static void precondition(const linear_system *of, const lanes *x, lanes *y)
 {
-  for (long long i = 0; i < of->n; i++)
+  for (long long i = of->own.first; i < of->own.end; i++)
     for (int g = 0; g < GROUPS; g++)
       y[g * of->n + i] = given_by_all(of->inverse + i * POINTS * GROUPS, g, x + i, of->n);
 }
@@ -63,9 +63,8 @@ static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
 static void find_inverses(linear_system *of)
 {
   const long long n = of->n;
-  for (int g = 0; g < GROUPS; g++)
-    diagonals(of->given, of->X + g * n, of->run->t + of->run->h * ABSCISSA[g], of->forces + g * n, n);
-  for (long long i = 0; i < n; i++) {
+  diagonals(of->run, of->given, of->X, of->forces, n);
+  for (long long i = of->own.first; i < of->own.end; i++) {
     double matrix[POINTS][POINTS], inverse[POINTS][POINTS], mean = 0.0;
     for (int j = 0; j < KEPT; j++)
       mean += at_point(&of->forces[i], n, j) / KEPT;

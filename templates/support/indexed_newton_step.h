@@ -12,6 +12,7 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
       .by = lengths_of(run->h),
       .n = n,
       .count = count,
+      .own = mine(run, n),
       .X = parts->X,
       .residual = work,
       .correction = work + count,
@@ -22,13 +23,13 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
   return of;
 }
 
-/* What a sweep would change at points X with forces F; returned is the size of the coordinates, squared. */
-static double find_residual(linear_system *of, const lanes *X, const lanes *F)
+/* What a sweep would change at points X with forces F, of a block; returned is the size of the coordinates, squared. */
+static double residual_of_block(linear_system *of, const lanes *X, const lanes *F, section here)
 {
   const run_memory *run = of->run;
   const long long n = of->n;
   double size = 0.0;
-  for (long long i = 0; i < n; i++) {
+  for (long long i = here.first; i < here.end; i++) {
     double low, of_one;
     const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
@@ -42,6 +43,17 @@ static double find_residual(linear_system *of, const lanes *X, const lanes *F)
   return size;
 }
 
+/* The same of all. */
+static double find_residual(linear_system *of, const lanes *X, const lanes *F)
+{
+  sums all;
+  begin_sums(&all, of->run, of->n);
+  while (next_block(&all))
+    add_block(&all, residual_of_block(of, X, F, all.here), 0.0);
+  wait_for_others(of->run);
+  return sum_of(&all, 0);
+}
+
 /* The points as former steps are continued, or at rest, whichever a sweep would change less: the forces of a stiff
  * motion are no curve that could be continued. */
 static void start_nearer(linear_system *of, const parts_of_work *parts)
@@ -49,17 +61,17 @@ static void start_nearer(linear_system *of, const parts_of_work *parts)
   const run_memory *run = of->run;
   double continued, at_rest;
   find_residual(of, parts->X, parts->F);
-  continued = inner_product(of->residual, of->residual, of->count);
+  continued = inner_product(of, of->residual, of->residual);
   for (int g = 0; g < GROUPS; g++)
-    for (long long i = 0; i < of->n; i++)
+    for (long long i = of->own.first; i < of->own.end; i++)
       of->correction[g * of->n + i] = lanes_of(run->q[i]);
   forces_at_points(run, of->given, of->correction, of->forces, of->n);
   find_residual(of, of->correction, of->forces);
-  at_rest = inner_product(of->residual, of->residual, of->count);
+  at_rest = inner_product(of, of->residual, of->residual);
   if (continued <= at_rest)
     return;
-  memcpy(parts->X, of->correction, sizeof(lanes) * (size_t)of->count);
-  memcpy(parts->F, of->forces, sizeof(lanes) * (size_t)of->count);
+  scale(of, parts->X, 1.0, of->correction);
+  scale(of, parts->F, 1.0, of->forces);
 }
 
 /* Until the points rest. The tables continue so many steps; then `guess` is how many are best continued into the next,
@@ -79,16 +91,15 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
     if (now.last > REFRESHED) /* as before the first */
       find_inverses(&of);
     find_correction(&of, report);
-    for (long long i = 0; i < of.count; i++)
-      parts.X[i] += of.correction[i];
+    add_multiple(&of, parts.X, 1.0, of.correction);
     forces_at_points(run, given, parts.X, parts.F, n);
-    change = inner_product(of.correction, of.correction, of.count);
+    change = inner_product(&of, of.correction, of.correction);
     judge(&now, beside_state(change, size, options), options, report);
   }
   if (now.status < 0)
     return failure_of(&now);
   if (largest <= DBL_MIN)
-    largest = largest_at_end(parts.X, n);
+    largest = largest_at_end(run, parts.X, n);
   *guess = steps_to_continue(*guess, now.first);
   return examine(run, parts.F, &of.by, n, largest, decay, error) ? OK : NOT_FINITE;
 }

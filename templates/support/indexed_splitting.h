@@ -8,20 +8,26 @@ typedef struct {
 
 /* Increments by a drift, and where they lead. */
 static void drift_by(double by, const double *restrict inverse_mass, const double *restrict p,
-    const double *restrict dp, const double *restrict q, double *restrict dq, double *restrict X, long long n)
+    const double *restrict dp, const double *restrict q, double *restrict dq, double *restrict X, section own)
 {
-  for (long long i = 0; i < n; i++) {
+  for (long long i = own.first; i < own.end; i++) {
     dq[i] += by * (inverse_mass[i] * (p[i] + dp[i]));
     X[i] = q[i] + dq[i];
   }
 }
 
-static int all_sums_finite(const double *x, const double *y, long long n)
+static int all_sums_finite(const run_memory *run, const parts_of_work *parts, long long n)
 {
-  int faults = 0;
-  for (long long i = 0; i < n; i++)
-    faults |= 0.0 * (x[i] + y[i]) != 0.0;
-  return !faults;
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    int faults = 0;
+    for (long long i = all.here.first; i < all.here.end; i++)
+      faults |= (0.0 * (run->q[i] + parts->dq[i]) != 0.0) | (0.0 * (run->p[i] + parts->dp[i]) != 0.0);
+    add_block(&all, faults, 0.0);
+  }
+  wait_for_others(run);
+  return sum_of(&all, 0) == 0.0;
 }
 
 /* Whether the last kick of a step is at its end: its forces are those of the first of the next. */
@@ -30,37 +36,47 @@ static int ends_with_a_kick(void)
   return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
 }
 
+/* A kick of a thread's own momenta; forces that the next step begins with are kept. */
+static void kick_by(const run_memory *run, const problem *given, const parts_of_work *parts, int k, section own)
+{
+  const double by = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
+  const long long size = own.end - own.first;
+  if (k == 0 && run->guess)
+    add_to(parts->dp + own.first, parts->F + own.first, by, size);
+  else if (k == LEAPS - 1 && ends_with_a_kick()) {
+    memset(parts->F + own.first, 0, sizeof(double) * (size_t)size);
+    add_forces(run, given, parts->X, t, 1.0, parts->F);
+    add_to(parts->dp + own.first, parts->F + own.first, by, size);
+  } else
+    add_forces(run, given, parts->X, t, by, parts->dp);
+}
+
 /* Increments begin with what rounding cut off the state. */
 static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {
   double *work = run->work;
   const parts_of_work parts = {work, work + n, work + 2 * n, work + 3 * n};
+  const section own = mine(run, n);
+  const size_t size = (size_t)(own.end - own.first);
   (void)options;
-  memcpy(parts.dq, run->carry_q, sizeof(double) * (size_t)n);
-  memcpy(parts.dp, run->carry_p, sizeof(double) * (size_t)n);
-  drift_by(0.0, run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, n);
+  memcpy(parts.dq + own.first, run->carry_q + own.first, sizeof(double) * size);
+  memcpy(parts.dp + own.first, run->carry_p + own.first, sizeof(double) * size);
+  drift_by(0.0, run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, own);
   for (int k = 0; k < LEAPS; k++) {
-    const double kick = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
-    if (kick != 0.0 && k == 0 && run->guess)
-      add_to(parts.dp, parts.F, kick, n);
-    else if (kick != 0.0 && k == LEAPS - 1 && ends_with_a_kick()) {
-      memset(parts.F, 0, sizeof(double) * (size_t)n);
-      add_forces(given, parts.X, t, 1.0, parts.F);
-      add_to(parts.dp, parts.F, kick, n);
-    } else if (kick != 0.0)
-      add_forces(given, parts.X, t, kick, parts.dp);
+    if (KICK[k] != 0.0)
+      kick_by(run, given, &parts, k, own);
     if (DRIFT[k] != 0.0)
-      drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, n);
+      drift_by(run->h * DRIFT[k], run->inverse_mass, run->p, parts.dp, run->q, parts.dq, parts.X, own);
   }
   report->iterations++;
   run->error = NAN;
-  if (!all_sums_finite(run->q, parts.dq, n) || !all_sums_finite(run->p, parts.dp, n)) {
+  if (!all_sums_finite(run, &parts, n)) {
     run->guess = 0; /* the forces that are kept are those of no state */
     return NOT_FINITE;
   }
-  add_all(run->q, parts.dq, run->carry_q, n);
-  add_all(run->p, parts.dp, run->carry_p, n);
+  add_all(run->q + own.first, parts.dq + own.first, run->carry_q + own.first, (long long)size);
+  add_all(run->p + own.first, parts.dp + own.first, run->carry_p + own.first, (long long)size);
   run->guess = ends_with_a_kick();
   return OK;
 }

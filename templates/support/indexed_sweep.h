@@ -43,17 +43,16 @@ static inline double drift_of(const run_memory *run, long long i, double *low)
 
 static void forces_at_points(const run_memory *run, const problem *given, const lanes *X, lanes *F, long long n)
 {
-  for (int g = 0; g < GROUPS; g++)
-    forces(given, X + g * OF_EACH * n, run->t + run->h * ABSCISSA[g], F + g * n, n);
+  forces(run, given, X, OF_EACH * n, F, n);
 }
 
-/* Where the points stand by the forces of former steps, or without any; returned is the largest coordinate, and its
- * drift. */
-static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n,
-    const struct guess_tables *tables, long long guess)
+/* Where the points of a block stand by the forces of former steps, or without any; returned is the largest coordinate,
+ * and its drift. */
+static double first_of_block(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n,
+    const struct guess_tables *tables, long long guess, section here)
 {
   double largest = DBL_MIN;
-  for (long long i = 0; i < n; i++) {
+  for (long long i = here.first; i < here.end; i++) {
     double low;
     const double drift = drift_of(run, i, &low), unit = by->square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
@@ -76,24 +75,42 @@ static double first_positions(const run_memory *run, const parts_of_work *parts,
   return largest;
 }
 
-/* The largest coordinate at the last point: of a step from rest at 0 the only size there is. */
-static double largest_at_end(const lanes *X, long long n)
+/* The same of all; the largest. */
+static double first_positions(const run_memory *run, const parts_of_work *parts, const lengths *by, long long n,
+    const struct guess_tables *tables, long long guess)
 {
-  double largest = DBL_MIN;
-  for (long long i = 0; i < n; i++)
-    largest = larger(largest, fabs(at_point(&X[i], OF_EACH * n, KEPT - 1)));
-  return largest;
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all))
+    add_block(&all, first_of_block(run, parts, by, n, tables, guess, all.here), 0.0);
+  wait_for_others(run);
+  return largest_of(&all, 0);
 }
 
-/* Whether all forces are finite. And what the highest coefficient of the forces at the points moves a coordinate by,
- * squared, over what they bend it by: the largest of these, everything as a part of the largest coordinate. That
- * coefficient is taken for at least `decay` times the one below (coefficients.h). */
-static int examine(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest, double decay,
-    double *error)
+/* The largest coordinate at the last point: of a step from rest at 0 the only size there is. */
+static double largest_at_end(const run_memory *run, const lanes *X, long long n)
+{
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    double largest = DBL_MIN;
+    for (long long i = all.here.first; i < all.here.end; i++)
+      largest = larger(largest, fabs(at_point(&X[i], OF_EACH * n, KEPT - 1)));
+    add_block(&all, largest, 0.0);
+  }
+  wait_for_others(run);
+  return largest_of(&all, 0);
+}
+
+/* What the highest coefficient of the forces at the points moves a coordinate of a block by, squared, over what they
+ * bend it by: the largest of these, everything as a part of the largest coordinate. That coefficient is taken for at
+ * least `decay` times the one below (coefficients.h). No number where a force is none. */
+static double unresolved(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest,
+    double decay, section here)
 {
   lanes faults = lanes_of(0.0);
   double least = 0.0;
-  for (long long i = 0; i < n; i++) {
+  for (long long i = here.first; i < here.end; i++) {
     const double unit = by->square * run->inverse_mass[i];
     const double size = fabs(run->q[i]) + fabs(by->h * run->inverse_mass[i] * run->p[i]) + largest;
     const double ends = fabs(at_point(&F[i], n, 0)) + fabs(at_point(&F[i], n, KEPT - 1));
@@ -103,19 +120,34 @@ static int examine(const run_memory *run, const lanes *F, const lengths *by, lon
       faults += 0.0 * F[g * n + i];
     least = larger(least, top * top / (bend * size));
   }
-  *error = least;
-  return lanes_total(faults) == 0.0;
+  return least + lanes_total(faults);
+}
+
+/* Whether all forces are finite; and the largest of these of all. */
+static int examine(const run_memory *run, const lanes *F, const lengths *by, long long n, double largest, double decay,
+    double *error)
+{
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    const double found = unresolved(run, F, by, n, largest, decay, all.here);
+    add_block(&all, found, found == found ? 0.0 : 1.0);
+  }
+  wait_for_others(run);
+  *error = largest_of(&all, 0);
+  return sum_of(&all, 1) == 0.0;
 }
 
 /* The state at the end of the step. */
 static void move(run_memory *run, const lanes *F, const lengths *by, long long n)
 {
+  const section own = mine(run, n);
   lanes kick[GROUPS], kick_low[GROUPS];
   for (int g = 0; g < GROUPS; g++) {
     kick[g] = by->h * POINT_END_MOMENTUM[g];
     kick_low[g] = fused_weights(by->h, POINT_END_MOMENTUM[g], -kick[g]) + by->h * POINT_END_MOMENTUM_LOW[g];
   }
-  for (long long i = 0; i < n; i++) {
+  for (long long i = own.first; i < own.end; i++) {
     double drift_low;
     const double drift = drift_of(run, i, &drift_low), inverse = run->inverse_mass[i];
     const double sum = weigh_apart_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, &F[i], n);

@@ -30,12 +30,10 @@ from scvi_codegen.benchmark import (
     report,
     samples,
     start_up,
-    sums,
 )
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders import held_bodies, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
-from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
@@ -582,42 +580,6 @@ class TestTables:
             assert len(own) == methods
             assert all(each.error < 1e-4 and each.seconds > 0.0 for each in own)
             assert max(each.error for each in found if each not in own) < 1e-10
-
-    @pytest.mark.parametrize("lattice", [sums.ring(8, 1.0), sums.field(6, 0.2)], ids=lambda lattice: lattice.name)
-    def test_lattices_by_hand_move_as_generated_ones(self, lattice):
-        steps = 10
-        by_hand, ours = (
-            run() for run in (sums._by_hand(lattice, 8, steps), sums._ours(lattice, Composition(8), steps))
-        )
-        assert np.abs(by_hand - ours).max() < 1e-14
-        assert np.abs(ours - lattice.q).max() > 0.01
-
-    @pytest.mark.parametrize("name", sorted(PLATFORMS))
-    def test_openmm_makes_the_steps_of_leapfrog(self, name):
-        pytest.importorskip("openmm", reason="needs the extra 'bench'")
-        crystal, steps = sums.atoms(1, 0.5), 50
-        theirs = sums._openmm(name, crystal, steps)()
-        ours = sums._ours(crystal, "stoermer-verlet", steps)()
-        rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
-        assert np.abs(theirs - ours).max() < rounding
-        assert np.abs(ours - crystal.q).max() > 0.1
-
-    @pytest.mark.full
-    def test_sums_are_measured_at_equal_error(self, monkeypatch):
-        monkeypatch.setattr(sums, "lattices", lambda plan: (sums.ring(32, 2.0), sums.bodies(4, 0.5)))
-        rows = sums.run_sums(bench.Plan(quick=True, peers=()), lambda text: None).rows
-        assert [row["error"] for row in rows] == [*sums.ERRORS, *sums.ERRORS]
-        assert all(row["doubt"] < 1e-13 and row["DOP853"] > 0.0 and row["composition"] > 0.0 for row in rows)
-        assert "leapfrog" in rows[0]
-        assert "leapfrog" not in rows[-1]
-
-    @pytest.mark.full
-    def test_growth_is_measured(self, monkeypatch):
-        monkeypatch.setattr(sums, "GROWTH", (100, 100_000))
-        rows = sums.run_growth(bench.Plan(quick=True), lambda text: None).rows
-        assert [row["coordinates"] for row in rows] == [100, 100_000, 256] * 3
-        assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::3], rows[1::3], strict=True))
-        assert all(row["gigabytes_s"] > 0.0 for row in rows)
 
     @pytest.mark.full
     def test_compilers_and_processors_are_measured(self, monkeypatch):

@@ -151,6 +151,17 @@ def test_generate(ring: str) -> None:
     end = np.loadtxt("ring_svi/end.txt")
     assert end[:8] == pytest.approx(document["final"]["q"]["q"], abs=1e-14)
     assert end[8:] == pytest.approx(document["final"]["p"]["q"], abs=1e-14)
+    without = Path("ring_svi/end.txt").read_text()
+    subprocess.run(["make", "-s", "ring_svi_main"], cwd="ring_svi", check=True)
+    ends = set()
+    for threads in ("1", "3"):
+        subprocess.run(["./ring_svi_main", threads], cwd="ring_svi", check=True, capture_output=True)
+        ends.add(Path("ring_svi/end.txt").read_text())
+    assert len(ends) == 1
+    subprocess.run(["make", "-s", "-B", "THREADS=", "ring_svi_main"], cwd="ring_svi", check=True)
+    subprocess.run(["./ring_svi_main", "3"], cwd="ring_svi", check=True, capture_output=True)
+    assert ends == {Path("ring_svi/end.txt").read_text()}
+    assert np.fromstring(without, sep=" ") == pytest.approx(np.fromstring(ends.pop(), sep=" "), abs=1e-14)
     Path("ring_svi/main.c").write_text("mine")
     assert "was edited" in invoke("generate", ring, "-o", "ring_svi").output
     assert invoke("generate", ring, "-o", "ring_svi", "--force").exit_code == 0

@@ -87,9 +87,10 @@ def test_what_belongs_to_the_first_of_a_pair_is_read_and_added_once() -> None:
     """Before and behind the loop over the second."""
     code = rendered("bodies", "svi:4").code
     outer = code.index(
-        "for (long long index_i = 0; index_i < size_N; index_i++)", code.index("static void add_force_0")
+        "for (long long index_i = here->of.first; index_i < here->of.end; index_i++)",
+        code.index("static void add_force_0"),
     )
-    inner = code.index("for (long long index_j = index_i + 1", outer)
+    inner = code.index("for (long long index_j = between(index_i + 1, ", outer)
     end = code.index("\n}\n", inner)
     assert code[outer:inner].count("] = X[") == 3
     assert code[inner:end].count("] = X[") == 3

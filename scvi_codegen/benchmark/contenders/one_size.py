@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from scvi_codegen.benchmark.sums import field, ring
+from scvi_codegen.benchmark.large_cases import field, ring
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.ir.kernel import Kernel

@@ -41,7 +41,9 @@ def bench(
     million steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up, compile
     (larger systems, from text to first step), mechanisms (of SymPy, beside lambdify and PyDy), held (bodies held by
     rods, beside MuJoCo), samples (of controllers), sums (over indices: lattices, fields, many bodies), growth (with
-    their number of coordinates) or builds (other compilers and processors); by default all; kepler is both of its kind.
+    their number of coordinates), threads (that share their steps), energies (theirs, over a hundred thousand steps),
+    cluster (a thousand bodies beside REBOUND) or builds (other compilers and processors); by default all; kepler is
+    both of its kind.
     Install the peers with 'scvi-codegen[bench]'. Sections are printed, and written to the JSON, as they are measured;
     Ctrl-C ends it with these, and with --resume it goes on from there.
 

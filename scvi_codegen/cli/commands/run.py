@@ -117,6 +117,7 @@ Examples:
     "--solver-tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
 )
 @click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
+@click.option("--threads", type=int, metavar="N", help="That share each step of a model of sums over indices [1].")
 @reporting
 def run(
     model_name: str | None,
@@ -132,6 +133,7 @@ def run(
     solver: str,
     solver_tolerance: float | None,
     max_iterations: int | None,
+    threads: int | None,
     **choices: Any,
 ) -> None:
     """What ``ABOUT`` says."""
@@ -153,8 +155,10 @@ def run(
     options = SolverOptions(**chosen) if chosen else None
     if isinstance(model, IndexedModel):
         refuse({"ensemble": ensemble, "advise": advise, "solver": None if solver == "auto" else solver})
-        run_sums(model if tolerance is None else controlled_model(model, tolerance), output, plot, options)
+        run_sums(model if tolerance is None else controlled_model(model, tolerance), output, plot, options, threads)
         return
+    if threads is not None:
+        raise click.UsageError("--threads are for models of sums over indices")
     if model.system.inputs:
         _check_driven(advise, recorded=recorded)
     if ensemble is not None:

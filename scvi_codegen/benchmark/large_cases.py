@@ -1,0 +1,242 @@
+"""Large systems to be timed: lattices, fields, molecules, cloth, bodies, of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import Array
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+
+__all__ = ["Lattice", "atoms", "bodies", "breather", "cloth", "field", "ring", "waves"]
+
+SEED = 20261121
+SPACING = 0.98 * 2 ** (2 / 3)
+"""Of an argon crystal, in diameters of its atoms: neighbours stand a little closer than two atoms at rest would."""
+
+
+class Lattice(NamedTuple):
+    """A problem: its system and start, how long it runs, steps to try, its accelerations by NumPy.
+
+    ``by_hand``: (is a field, places along an axis, strength) for the C by hand; ``tables``: of bonds.
+    """
+
+    name: str
+    system: IndexedSystem
+    q: Array
+    v: Array
+    span: float
+    longest: float
+    accelerations: Callable[[Array], Array]
+    by_hand: tuple[int, int, float] | None
+    parameters: Mapping[str, float]
+    tables: Mapping[str, Any] = MappingProxyType({})
+
+
+def ring(count: int, span: float) -> Lattice:
+    """A Fermi-Pasta-Ulam-Tsingou ring in which all places move."""
+    beta, numbers = 0.25, np.random.default_rng(SEED)
+
+    def accelerations(q: Array) -> Array:
+        d = np.roll(q, -1) - q
+        pull = d + beta * d**3
+        return pull - np.roll(pull, 1)
+
+    return Lattice(
+        name="ring",
+        system=IndexedSystem.from_text(
+            name="ring",
+            coordinates=["q[N]"],
+            parameters={"beta": beta},
+            lagrangian="sum(i in N, q_dot[i]**2/2)"
+            "- sum(i in N periodic, (q[i+1] - q[i])**2/2 + beta*(q[i+1] - q[i])**4/4)",
+        ),
+        q=np.zeros(count),
+        v=numbers.normal(size=count),
+        span=span,
+        longest=0.4,
+        accelerations=accelerations,
+        by_hand=(0, count, beta),
+        parameters={},
+    )
+
+
+def field(side: int, span: float) -> Lattice:
+    """Sine-Gordon on a torus, a smooth bump."""
+    dx = 0.1
+    x = dx * (np.arange(side) - side // 2)
+    bump = 2.0 * np.exp(-(x[:, np.newaxis] ** 2 + x**2) / 4.0)
+
+    def accelerations(u: Array) -> Array:
+        around = sum(np.roll(u, shift, axis) for shift in (1, -1) for axis in (0, 1))
+        found: Array = (around - 4.0 * u) / dx**2 - np.sin(u)
+        return found
+
+    return Lattice(
+        name="field",
+        system=IndexedSystem.from_text(
+            name="field",
+            coordinates=["u[NX, NY]"],
+            parameters={"w": 1 / dx**2},
+            lagrangian="sum(i in NX periodic, j in NY periodic, u_dot[i, j]**2/2"
+            "- w*((u[i+1, j] - u[i, j])**2 + (u[i, j+1] - u[i, j])**2)/2 + cos(u[i, j]))",
+        ),
+        q=bump,
+        v=np.zeros((side, side)),
+        span=span,
+        longest=0.06,
+        accelerations=accelerations,
+        by_hand=(1, side, 1 / dx**2),
+        parameters={},
+    )
+
+
+def bodies(count: int, span: float) -> Lattice:
+    """Gravity, softened, of a cluster."""
+    softening, numbers = 0.1, np.random.default_rng(SEED)
+
+    def accelerations(r: Array) -> Array:
+        d = r[np.newaxis] - r[:, np.newaxis]
+        cube = (np.sum(d**2, axis=-1) + softening**2) ** -1.5
+        found: Array = np.einsum("ij,ijk->ik", cube, d) / count
+        return found
+
+    return Lattice(
+        name="bodies",
+        system=IndexedSystem.from_text(
+            name="bodies",
+            coordinates=["r[N, 3]"],
+            parameters={"m": 1, "e": softening},
+            lagrangian="m*sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)"
+            "+ m**2*sum(i < j in N, 1/sqrt(sum(a in 3, (r[i, a] - r[j, a])**2) + e**2))",
+        ),
+        q=numbers.normal(size=(count, 3)),
+        v=0.4 * numbers.normal(size=(count, 3)),
+        span=span,
+        longest=0.25,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={"m": 1 / count},
+    )
+
+
+def atoms(cells: int, span: float) -> Lattice:
+    """A crystal of argon (face-centred cubic, free surfaces), slightly compressed, whose atoms move at random."""
+    corner = np.array([[0.0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
+    q = SPACING * np.concatenate([corner + np.array(cell) for cell in np.ndindex(cells, cells, cells)])
+
+    def accelerations(r: Array) -> Array:
+        d = r[np.newaxis] - r[:, np.newaxis]
+        square = np.sum(d**2, axis=-1)
+        np.fill_diagonal(square, np.inf)
+        found: Array = -np.einsum("ij,ijk->ik", 24.0 * (2.0 * square**-7 - square**-4), d)
+        return found
+
+    return Lattice(
+        name="atoms",
+        system=IndexedSystem.from_text(
+            name="atoms",
+            coordinates=["r[N, 3]"],
+            lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(i < j in N, "
+            "4/sum(a in 3, (r[i, a] - r[j, a])**2)**6 - 4/sum(a in 3, (r[i, a] - r[j, a])**2)**3)",
+        ),
+        q=q,
+        v=0.5 * np.random.default_rng(SEED).normal(size=q.shape),
+        span=span,
+        longest=0.05,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={},
+    )
+
+
+def waves(count: int, span: float) -> Lattice:
+    """A Klein-Gordon ring, q^4 at every place, in which long waves run."""
+
+    def accelerations(q: Array) -> Array:
+        found: Array = np.roll(q, -1) - 2.0 * q + np.roll(q, 1) - q - q**3
+        return found
+
+    phase = 2.0 * np.pi * np.arange(count) / count
+    return Lattice(
+        name="waves",
+        system=IndexedSystem.from_text(
+            name="waves",
+            coordinates=["q[N]"],
+            lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2 - q[i]**4/4)- sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        ),
+        q=np.sin(8.0 * phase),
+        v=np.cos(3.0 * phase),
+        span=span,
+        longest=0.4,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={},
+    )
+
+
+def breather(count: int, span: float) -> Lattice:
+    """The breather of sine-Gordon's equation, 4 atan(k sin(w t) / (w cosh(k x))), k^2 = 1 - w^2, on a ring."""
+    dx, frequency = 0.1, 0.8
+    slope = np.sqrt(1.0 - frequency**2)
+
+    def accelerations(u: Array) -> Array:
+        found: Array = (np.roll(u, -1) - 2.0 * u + np.roll(u, 1)) / dx**2 - np.sin(u)
+        return found
+
+    x = dx * (np.arange(count) - count // 2)
+    return Lattice(
+        name="breather",
+        system=IndexedSystem.from_text(
+            name="breather",
+            coordinates=["u[N]"],
+            parameters={"w": 1 / dx**2},
+            lagrangian="sum(i in N, u_dot[i]**2/2 + cos(u[i])) - w*sum(i in N periodic, (u[i+1] - u[i])**2/2)",
+        ),
+        q=np.zeros(count),
+        v=4.0 * slope / np.cosh(slope * x),
+        span=span,
+        longest=0.06,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={},
+    )
+
+
+def cloth(side: int, span: float) -> Lattice:
+    """Places on a square, springs between neighbours along both axes, stretched a little and waving."""
+    places = np.arange(side**2).reshape(side, side)
+    down, along = np.stack([places[:-1], places[1:]], -1), np.stack([places[:, :-1], places[:, 1:]], -1)
+    bonds = np.concatenate([down.reshape(-1, 2), along.reshape(-1, 2)])
+    x, y = (each.T for each in np.meshgrid(np.arange(side), np.arange(side)))
+    q = np.stack([1.05 * x, 1.02 * y, 0.1 * np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
+
+    def accelerations(r: Array) -> Array:
+        d = r[bonds[:, 0]] - r[bonds[:, 1]]
+        length, found = np.sqrt(np.sum(d**2, axis=-1, keepdims=True)), np.zeros_like(r)
+        np.add.at(found, bonds[:, 0], -100.0 * (1.0 - 1.0 / length) * d)
+        np.add.at(found, bonds[:, 1], 100.0 * (1.0 - 1.0 / length) * d)
+        return found
+
+    return Lattice(
+        name="cloth",
+        system=IndexedSystem.from_text(
+            name="cloth",
+            coordinates=["r[N, 3]"],
+            parameters={"k": 100},
+            tables=["bonds[B, 2]"],
+            lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)"
+            "- k*sum(b in B, (sqrt(sum(a in 3, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2)) - 1)**2/2)",
+        ),
+        q=q,
+        v=np.zeros_like(q),
+        span=span,
+        longest=0.04,
+        accelerations=accelerations,
+        by_hand=None,
+        parameters={},
+        tables={"bonds": bonds},
+    )

@@ -1,0 +1,101 @@
+"""The benchmark of sums over indices: contenders move as ours do, and what is measured comes out."""
+
+import numpy as np
+import pytest
+
+from scvi_codegen import benchmark as bench
+from scvi_codegen.benchmark import cluster, long_sums, shared_steps, sums
+from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
+from scvi_codegen.benchmark.large_cases import atoms, bodies, breather, cloth, field, ring, waves
+from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.methods import Composition
+
+QUICK = bench.Plan(quick=True, peers=())
+
+
+def quiet(text):
+    """Says nothing."""
+
+
+@pytest.mark.parametrize("lattice", [ring(8, 1.0), field(6, 0.2)], ids=lambda lattice: lattice.name)
+def test_lattices_by_hand_move_as_generated_ones(lattice):
+    steps = 10
+    by_hand, ours = (run() for run in (sums._by_hand(lattice, 8, steps), sums._ours(lattice, Composition(8), steps)))
+    assert np.abs(by_hand - ours).max() < 1e-14
+    assert np.abs(ours - lattice.q).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    "each",
+    [ring(8, 1.0), waves(8, 1.0), breather(8, 1.0), field(5, 1.0), atoms(1, 1.0), bodies(4, 1.0), cloth(3, 1.0)],
+    ids=lambda each: each.name,
+)
+def test_accelerations_by_numpy_are_those_of_the_formula(each):
+    """By a step of leapfrog."""
+    h, given = 1e-3, {"parameters": each.parameters, "tables": each.tables}
+    run = compile_indexed(each.system, "stoermer-verlet").integrate(each.q, velocity=each.v, h=h, steps=1, **given)
+    ((_, q),) = run.q.values()
+    ((_, velocity),) = run.velocity.values()
+    kick = h / 2 * (each.accelerations(each.q) + each.accelerations(q))
+    np.testing.assert_allclose(velocity - each.v, kick, rtol=0, atol=1e-12 * np.abs(kick).max() + 1e-15)
+
+
+@pytest.mark.parametrize("name", sorted(PLATFORMS))
+def test_openmm_makes_the_steps_of_leapfrog(name):
+    pytest.importorskip("openmm", reason="needs the extra 'bench'")
+    crystal, steps = atoms(1, 0.5), 50
+    theirs = sums._openmm(name, crystal, steps)()
+    ours = sums._ours(crystal, "stoermer-verlet", steps)()
+    rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
+    assert np.abs(theirs - ours).max() < rounding
+    assert np.abs(ours - crystal.q).max() > 0.1
+
+
+@pytest.mark.full
+def test_rebound_settles_where_we_do():
+    pytest.importorskip("rebound", reason="needs the extra 'bench'")
+    each = bodies(10, 0.5)
+    ours, theirs = cluster._ours(each, "svi:8", 32)(), cluster._rebound(each, "ias15", None)()
+    assert max(np.abs(one - other).max() for one, other in zip(ours, theirs, strict=True)) < 1e-14
+
+
+@pytest.mark.full
+def test_sums_are_measured_at_equal_error(monkeypatch):
+    monkeypatch.setattr(sums, "lattices", lambda plan: (ring(32, 2.0), bodies(4, 0.5)))
+    rows = sums.run_sums(QUICK, quiet).rows
+    assert [row["error"] for row in rows] == [*sums.ERRORS, *sums.ERRORS]
+    assert all(row["doubt"] < 1e-13 and row["DOP853"] > 0.0 and row["composition"] > 0.0 for row in rows)
+    assert "leapfrog" in rows[0]
+    assert "leapfrog" not in rows[-1]
+
+
+@pytest.mark.full
+def test_growth_is_measured(monkeypatch):
+    monkeypatch.setattr(sums, "GROWTH", (100, 100_000))
+    rows = sums.run_growth(QUICK, quiet).rows
+    assert [row["coordinates"] for row in rows] == [100, 100_000, 256] * 3
+    assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::3], rows[1::3], strict=True))
+    assert all(row["gigabytes_s"] > 0.0 for row in rows)
+
+
+@pytest.mark.full
+def test_threads_are_measured():
+    rows = shared_steps.run_threads(QUICK, quiet).rows
+    assert [row["problem"] for row in rows] == ["ring"] * 2 + ["atoms"] * 2
+    assert all(row["one_us"] > 0.0 and row["threads_2"] > 0.0 for row in rows)
+
+
+@pytest.mark.full
+def test_energies_stay_at_rounding():
+    for row in long_sums.run_energies(QUICK, quiet).rows:
+        exact = row["by"].endswith("svi:8")
+        assert row["largest"] < 1e-13 if exact else 1e-8 < row["largest"] < 1e-2
+
+
+@pytest.mark.full
+def test_errors_of_a_cluster_shrink_with_its_steps():
+    rows = cluster.run_cluster(QUICK, quiet).rows
+    for name, counts in cluster.OURS_BY.items():
+        errors = [row["error"] for row in rows if row["by"].endswith(name)]
+        assert len(errors) == len(counts)
+        assert errors == sorted(errors, reverse=True)

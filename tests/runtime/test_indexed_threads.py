@@ -1,0 +1,400 @@
+"""Threads that share the steps of sums over indices: no bit depends on their number, and every term is counted once."""
+
+import os
+import signal
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.indexed_compiler import generate_indexed
+from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.methods import as_method
+from scvi_codegen.native.compilers import find_compiler
+from scvi_codegen.rendering.sharing import Sharing, sharing_of
+
+RNG = np.random.default_rng(5)
+THREADS = (1, 2, 3, 5)
+BONDS = RNG.integers(0, 1500, size=(3000, 2))
+PINS = RNG.integers(0, 300, size=7)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A potential, how its terms are shared, and its forces by NumPy."""
+
+    coordinates: str
+    potential: str
+    shape: tuple[int, ...]
+    shared: Sharing
+    forces: Callable[[Any], Any]
+    given: dict[str, Any] = field(default_factory=dict)
+
+
+def scattered(*parts: tuple[Any, Any]) -> Callable[[Any], Any]:
+    """Adds up values at places that may occur more than once."""
+
+    def add(q: Any) -> Any:
+        total = np.zeros_like(q)
+        for places, values in parts:
+            np.add.at(total, places, values(q))
+        return total
+
+    return add
+
+
+def ring(q: Any) -> Any:
+    cubes = (np.roll(q, -1) - q) ** 3
+    return cubes - np.roll(cubes, 1) - np.roll(q, -3) - np.roll(q, 3)
+
+
+def plane(u: Any) -> Any:
+    cubes = (np.roll(u, -2, axis=0) - u) ** 3
+    return cubes - np.roll(cubes, 2, axis=0) - u
+
+
+def pairs(q: Any) -> Any:
+    slopes = np.sin(q[:, None] - q[None, :]) / len(q)
+    return slopes.sum(axis=1)
+
+
+def transposed(u: Any) -> Any:
+    return -(u.T**2) - 2 * u * u.T
+
+
+LINES, COLUMNS = BONDS.T
+CASES = {
+    "ring": Case("q[N]", "sum(i in N periodic, (q[i+1] - q[i])**4/4 + q[i-1]*q[i+2])", (9000,), Sharing.IN_TURN, ring),
+    "plane": Case(
+        "q[N, M]",
+        "sum(i in N periodic, j in M, (q[i+2, j] - q[i, j])**4/4 + q[i, j]**2/2)",
+        (90, 70),
+        Sharing.IN_TURN,
+        plane,
+    ),
+    "pairs": Case("q[N]", "sum(i < j in N, cos(q[i] - q[j])/N)", (210,), Sharing.IN_TILES, pairs),
+    "few pairs": Case("q[N]", "sum(i < j in N, cos(q[i] - q[j])/N)", (66,), Sharing.IN_TILES, pairs),
+    "net": Case(
+        "q[N]",
+        "sum(b in B, (q[bonds[b, 0]] - q[bonds[b, 1]])**4/4)",
+        (1500,),
+        Sharing.BY_PLACES,
+        scattered(
+            (LINES, lambda q: -((q[LINES] - q[COLUMNS]) ** 3)), (COLUMNS, lambda q: (q[LINES] - q[COLUMNS]) ** 3)
+        ),
+        {"tables": {"bonds": BONDS}},
+    ),
+    "pins": Case(
+        "q[N]",
+        "sum(i in N, c in P, q[i]**2*q[pins[c]]/8)",
+        (3000,),
+        Sharing.BY_PLACES,
+        scattered(
+            (slice(None), lambda q: -q * q[PINS].sum() / 4),
+            (PINS, lambda q: np.full(len(PINS), -(q**2).sum() / 8)),
+        ),
+        {"tables": {"pins": PINS}},
+    ),
+    "transposed": Case("q[N, N]", "sum(i in N, j in N, q[i, j]*q[j, i]**2)", (60, 60), Sharing.BY_PLACES, transposed),
+}
+
+
+def system_of(case: Case) -> sc.IndexedSystem:
+    """With unit masses."""
+    axes = "i in N, j in N" if "N, N" in case.coordinates else "i in N, j in M" if "M" in case.coordinates else "i in N"
+    velocity = "q_dot[i, j]" if "j" in axes else "q_dot[i]"
+    return sc.IndexedSystem.from_text(
+        name="shared",
+        coordinates=[case.coordinates],
+        tables=[each for each in ("bonds[B, 2]", "pins[P]") if each.split("[")[0] in case.potential],
+        lagrangian=f"sum({axes}, {velocity}**2/2) - {case.potential.replace('/N', '/size')}",
+        parameters={"size": case.shape[0]},
+    )
+
+
+@cache
+def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.IndexedStepper:
+    return sc.compile_indexed(system_of(CASES[name]), method, solver=solver)
+
+
+def start_of(name: str) -> Any:
+    return 0.3 * np.sin(1.0 + np.arange(np.prod(CASES[name].shape)) ** 1.3).reshape(CASES[name].shape)
+
+
+def bits(run: Any) -> tuple[Any, ...]:
+    """All that must not depend on the number of threads."""
+    states = (values.tobytes() for values in (*run.q.values(), *run.p.values()))
+    return (*states, run.iterations, run.steps, run.rejected, repr(run.step_error))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_how_terms_are_shared(name: str) -> None:
+    system = system_of(CASES[name])
+    program = lower_indexed(system, as_method("svi:2", one_coordinate(system)), "shared")
+    assert {sharing_of(looped) for looped in program.forces} == {CASES[name].shared}
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("name", CASES)
+def test_every_term_is_counted_once(name: str, threads: int) -> None:
+    """A leapfrog step beside NumPy's forces."""
+    case, q, h = CASES[name], start_of(name), 1e-3
+    run = stepper_of(name, "stoermer-verlet").integrate(q, h=h, steps=1, threads=threads, **case.given)
+    there = q + h * (h / 2 * case.forces(q))
+    kick = h / 2 * (case.forces(q) + case.forces(there))
+    np.testing.assert_allclose(run.q["q"][1], there, rtol=0, atol=2e-16 * 4)
+    np.testing.assert_allclose(run.p["q"][1], kick, rtol=0, atol=2e-15 * np.abs(kick).max())
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [(name, "stoermer-verlet") for name in CASES] + [(name, "svi:4") for name in ("ring", "pairs", "net")],
+)
+def test_no_bit_depends_on_the_number_of_threads(name: str, method: str) -> None:
+    found = [
+        bits(stepper_of(name, method).integrate(start_of(name), h=0.01, steps=4, threads=threads, **CASES[name].given))
+        for threads in THREADS
+    ]
+    assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+def test_sweeps_go_where_leapfrog_goes() -> None:
+    """By short steps of both."""
+    for name in ("ring", "pairs", "net"):
+        case = CASES[name]
+        ends = [
+            stepper_of(name, method).integrate(
+                start_of(name), h=h, steps=round(0.02 / h), every=round(0.02 / h), threads=2, **case.given
+            )
+            for method, h in (("svi:4", 0.02), ("stoermer-verlet", 5e-5))
+        ]
+        np.testing.assert_allclose(ends[0].q["q"][-1], ends[1].q["q"][-1], rtol=0, atol=1e-9)
+
+
+def test_newtons_iteration() -> None:
+    stepper = stepper_of("ring", "svi:2", "newton")
+    found = [bits(stepper.integrate(start_of("ring"), h=0.2, steps=3, threads=threads)) for threads in THREADS]
+    assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+def test_steps_that_choose_their_length() -> None:
+    stepper = stepper_of("pairs", "svi:4")
+    found = [
+        bits(stepper.integrate(start_of("pairs"), t_end=3.0, tolerance=1e-9, threads=threads)) for threads in THREADS
+    ]
+    assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+def test_hamiltonians_and_forces_of_velocities() -> None:
+    field = sc.IndexedSystem.from_text(
+        name="field",
+        coordinates=["q[N]"],
+        momenta=["p[N]"],
+        hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
+    )
+    damped = sc.IndexedSystem.from_text(
+        name="damped",
+        coordinates=["q[N]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
+        forces={"q[i]": "-q_dot[i]**3", "q[0]": "cos(t)"},
+    )
+    for system, method in ((field, "gauss:4"), (damped, "svi:4")):
+        stepper, q = sc.compile_indexed(system, method), np.sin(0.1 * np.arange(5000))
+        found = [bits(stepper.integrate(q, np.cos(0.2 * q), h=0.1, steps=4, threads=threads)) for threads in THREADS]
+        assert found[1:] == found[:1] * (len(THREADS) - 1)
+
+
+def test_a_run_goes_on_by_other_threads() -> None:
+    """Saved and restored, apart, and from step to step."""
+    stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
+    whole = stepper.start(q, h=0.01)
+    whole.advance(6)
+    parts = stepper.start(q, h=0.01, threads=3)
+    parts.advance(3)
+    parts = stepper.restore(parts.save(), threads=2)
+    parts.advance(3)
+    assert bits(parts) == bits(whole)
+    assert parts.apart(0.01).threads == 2
+
+
+def test_ctrl_c_ends_a_run_between_steps() -> None:
+    run = stepper_of("pairs", "svi:4").start(start_of("pairs"), h=0.001, threads=3)
+
+    def interrupt(done: int) -> None:
+        if done > 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run.advance(10**9, progress=interrupt)
+    stopped = run.steps
+    run.advance(2)
+    assert run.steps == stopped + 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
+def test_a_process_that_is_forked_off_has_threads_of_its_own() -> None:
+    stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
+    expected = bits(stepper.integrate(q, h=0.01, steps=3, threads=3))
+    if (child := os.fork()) == 0:
+        os._exit(int(bits(stepper.integrate(q, h=0.01, steps=3, threads=3)) != expected))
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_a_step_that_fails_fails_for_all() -> None:
+    stepper = stepper_of("ring", "svi:4")
+    said = set()
+    for threads in THREADS:
+        with pytest.raises(sc.StepFailedError) as caught:
+            stepper.integrate(1e3 * start_of("ring"), h=1.0, steps=3, threads=threads)
+        said.add(str(caught.value))
+    assert len(said) == 1
+
+
+def test_what_is_refused() -> None:
+    stepper, q = stepper_of("ring", "svi:4"), start_of("ring")
+    for threads in (0, -1, 65):
+        with pytest.raises(StateError, match="threads"):
+            stepper.start(q, h=0.1, threads=threads)
+    rods = sc.IndexedSystem.from_text(
+        name="rods",
+        coordinates=["r[N, 2]"],
+        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
+        constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"],
+    )
+    with pytest.raises(MethodError, match="one thread"):
+        sc.compile_indexed(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
+
+
+WINDOWS = """
+#include "shared.c"
+#include <stdio.h>
+static void tell(const char *what, long long size, sharing how)
+{
+  for (long long round = 0; round < how.rounds; round++)
+    for (long long k = 0; k < tasks_in(&how, round); k++) {
+      const window here = window_of(&how, round, k);
+      printf("%s %lld %lld %lld %lld %lld %lld\\n", what, size, round, here.of.first, here.of.end, here.behind.first,
+             here.behind.end);
+    }
+}
+int main(void)
+{
+  static const long long sizes[] = {1, 63, 64, 100, 191, 192, 800, 3500, 5000, 70000, 1000003};
+  for (int k = 0; k < 11; k++) {
+    tell("turn", sizes[k], in_turn(3, 3 + sizes[k], 5, 1));
+    tell("wide", sizes[k], in_turn(3, 3 + sizes[k], 5, 2000));
+    if (sizes[k] < 10000)
+      tell("tiles", sizes[k], in_tiles(sizes[k]));
+  }
+  return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
+    """Rounds and windows of families of several sizes, as C says them."""
+    folder = tmp_path_factory.mktemp("windows")
+    source, _ = generate_indexed(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
+    for path, text in {**source.files, "main.c": WINDOWS}.items():
+        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).write_text(text)
+    subprocess.run([*find_compiler(), "-std=c99", "-w", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
+    found: dict[tuple[str, int], list[list[int]]] = {}
+    for line in subprocess.run(["./main"], cwd=folder, check=True, capture_output=True, text=True).stdout.splitlines():
+        what, size, *numbers = line.split()
+        found.setdefault((what, int(size)), []).append([int(number) for number in numbers])
+    return found
+
+
+def test_neighbouring_blocks_are_never_done_at_a_time(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+    """Of a round; and every index is in one block."""
+    several = 0
+    for (what, size), each in windows.items():
+        if what == "tiles":
+            continue
+        assert sorted(each, key=lambda window: window[1])[0][1] == 3
+        assert sum(end - first for _, first, end, *_ in each) == size
+        for number in (0, 1):
+            blocks = sorted((first, end) for round_, first, end, *_ in each if round_ == number)
+            several += len(blocks) > 1
+            assert all(after - before >= 5 for (_, before), (after, _) in pairwise(blocks))
+    assert several >= 10
+
+
+def test_blocks_of_pairs_meet_once_and_one_another_a_round(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+    most = 0
+    for (what, size), each in windows.items():
+        if what != "tiles":
+            continue
+        met = np.zeros((size, size), dtype=int)
+        for _, first, end, behind, last in each:
+            met[first:end, behind:last] += 1
+        assert np.array_equal(np.triu(met, 1), np.triu(np.ones_like(met), 1))
+        for number in {window[0] for window in each}:
+            places = [
+                place
+                for round_, first, end, behind, last in each
+                if round_ == number
+                for place in {*range(first, end), *range(behind, last)}
+            ]
+            assert len(places) == len(set(places)) == size
+            most = max(most, number)
+    assert most == 31
+
+
+RACES = """
+#include "shared.h"
+enum {{ N = {count} }};
+static const int bonds[] = {{{bonds}}};
+static double work[N * SHARED_WORK] __attribute__((aligned(64))), rest[5 * N];
+int main(void)
+{{
+  static shared_problem given = {{.size = {{{sizes}}}, .parameters = {{N}}}};
+  static shared_run run;
+  given.table[0] = bonds;
+  run.work = work, run.q = rest, run.p = rest + N, run.carry_q = rest + 2 * N, run.carry_p = rest + 3 * N;
+  run.inverse_mass = rest + 4 * N;
+  for (int i = 0; i < N; i++)
+    run.q[i] = 0.3 * (i * 37 % 101) / 101.0;
+  shared_inverse_masses(&given, run.inverse_mass);
+  run.h = 0.01, run.threads = 3;
+  return shared_advance(&run, &given, 4, 0, 0);
+}}
+"""
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("name", "method", "solver"),
+    [(name, method, "fixed-point") for name in ("ring", "pairs", "net") for method in ("svi:4", "stoermer-verlet")]
+    + [("ring", "svi:4", "newton")],
+)
+def test_threads_do_not_race(name: str, method: str, solver: str, tmp_path: Path) -> None:
+    """By the thread sanitizer, where the compiler has it."""
+    source, interface = generate_indexed(system_of(CASES[name]), method, solver=solver, prefix="shared")
+    for path, text in source.files.items():
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).write_text(text)
+    sizes = {"N": CASES[name].shape[0], "B": len(BONDS)}
+    numbers = {
+        "count": sizes["N"],
+        "bonds": ", ".join(map(str, BONDS.reshape(-1))),
+        "sizes": ", ".join(str(sizes[size]) for size in interface.sizes),
+    }
+    (tmp_path / "main.c").write_text(RACES.format(**numbers))
+    flags = ["-std=c99", "-O1", "-g", "-fsanitize=thread", "-DSCVI_THREADS", "-pthread", "-Wno-psabi"]
+    command = [*find_compiler(), *flags, "main.c", "shared.c", "-lm", "-o", "main"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    if built.returncode:
+        pytest.skip(f"no thread sanitizer: {built.stderr[-200:]}")
+    done = subprocess.run(["setarch", "-R", "./main"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
