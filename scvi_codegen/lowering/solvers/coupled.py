@@ -11,6 +11,10 @@ the rounded map still has a generating function: its energy error does not drift
 
 from __future__ import annotations
 
+import sympy
+from sympy import Expr
+
+from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.ir.sweeps import CoupledSweep
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
@@ -24,6 +28,8 @@ from scvi_codegen.tables.precision import Matrix, Vector, mp
 __all__ = ["coupled_sweep", "over", "weighted_tables"]
 
 FRACTION_BITS = 51
+MOST_FOLLOWED = 8
+"""Coordinates; of more the slopes of all forces by all of them cost more than they save."""
 
 
 def coupled_sweep(problem: StepProblem) -> CoupledSweep | None:
@@ -40,6 +46,8 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
     guess = guess_tables(tables.blocks, lanes)
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    followed = () if tables.projection else _followed(system)
+    given = "L_q, L_v, their slopes F_q, F_v and L_vq" if followed else "L_q, L_v"
     return CoupledSweep(
         points=points,
         blocks=blocks,
@@ -57,16 +65,34 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
         kernel=system_kernel(
             system,
             "point_lanes",
-            (*forms.force, *forms.momentum),
+            (*forms.force, *forms.momentum, *followed),
             of=of,
             slopes=forms.lower_mass.values(),
-            purpose="L_q, L_v and the lower triangle of L_vv at all points, u = (q, v).",
+            purpose=f"{given} and the lower triangle of L_vv at all points, u = (q, v).",
         ),
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),
         mass_entries=tuple(forms.lower_mass),
+        followed=bool(followed),
         integrands=integrand_kernel(system, "integrand_lanes", of),
         damping=damping_kernel(system),
     )
+
+
+def _followed(system: LagrangianSystem) -> tuple[Expr, ...]:
+    """F_q, F_v and L_vq row by row, zeros with them, of few coordinates whose masses depend on where they are.
+
+    Of others nothing: sweeps contract quickly where masses are constant.
+    """
+    forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
+    moving = {*system.coordinates, *system.velocities}
+    if m > MOST_FOLLOWED or not any(entry.free_symbols & moving for entry in forms.lower_mass.values()):
+        return ()
+    matrices = (
+        jacobian(forms.force, system.coordinates),
+        jacobian(forms.force, system.velocities),
+        jacobian(forms.momentum, system.coordinates),
+    )
+    return tuple(matrix.get((i, j), zero) for matrix in matrices for i in range(m) for j in range(m))
 
 
 def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
