@@ -195,6 +195,12 @@ class CoupledSweep(PointSweep):
     followed: bool = False
     damping: Kernel | None = None
 
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes; forces that follow are not asked for again."""
+        given = super(CoupledSweep, self).kernels
+        return tuple(each for each in given if each is not self.force) if self.followed else given
+
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
         return 2 * dimension * self.lanes

@@ -57,6 +57,13 @@ def leaning() -> LagrangianSystem:
     )
 
 
+def relativistic() -> LagrangianSystem:
+    """Masses that depend on velocities alone."""
+    return LagrangianSystem.from_text(
+        name="relativistic", coordinates=["x", "y"], lagrangian="-sqrt(1 - x_dot**2/2 - y_dot**2/3) - x**2*y"
+    )
+
+
 def as_numbers(arguments, expression):
     function = sympy.lambdify(arguments, expression)
     return lambda *values: np.array(function(*values), dtype=float)
@@ -87,8 +94,10 @@ def test_velocities_follow_momenta_by_the_whole_mass_and_what_changes_with_them_
         assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
 
 
-@pytest.mark.parametrize("system", [problem("charged-particle").system, leaning()], ids=lambda system: system.name)
-def test_where_masses_are_constant_velocities_follow_momenta_and_forces_are_those_where_they_end(system):
+@pytest.mark.parametrize(
+    "system", [problem("charged-particle").system, leaning(), relativistic()], ids=lambda system: system.name
+)
+def test_where_masses_are_the_same_everywhere_velocities_follow_momenta_and_forces_are_those_where_they_end(system):
     stepper, (force, momentum, mass) = swept(system), functions(system)
     assert "support/corrections.h" in stepper.source.files
     for q0, v0 in states(system.dimension):

@@ -81,11 +81,10 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
 def _followed(system: LagrangianSystem) -> tuple[Expr, ...]:
     """F_q, F_v and L_vq row by row, zeros with them, of few coordinates whose masses depend on where they are.
 
-    Of others nothing: sweeps contract quickly where masses are constant.
+    Of others nothing: their sweeps contract quickly.
     """
     forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
-    moving = {*system.coordinates, *system.velocities}
-    if m > MOST_FOLLOWED or not any(entry.free_symbols & moving for entry in forms.lower_mass.values()):
+    if m > MOST_FOLLOWED or not any(entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()):
         return ()
     matrices = (
         jacobian(forms.force, system.coordinates),
