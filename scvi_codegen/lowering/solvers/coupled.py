@@ -4,6 +4,11 @@ The equations are L_v(q_n, V_n) = P_n with q_n and P_n from the two tables of a 
 velocities (an SVI of another quadrature) the s velocities z_b give V_n = sum_b l_nb z_b and the equations are projected
 on them: a correction goes to the points by l, through the mass of each, and back by the projection.
 
+Where masses depend on positions, a correction changes forces and momenta about as much as what it corrects. So it is
+made twice, the second time less its own effect to first order, by F_q, F_v and L_vq of the same kernel: a sweep then
+contracts as two do, and forces at the end follow the last correction. A quarter of the time of a step is saved on a
+swinging Atwood machine, 8 to 25 % on pendulums, carts and motions in transformed time.
+
 For a variational method the two tables belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
 rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51,
 the rounded map still has a generating function: its energy error does not drift.
