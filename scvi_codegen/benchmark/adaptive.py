@@ -112,12 +112,23 @@ def _contender(
 
 def _to_its_end(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
     run = stepper.start(q, p, **arguments)
-    return lambda: run.record(every=LAST).q[-1]
+
+    def integrate() -> Array:
+        """As heyoka's propagate_until: the last state alone is kept."""
+        run.run_to_goal()
+        return run.q
+
+    return integrate
 
 
 def _by_so_many(stepper: Stepper, span: float, count: int, q: Array, p: Array) -> Callable[[], Array]:
     run = stepper.start(q, p, h=span / count)
-    return lambda: run.record(count, every=count).q[-1]
+
+    def integrate() -> Array:
+        run.skip(count)
+        return run.q
+
+    return integrate
 
 
 def _whole(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:

@@ -167,7 +167,7 @@ class PointSweep(Sweep):
         """Whether time occurs in a kernel with lanes."""
         return any(kernel.uses_time for kernel in self.kernels)
 
-    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self:
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self | None:
         """See :meth:`Sweep.with_forces`."""
         return replace(self, force=self.force.with_sums(forces))
 
@@ -183,6 +183,8 @@ class CoupledSweep(PointSweep):
         velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, with other points than
             blocks; else empty.
         mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+        followed: whether the kernel gives F_q, F_v and L_vq, too, by which a correction is followed by another, and
+            forces by both.
         damping: its rate, if there is one.
     """
 
@@ -190,14 +192,23 @@ class CoupledSweep(PointSweep):
     velocity: NumberTable
     projection: NumberTable
     mass_entries: tuple[tuple[int, int], ...]
+    followed: bool = False
     damping: Kernel | None = None
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes; forces that follow are not asked for again."""
+        given = super(CoupledSweep, self).kernels
+        return tuple(each for each in given if each is not self.force) if self.followed else given
 
     def memory(self, dimension: int) -> int:
         """The velocities z of the last two steps."""
         return 2 * dimension * self.lanes
 
-    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self:
-        """In both kernels: positions come first in the arguments, forces in the values."""
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self | None:
+        """In both kernels: positions come first in the arguments, forces in the values; ``None`` with their slopes."""
+        if self.followed:
+            return None
         return replace(self, kernel=self.kernel.with_sums(forces), force=self.force.with_sums(forces))
 
     @property
@@ -218,8 +229,10 @@ class CoupledSweep(PointSweep):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Weights, which damping changes, a mass, the sweep."""
-        return (*(("damped_points",) if self.damping else ()), "point_weights", self.mass_part, "coupled_sweep")
+        """Weights, which damping changes, a mass, corrections, the sweep."""
+        damped = ("damped_points",) if self.damping else ()
+        corrections = "followed_corrections" if self.followed else "corrections"
+        return (*damped, "point_weights", self.mass_part, "places", corrections, "coupled_sweep")
 
     @property
     def integral_part(self) -> str:

@@ -151,22 +151,30 @@ class Integrator(LinearisedMethod):
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Energy p.v - L of the system itself: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
-        values = self._parameters(parameters)
-        result = np.empty(len(times))
+        result = self.energies_of(times, positions, momenta, self._parameters(parameters))
+        return float(result[0]) if np.ndim(q) == 1 else result
+
+    def energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
+        """(n,) of states as trajectories have them, which need no check: contiguous (n,), (n, m), (n, m) and (k,).
+
+        Raises:
+            StateError: beyond the domain of L.
+        """
+        result = np.empty(len(t))
         status = self.binding.function("energies")(
-            len(times),
-            self.binding.pointer(times),
-            self.binding.pointer(positions),
-            self.binding.pointer(momenta),
-            self.binding.pointer(values),
+            len(t),
+            self.binding.pointer(t),
+            self.binding.pointer(q),
+            self.binding.pointer(p),
+            self.binding.pointer(parameters),
             self.binding.pointer(result),
             self.binding.workspace(),
         )
         if status:
             raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
         if name := self.interface.energy_parameter:
-            result = values[parameter_index(self.interface, name)] + result / self.rates(positions, momenta, values)
-        return float(result[0]) if np.ndim(q) == 1 else result
+            result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
+        return result
 
     def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """What symmetries conserve, k numbers in the order of ``momentum_map_names``.

@@ -140,7 +140,9 @@ class _Piece(NamedTuple):
 def _joined(memory: Memory, pieces: Sequence[_Piece], every: int) -> Trajectory:
     """The trajectory of a run to its goal; with each state there, the steps between them have their lengths."""
     t, q, p, iterations = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
-    lengths = np.append(np.diff(t) if every == 1 else np.full(len(t) - 1, np.nan), np.nan)
+    lengths = np.full(len(t), np.nan)
+    if every == 1:
+        lengths[:-1] = np.diff(t)
     return trajectory_of(memory, t, q, p, iterations, lengths=lengths)
 
 

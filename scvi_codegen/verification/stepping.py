@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from functools import partial
 
@@ -125,9 +126,8 @@ def _fallback(subject: Subject) -> Finding | None:
     """Newton's iteration in the artefact itself, reached where so few sweeps do not converge."""
     if subject.newton is None or not subject.stepper.interface.has_fallback:
         return None
-    first = subject.states[0]
-    for factor in (1, 2, 4, 8):
-        state = State(first.q, first.p, first.t, factor * first.h)
+    for factor, start in itertools.product((1, 2, 4, 8, 16), subject.states):
+        state = State(start.q, start.p, start.t, factor * start.h)
         for most in range(3, MOST_TRIED):
             try:
                 iterations, end = _counted(subject, state, SolverOptions(max_iterations=most))

@@ -1,19 +1,5 @@
 /* A step by sweeps for any regular Lagrangian. Before it: points.h or trajectories.h with what follows them,
- * point_weights.h, a mass, the tables, the kernels point_lanes and force_lanes; PROJECTED where the unknowns are not
- * the velocities at the points. */
-
-/* Positions and velocities at point n of the curve that z gives. */
-static inline void place(const step_data *step, int n, lanes (*scaled)[M], lanes (*z)[M], lanes *u)
-{
-  for (int i = 0; i < M; i++) {
-    u[i] = step->q0[i] + (step->carry_q[i] + apply(POSITION, n, scaled, i));
-#ifdef PROJECTED
-    u[M + i] = apply(VELOCITY, n, z, i);
-#else
-    u[M + i] = z[n][i];
-#endif
-  }
-}
+ * point_weights.h, a mass, places.h, corrections of velocities, the tables, the kernel point_lanes. */
 
 /* The increments of one step. The velocities z are corrected by mass^-1 (P - L_v) until they rest; the increments are
  * made from the forces at the points they rest at. The velocities are kept. */
@@ -21,7 +7,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     const solver_options *options, solver_report *report)
 {
   coordinates own[GROUPS], *z = kept(past, own);
-  lanes u[2 * M], value[GROUPS][2 * M], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
+  lanes u[2 * M], value[GROUPS][VALUES], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
   number inverse_size[M] = {0.0};
   progress now = before_sweeps();
   int status = OK;
@@ -40,7 +26,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
       place(step, n, scaled, z, u);
       point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
 #ifdef DAMPED
-      grow(&data->damping, n, 2 * M, value[n]);
+      grow(&data->damping, n, VALUES, value[n]);
       grow(&data->damping, n, MASS, mass[n]);
 #endif
       for (int i = 0; i < M; i++)
@@ -74,10 +60,11 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
       for (int i = 0; i < M; i++)
         r[n][i] = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, impulse, i)) - value[n][M + i];
       factor_mass(mass[n]);
-      solve_mass(mass[n], r[n]);
+    }
+    correct(data, value, mass, r);
+    for (int n = 0; n < GROUPS; n++)
       for (int i = 0; i < M; i++)
         z[n][i] += r[n][i];
-    }
 #endif
     if (k == 0) {
       for (int i = 0; i < M; i++)
@@ -98,15 +85,9 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   status = outcome(&now, report);
   if (status != OK)
     return status;
+  forces_at_rest(step, data, value, z, r, impulse);
+  scale(data->momentum_weight, impulse, impulse);
   scale(data->position_weight, z, scaled);
-  for (int n = 0; n < GROUPS; n++) {
-    place(step, n, scaled, z, u);
-    force_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, r[n]);
-#ifdef DAMPED
-    grow(&data->damping, n, M, r[n]);
-#endif
-  }
-  scale(data->momentum_weight, r, impulse);
   for (int i = 0; i < M; i++) {
     dq[i] = weigh(POINT_END_POSITION, scaled, i);
     dp[i] = weigh(POINT_END_MOMENTUM, impulse, i);

@@ -19,7 +19,7 @@ static void try_step(run_memory *run, trial *now, double least, const solver_opt
 {
   struct guess_tables tables;
   (void)least;
-  run->h = next_length(run->rung, (now->t_end - now->at.t) - now->at.t_low, &now->last);
+  run->h = next_length(length_of(run->rung), (now->t_end - now->at.t) - now->at.t_low, &now->last);
   report->t = now->at.t;
   now->guess = now->last || !choose_tables(run, &tables) ? 0 : run->guess;
   if (solve(run, now->given, now->n, &tables, &now->guess, now->limits.decay, &now->error,

@@ -71,10 +71,9 @@ static int next_change(real error, real before, const error_limits *limits)
   return change;
 }
 
-/* The length of the step at a rung, or the rest of the way where that is hardly longer, which then is the last. */
-static real next_length(long long rung, real rest, int *last)
+/* The length of the next step, or the rest of the way where that is hardly longer, which then is the last. */
+static real next_length(real length, real rest, int *last)
 {
-  const real length = length_of(rung);
   *last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);
   return *last ? rest : MATH(copysign)(length, rest);
 }

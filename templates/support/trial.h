@@ -7,7 +7,8 @@ typedef struct {
   solver_data data;
   error_limits limits;
   real t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low parts */
-  long long guess;
+  long long guess, rung; /* of the length */
+  real length; /* 0 before the first trial */
   int last; /* whether the step ends at t_end */
 } trial;
 
@@ -15,7 +16,13 @@ typedef struct {
  * infinity where there is none. */
 HOT void try_step(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
 {
-  const real rest = (now->t_end - now->at.t) - now->at.t_low, h = next_length(run->rung, rest, &now->last);
+  const real rest = (now->t_end - now->at.t) - now->at.t_low;
+  real h;
+  if (now->length == 0 || now->rung != run->rung) {
+    now->rung = run->rung;
+    now->length = length_of(run->rung);
+  }
+  h = next_length(now->length, rest, &now->last);
   report->t = now->step.t = now->at.t;
   if (now->last || now->step.h != h) {
     now->step.h = h;

@@ -5,6 +5,7 @@ What a sweep does wrong, the next ones mend as long as they contract: the soluti
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
 
 import numpy as np
@@ -14,6 +15,7 @@ from samples import QUICK_FLAGS, pumped_cart_pole, tangle
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
@@ -38,6 +40,30 @@ def functions(system: MechanicalSystem):
     return tuple(map(partial(as_numbers, [q, second, t]), (by_q, by_second, curvature)))
 
 
+def slopes(system: MechanicalSystem):
+    """F_q, F_v and L_vq."""
+    q, v, L = system.coordinates, system.velocities, system.formula.subs(system.constants)
+    by_q, by_v = (sympy.Matrix([L.diff(x) for x in symbols]) for symbols in (q, v))
+    matrices = by_q.jacobian(q), by_q.jacobian(v), by_v.jacobian(q)
+    return tuple(map(partial(as_numbers, [q, v, system.time]), matrices))
+
+
+def leaning() -> LagrangianSystem:
+    """Three coordinates whose constant masses all meet."""
+    return LagrangianSystem.from_text(
+        name="leaning",
+        coordinates=["x", "y", "z"],
+        lagrangian="x_dot**2 + y_dot**2 + z_dot**2 + x_dot*y_dot/2 + y_dot*z_dot/3 + x_dot*z_dot/5 + x*y*z_dot - x**4",
+    )
+
+
+def relativistic() -> LagrangianSystem:
+    """Masses that depend on velocities alone."""
+    return LagrangianSystem.from_text(
+        name="relativistic", coordinates=["x", "y"], lagrangian="-sqrt(1 - x_dot**2/2 - y_dot**2/3) - x**2*y"
+    )
+
+
 def as_numbers(arguments, expression):
     function = sympy.lambdify(arguments, expression)
     return lambda *values: np.array(function(*values), dtype=float)
@@ -53,14 +79,41 @@ def close(found, expected) -> bool:
 
 
 @pytest.mark.parametrize("system", [tangle(), pumped_cart_pole()], ids=lambda system: system.name)
-def test_velocities_follow_momenta_by_the_whole_mass_and_forces_are_those_where_they_end(system):
+def test_velocities_follow_momenta_by_the_whole_mass_and_what_changes_with_them_to_first_order(system):
     stepper, (force, momentum, mass) = swept(system), functions(system)
+    assert "support/followed_corrections.h" in stepper.source.files
+    F_q, F_v, P_q = slopes(system)
+    for q0, v0 in states(system.dimension):
+        p0, t = momentum(q0, v0, T), T + H / 2
+        at = q0 + H / 2 * v0, v0, t
+        residual = p0 + H / 2 * force(*at) - momentum(*at)
+        r = np.linalg.solve(mass(*at), residual)
+        residual += H / 2 * (H / 2 * F_q(*at) @ r + F_v(*at) @ r) - H / 2 * P_q(*at) @ r
+        r = np.linalg.solve(mass(*at), residual)
+        expected = q0 + H * (v0 + r), p0 + H * (force(*at) + H / 2 * F_q(*at) @ r + F_v(*at) @ r)
+        assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
+
+
+@pytest.mark.parametrize(
+    "system", [problem("charged-particle").system, leaning(), relativistic()], ids=lambda system: system.name
+)
+def test_where_masses_are_the_same_everywhere_velocities_follow_momenta_and_forces_are_those_where_they_end(system):
+    stepper, (force, momentum, mass) = swept(system), functions(system)
+    assert "support/corrections.h" in stepper.source.files
     for q0, v0 in states(system.dimension):
         p0, t = momentum(q0, v0, T), T + H / 2
         x = q0 + H / 2 * v0
         v = v0 + np.linalg.solve(mass(x, v0, t), p0 + H / 2 * force(x, v0, t) - momentum(x, v0, t))
         expected = q0 + H * v, p0 + H * force(q0 + H / 2 * v, v, t)
         assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
+
+
+def test_of_many_coordinates_no_slopes_are_asked_for():
+    """They are the square of their number; a chain of nine has masses that depend on where it is."""
+    names = [f"a{k}" for k in range(9)]
+    coupled = " + ".join(f"{a}_dot**2 + {a}_dot*{b}_dot*cos({a} - {b})" for a, b in itertools.pairwise([*names, "a0"]))
+    chain = LagrangianSystem.from_text(name="ring of nine", coordinates=names, lagrangian=coupled)
+    assert "support/corrections.h" in swept(chain).source.files
 
 
 def test_momenta_follow_forces_and_velocities_follow_momenta():

@@ -114,6 +114,10 @@ SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
         Formula(Symbol("V_n") + inverse_mass * (Symbol("P_n") - Symbol("L_v_n")), Symbol("V_n_new")),
+        Paragraph(
+            "Where the masses of few coordinates depend on positions, V_n_new - V_n is corrected by what it changes of "
+            "P_n and L_v, to first order. In the end:"
+        ),
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
     ),

@@ -1,0 +1,27 @@
+/* Corrections of velocities by residual momenta r, forces and momenta taken for what they were. Before it: places.h,
+ * point_weights.h, a mass, the kernel force_lanes. */
+enum { VALUES = 2 * M }; /* of point_lanes: forces, momenta */
+
+/* r = mass^-1 r at all points. */
+static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes (*mass)[MASS], lanes (*r)[M])
+{
+  (void)data, (void)value;
+  for (int n = 0; n < GROUPS; n++)
+    solve_mass(mass[n], r[n]);
+}
+
+/* Forces where the velocities z came to rest, after the last correction r of them. */
+static inline void forces_at_rest(const step_data *step, const sweep_data *data, lanes (*value)[VALUES], lanes (*z)[M],
+    lanes (*r)[M], lanes (*F)[M])
+{
+  lanes u[2 * M], scaled[GROUPS][M];
+  (void)value, (void)r;
+  scale(data->position_weight, z, scaled);
+  for (int n = 0; n < GROUPS; n++) {
+    place(step, n, scaled, z, u);
+    force_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, F[n]);
+#ifdef DAMPED
+    grow(&data->damping, n, M, F[n]);
+#endif
+  }
+}

@@ -1,0 +1,57 @@
+/* Corrections of velocities by residual momenta r, forces and momenta following them to first order. Before it:
+ * places.h, point_weights.h, a mass. */
+enum { VALUES = 2 * M + 3 * M * M }; /* of point_lanes: forces, momenta; F_q, F_v, P_q, row by row */
+
+/* A row of a matrix, times x. */
+static inline lanes row_times(const lanes *row, const lanes *x)
+{
+  lanes sum = row[0] * x[0];
+  for (int j = 1; j < M; j++)
+    sum += row[j] * x[j];
+  return sum;
+}
+
+/* How the forces F follow the changes r of the velocities, and, less that, the residual momenta are the momenta. */
+static inline void follow(const sweep_data *data, lanes (*value)[VALUES], lanes (*r)[M], lanes (*F)[M], lanes (*P)[M])
+{
+  lanes scaled[GROUPS][M], moved[M];
+  scale(data->position_weight, r, scaled);
+  for (int n = 0; n < GROUPS; n++) {
+    const lanes *F_q = value[n] + 2 * M, *F_v = F_q + M * M, *P_q = F_v + M * M;
+    for (int i = 0; i < M; i++)
+      moved[i] = apply(POSITION, n, scaled, i);
+    for (int i = 0; i < M; i++) {
+      F[n][i] = row_times(F_v + i * M, r[n]) + row_times(F_q + i * M, moved);
+      P[n][i] = row_times(P_q + i * M, moved);
+    }
+  }
+}
+
+/* r = mass^-1 r at all points; then once more, less what follows. A sweep contracts as two do, and calls no function
+ * more. */
+static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes (*mass)[MASS], lanes (*r)[M])
+{
+  lanes first[GROUPS][M], force[GROUPS][M], impulse[GROUPS][M], momentum[GROUPS][M];
+  memcpy(first, r, sizeof first);
+  for (int n = 0; n < GROUPS; n++)
+    solve_mass(mass[n], first[n]);
+  follow(data, value, first, force, momentum);
+  scale(data->momentum_weight, force, impulse);
+  for (int n = 0; n < GROUPS; n++) {
+    for (int i = 0; i < M; i++)
+      r[n][i] += apply(MOMENTUM, n, impulse, i) - momentum[n][i];
+    solve_mass(mass[n], r[n]);
+  }
+}
+
+/* Forces where the velocities z came to rest, after the last correction r of them, which is small. */
+static inline void forces_at_rest(const step_data *step, const sweep_data *data, lanes (*value)[VALUES], lanes (*z)[M],
+    lanes (*r)[M], lanes (*F)[M])
+{
+  lanes momentum[GROUPS][M];
+  (void)step, (void)z;
+  follow(data, value, r, F, momentum);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      F[n][i] += value[n][i];
+}
