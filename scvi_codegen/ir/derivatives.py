@@ -8,7 +8,7 @@ from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 
-__all__ = ["Derivatives", "GivenSlopes", "LinearClock"]
+__all__ = ["Derivatives", "GivenSlopes", "LinearClock", "SweptSlopes"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +41,26 @@ class LinearClock:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SweptSlopes:
+    """What steps by sweeps on forces need to carry changes and slopes by sweeps, too; entries are never empty.
+
+    Attributes:
+        slope_entries, slopes: (i, j) of the slopes of force i by coordinate j that are not zero; the kernel with lanes.
+        given_entries, given: the same by parameter j, or, by their number, by time.
+        mass_entries, masses: of constant mass i by parameter j; a kernel of numbers.
+        steps: that are solved before vectors are carried over them.
+    """
+
+    slope_entries: tuple[tuple[int, int], ...]
+    slopes: Kernel
+    given_entries: tuple[tuple[int, int], ...]
+    given: Kernel
+    mass_entries: tuple[tuple[int, int], ...]
+    masses: Kernel
+    steps: int = 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Derivatives:
     """Steps of a program with their derivative by all they start from.
 
@@ -52,6 +72,7 @@ class Derivatives:
             by y, as they change along dy; ``None`` where phi is linear.
         damping: slopes of the rate of a damping, by parameters.
         clock: of time where it is transformed.
+        swept: where its sweeps carry changes, too; ``None`` where Newton's factors do so alone.
         lanes: changes that are carried along at a time.
     """
 
@@ -60,6 +81,7 @@ class Derivatives:
     curvatures: tuple[Kernel | None, ...] = ()
     damping: GivenSlopes | None = None
     clock: LinearClock | None = None
+    swept: SweptSlopes | None = None
     lanes: int = 8
 
     @property
@@ -73,7 +95,13 @@ class Derivatives:
         """Those that the program lacks."""
         given = (*self.by_given, *((self.damping,) if self.damping else ()))
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
-        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock) if each)
+        swept = (self.swept.masses,) if self.swept else ()
+        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock, *swept) if each)
+
+    @property
+    def lane_kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes that its sweep lacks."""
+        return (self.swept.slopes, self.swept.given) if self.swept else ()
 
     @property
     def bent(self) -> tuple[int, int]:
@@ -110,6 +138,12 @@ class Derivatives:
         if self.curvatures:
             wide += 4 * self.given + 2 * program.unknowns + 3 * self.at_points
         return self.slopes + wide * self.lanes + self.places
+
+    @property
+    def kept(self) -> int:
+        """Doubles behind these: of a piece of steps by sweeps how the points stand from q0, and the increments."""
+        sweep = self.program.sweep
+        return self.swept.steps * self.program.dimension * (sweep.lanes + 2) if self.swept and sweep else 0
 
     @property
     def places(self) -> int:

@@ -117,6 +117,11 @@ class Sweep(ABC):
         return None
 
     @property
+    def back(self) -> tuple[SweepTable, ...]:
+        """The tables by which slopes go back from points to points; none where changes are not carried by sweeps."""
+        return ()
+
+    @property
     def damping(self) -> Kernel | None:
         """The rate of a uniform damping, a number of the parameters, where there is one."""
         return None

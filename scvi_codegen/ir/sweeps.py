@@ -76,6 +76,16 @@ class SeparableSweep(Sweep):
         yield from self.guess.tables
 
     @property
+    def back(self) -> tuple[SweepTable, ...]:
+        """The transpose of what leads from forces to positions; lanes beyond the points neither give nor take."""
+        if self.velocity:
+            return ()
+        padding = range(self.lanes - self.points)
+        columns = tuple(zip(*self.product[: self.points], strict=True))
+        real = tuple((*column, *(0 for _ in padding)) for column in columns[: self.points])
+        return (SweepTable("PRODUCT_BACK", (*real, *((0,) * self.lanes for _ in padding))),)
+
+    @property
     def parts(self) -> tuple[str, ...]:
         """One."""
         return ("separable_sweep",)

@@ -1,0 +1,203 @@
+/* How a step by separable_sweep.h changes with what it starts from, and the transpose, by sweeps again. With D = X - q0,
+ * the slopes K = F_q at the points, s = h^2 / m and P the table PRODUCT, the changes x of the points and the slopes y of
+ * a number by the forces are the fixed points of
+ *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
+ * whose rate of contraction is that of the step itself. All are exact: those of the map which the equations define.
+ * Before it: separable_sweep.h, PRODUCT_BACK, the transposed table, FORCE_ENTRY and force_slopes, FORCE_GIVEN and
+ * force_by_given, MASS_GIVEN and mass_by_given. */
+
+enum {
+  KEPT_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
+  GIVEN_T = GIVEN - 2
+};
+
+/* A solved step: how its points stand from q0, the increments, the slopes of its forces. */
+typedef struct {
+  const step_data *step;
+  const sweep_data *data;
+  const double *dq, *dp;
+  double scale[M], mass[M], mass_slope[MASS_SLOPES];
+  lanes D[GROUPS][M], slope[GROUPS][FORCE_SLOPES], given[GROUPS][FORCES_GIVEN];
+} swept_step;
+
+/* What is told of a step from its increments and the forces it keeps. */
+static void keep_step(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
+    const double *dp, double *to)
+{
+  lanes F[GROUPS][M], D[GROUPS][M];
+  lanes_load(memory, F);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      D[n][i] = DRIFT[n] * (step->h * (data->inverse_mass[i] * step->p0[i])) +
+          (data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i);
+  lanes_store(D, to);
+  memcpy(to + M * POINTS, dq, sizeof(double) * M);
+  memcpy(to + M * (POINTS + 1), dp, sizeof(double) * M);
+}
+
+static void slopes_of_step(const step_data *step, const sweep_data *data, const double *told, swept_step *at)
+{
+  lanes X[GROUPS][M];
+  at->step = step;
+  at->data = data;
+  at->dq = told + M * POINTS;
+  at->dp = at->dq + M;
+  lanes_load(told, at->D);
+  for (int i = 0; i < M; i++) {
+    at->scale[i] = data->square * data->inverse_mass[i];
+    at->mass[i] = fabs(1.0 / data->inverse_mass[i]);
+  }
+  for (int n = 0; n < GROUPS; n++) {
+    const lanes t = step->t + step->h * ABSCISSA[n];
+    for (int i = 0; i < M; i++)
+      X[n][i] = step->q0[i] + at->D[n][i];
+    force_slopes(X[n], t, step->parameters, at->slope[n]);
+    force_by_given(X[n], t, step->parameters, at->given[n]);
+  }
+  mass_by_given(NULL, step->t, step->parameters, at->mass_slope);
+}
+
+/* f = K x, or back: K^T x. */
+static inline void by_slopes(const swept_step *at, int back, lanes (*x)[M], lanes (*f)[M])
+{
+  memset(f, 0, sizeof(lanes) * GROUPS * M);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < FORCE_SLOPES; e++)
+      f[n][FORCE_ENTRY[e][back]] += at->slope[n][e] * x[n][FORCE_ENTRY[e][!back]];
+}
+
+/* x, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies: whatever the
+ * units of coordinates, and together, as every part contracts by the others. The changes are first measured where they
+ * came to rest the last time, less one sweep. */
+static inline int settle(const swept_step *at, int back, lanes (*x)[M], lanes (*f)[M], int *sweeps)
+{
+  const solver_options options = NAME(default_options)();
+  const lanes *table = back ? PRODUCT_BACK : PRODUCT;
+  lanes first[GROUPS][M];
+  double last = INFINITY;
+  int status = 0;
+  memcpy(first, x, sizeof first);
+  for (int k = 0; status == 0; k++) {
+    lanes change[GROUPS], size[GROUPS];
+    by_slopes(at, back, x, f);
+    memset(change, 0, sizeof change);
+    memset(size, 0, sizeof size);
+    for (int i = 0; i < M; i++)
+      for (int n = 0; n < GROUPS; n++) {
+        const lanes next = first[n][i] + at->scale[i] * apply(table, n, f, i), moved = next - x[n][i];
+        change[n] += at->mass[i] * (moved * moved);
+        size[n] += at->mass[i] * (next * next);
+        x[n][i] = next;
+      }
+    if (k + 1 >= *sweeps) {
+      const double moved = points_total(change), whole = points_total(size);
+      const double relative = whole > 0.0 ? moved / whole : moved;
+      status = sweep_status(relative, last, &options, k);
+      last = relative;
+      *sweeps = status == 1 ? k : *sweeps;
+    }
+  }
+  by_slopes(at, back, x, f);
+  return status == 1 ? OK : NOT_CONVERGED;
+}
+
+/* How much the masses change. */
+static inline void masses_changed(const swept_step *at, const double *v, double *dm)
+{
+  memset(dm, 0, sizeof(double) * M);
+  for (int e = 0; e < MASS_SLOPES; e++)
+    dm[MASS_GIVEN[e][0]] += at->mass_slope[e] * v[2 * M + MASS_GIVEN[e][1]];
+}
+
+/* The changes of forces, points held. */
+static inline void forces_changed(const swept_step *at, const double *v, lanes (*F)[M])
+{
+  memset(F, 0, sizeof(lanes) * GROUPS * M);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < FORCES_GIVEN; e++) {
+      const int from = 2 * M + FORCE_GIVEN[e][1];
+      const lanes by = from == GIVEN_T ? v[GIVEN_T] + v[GIVEN_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
+      F[n][FORCE_GIVEN[e][0]] += at->given[n][e] * by;
+    }
+}
+
+/* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
+static int push_swept(const swept_step *at, double *v, int *sweeps)
+{
+  const sweep_data *data = at->data;
+  const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
+  double dm[M];
+  lanes x[GROUPS][M], f[GROUPS][M], F[GROUPS][M];
+  masses_changed(at, v, dm);
+  forces_changed(at, v, F);
+  for (int i = 0; i < M; i++) {
+    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
+    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
+    for (int n = 0; n < GROUPS; n++)
+      x[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i] + at->scale[i] * apply(PRODUCT, n, F, i);
+  }
+  if (settle(at, 0, x, f, sweeps) != OK)
+    return NOT_CONVERGED;
+  for (int i = 0; i < M; i++) {
+    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
+    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
+    for (int n = 0; n < GROUPS; n++)
+      F[n][i] += f[n][i];
+    v[i] += drift + by_length * at->dq[i] + at->scale[i] * weigh(POINT_END_POSITION, F, i);
+    v[M + i] += dh * at->dp[i] + weigh(data->kick, F, i);
+  }
+  v[GIVEN_T] += v[GIVEN_T + 1];
+  return OK;
+}
+
+/* What slopes y by the forces come to, by what else these depend on: added to v. */
+static inline void given_back(const swept_step *at, lanes (*y)[M], double *v)
+{
+  lanes by[GIVEN - 2 * M][GROUPS];
+  memset(by, 0, sizeof by);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < FORCES_GIVEN; e++) {
+      const int to = FORCE_GIVEN[e][1];
+      const lanes part = at->given[n][e] * y[n][FORCE_GIVEN[e][0]];
+      by[to][n] += part;
+      if (to == GIVEN_T - 2 * M)
+        by[to + 1][n] += ABSCISSA[n] * part;
+    }
+  for (int j = 0; j < GIVEN - 2 * M; j++)
+    v[2 * M + j] += points_total(by[j]);
+}
+
+/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
+static int pull_swept(const swept_step *at, double *v, int *sweeps)
+{
+  const sweep_data *data = at->data;
+  const double h = at->step->h;
+  double by_length[M], by_h = 0.0;
+  lanes y[GROUPS][M], f[GROUPS][M];
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      y[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
+  if (settle(at, 1, y, f, sweeps) != OK)
+    return NOT_CONVERGED;
+  v[GIVEN_T + 1] += v[GIVEN_T];
+  given_back(at, y, v);
+  for (int i = 0; i < M; i++) {
+    lanes part[GROUPS], turned[GROUPS], drifted[GROUPS];
+    for (int n = 0; n < GROUPS; n++) {
+      part[n] = f[n][i];
+      turned[n] = f[n][i] * at->D[n][i];
+      drifted[n] = f[n][i] * DRIFT[n];
+    }
+    const double drift = h * data->inverse_mass[i] * (v[i] + points_total(drifted));
+    by_length[i] = v[i] * at->dq[i] + points_total(turned);
+    by_h += 2.0 * by_length[i] - drift * at->step->p0[i] + v[M + i] * at->dp[i];
+    v[i] += points_total(part);
+    v[M + i] += drift;
+  }
+  v[GIVEN_T + 1] += by_h / h;
+  for (int e = 0; e < MASS_SLOPES; e++) {
+    const int i = MASS_GIVEN[e][0];
+    v[2 * M + MASS_GIVEN[e][1]] -= data->inverse_mass[i] * at->mass_slope[e] * by_length[i];
+  }
+  return OK;
+}
