@@ -42,22 +42,30 @@ class LinearClock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweptSlopes:
-    """What steps by sweeps on forces need to carry changes and slopes by sweeps, too; entries are never empty.
+    """What steps by sweeps need to carry changes and slopes by sweeps, too; entries are never empty.
 
     Attributes:
-        slope_entries, slopes: (i, j) of the slopes of force i by coordinate j that are not zero; the kernel with lanes.
-        given_entries, given: the same by parameter j, or, by their number, by time.
-        mass_entries, masses: of constant mass i by parameter j; a kernel of numbers.
+        slopes: what slopes have at the points, each value of them once, behind ``beside`` other values; with lanes.
+        forward, back: at u = (changes, these) their matrix times changes, and its transpose; the same of a potential.
+        given_entries, given: (i, j) of force i, or behind these of a momentum, by parameter j, or, by their number, by
+            time; with lanes.
+        masses: constant ones by parameters, where they are; numbers.
         steps: that are solved before vectors are carried over them.
     """
 
-    slope_entries: tuple[tuple[int, int], ...]
     slopes: Kernel
+    beside: int
+    forward: Kernel
+    back: Kernel
     given_entries: tuple[tuple[int, int], ...]
     given: Kernel
-    mass_entries: tuple[tuple[int, int], ...]
-    masses: Kernel
+    masses: GivenSlopes | None = None
     steps: int = 32
+
+    @property
+    def count(self) -> int:
+        """Different slopes."""
+        return self.slopes.values - self.beside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,15 +101,18 @@ class Derivatives:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that the program lacks."""
-        given = (*self.by_given, *((self.damping,) if self.damping else ()))
+        given: tuple[GivenSlopes, ...] = (*self.by_given, *((self.damping,) if self.damping else ()))
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
-        swept = (self.swept.masses,) if self.swept else ()
-        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock, *swept) if each)
+        given += (self.swept.masses,) if self.swept and self.swept.masses else ()
+        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock) if each)
 
     @property
     def lane_kernels(self) -> tuple[Kernel, ...]:
         """Those with lanes that its sweep lacks."""
-        return (self.swept.slopes, self.swept.given) if self.swept else ()
+        if self.swept is None:
+            return ()
+        swept = self.swept
+        return tuple(dict.fromkeys((swept.slopes, swept.given, swept.forward, swept.back)))
 
     @property
     def bent(self) -> tuple[int, int]:

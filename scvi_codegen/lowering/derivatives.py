@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 from sympy import Add, Expr, Mul, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient, jacobian
-from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes, LinearClock, SweptSlopes
+from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes, LinearClock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.swept_slopes import swept_slopes
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem
 
@@ -35,27 +34,7 @@ def derivatives_of(
         curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
         damping=_given_slopes(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_linear_clock(system, stages.families[0].arguments) if system.clock else None,
-        swept=_swept_slopes(system) if program.sweep and program.sweep.back else None,
-    )
-
-
-def _swept_slopes(system: MechanicalSystem) -> SweptSlopes:
-    """Of the forces and masses of a separable system."""
-    twin = lagrangian_twin(system)
-    assert twin is not None
-    forms, given = forms_of(twin), (*twin.parameters, twin.time)
-    none = {(0, 0): S.Zero}
-    slopes = jacobian(forms.force, twin.coordinates) or none
-    by_given = jacobian(forms.force, given) or none
-    masses = jacobian(tuple(forms.mass.values()), twin.parameters) or none
-    kernel, at = partial(system_kernel, twin), tuple(twin.coordinates)
-    return SweptSlopes(
-        slope_entries=tuple(slopes),
-        slopes=kernel("force_slopes", slopes.values(), of=at, purpose="L_qq at all points, but for its zeros."),
-        given_entries=tuple(by_given),
-        given=kernel("force_by_given", by_given.values(), of=at, purpose="L_q by parameters and time."),
-        mass_entries=tuple(masses),
-        masses=kernel("mass_by_given", masses.values(), of=(), purpose="The constant masses, by parameters."),
+        swept=swept_slopes(system, program.sweep) if program.sweep else None,
     )
 
 

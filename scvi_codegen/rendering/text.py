@@ -302,7 +302,7 @@ def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]
         return {"sweep": None}
     hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
     kernels = (*sweep.kernels, *beside)
-    text = sweep_text(sweep, POINTS, fallback=fallback, kernels=kernels, back=bool(beside))
+    text = sweep_text(sweep, POINTS, fallback=fallback, kernels=kernels, changes=bool(beside))
     return {"sweep": text, "hot": hot}
 
 

@@ -3,21 +3,25 @@
  * a number by the forces are the fixed points of
  *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
  * whose rate of contraction is that of the step itself. All are exact: those of the map which the equations define.
- * Before it: separable_sweep.h, PRODUCT_BACK, the transposed table, FORCE_ENTRY and force_slopes, FORCE_GIVEN and
- * force_by_given, MASS_GIVEN and mass_by_given. */
+ * Before it: separable_sweep.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes, BY_SLOPES_BACK, POINT_GIVEN and
+ * given_slopes, MASS_GIVEN and mass_by_given. */
 
 enum {
   KEPT_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
   GIVEN_T = GIVEN - 2
 };
 
-/* A solved step: how its points stand from q0, the increments, the slopes of its forces. */
+/* A solved step: how its points stand from q0, the increments, the slopes of its forces behind room
+ * for M changes. */
 typedef struct {
   const step_data *step;
   const sweep_data *data;
   const double *dq, *dp;
-  double scale[M], mass[M], mass_slope[MASS_SLOPES];
-  lanes D[GROUPS][M], slope[GROUPS][FORCE_SLOPES], given[GROUPS][FORCES_GIVEN];
+  double scale[M], mass[M];
+#ifdef MASSES_GIVEN
+  double mass_slope[MASS_SLOPES];
+#endif
+  lanes D[GROUPS][M], u[GROUPS][M + POINT_SLOPES], given[GROUPS][GIVEN_SLOPES];
 } swept_step;
 
 /* What is told of a step from its increments and the forces it keeps. */
@@ -51,35 +55,37 @@ static void slopes_of_step(const step_data *step, const sweep_data *data, const 
     const lanes t = step->t + step->h * ABSCISSA[n];
     for (int i = 0; i < M; i++)
       X[n][i] = step->q0[i] + at->D[n][i];
-    force_slopes(X[n], t, step->parameters, at->slope[n]);
-    force_by_given(X[n], t, step->parameters, at->given[n]);
+    point_slopes(X[n], t, step->parameters, at->u[n] + M);
+    given_slopes(X[n], t, step->parameters, at->given[n]);
   }
+#ifdef MASSES_GIVEN
   mass_by_given(NULL, step->t, step->parameters, at->mass_slope);
+#endif
 }
 
 /* f = K x, or back: K^T x. */
-static inline void by_slopes(const swept_step *at, int back, lanes (*x)[M], lanes (*f)[M])
+static inline void through_slopes(swept_step *at, int back, lanes (*f)[M])
 {
-  memset(f, 0, sizeof(lanes) * GROUPS * M);
+  const step_data *step = at->step;
   for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < FORCE_SLOPES; e++)
-      f[n][FORCE_ENTRY[e][back]] += at->slope[n][e] * x[n][FORCE_ENTRY[e][!back]];
+    (back ? BY_SLOPES_BACK : by_slopes)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
 }
 
-/* x, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies: whatever the
+/* The x in u, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies: whatever the
  * units of coordinates, and together, as every part contracts by the others. The changes are first measured where they
  * came to rest the last time, less one sweep. */
-static inline int settle(const swept_step *at, int back, lanes (*x)[M], lanes (*f)[M], int *sweeps)
+static inline int settle(swept_step *at, int back, lanes (*f)[M], int *sweeps)
 {
   const solver_options options = NAME(default_options)();
   const lanes *table = back ? PRODUCT_BACK : PRODUCT;
-  lanes first[GROUPS][M];
+  lanes(*x)[M + POINT_SLOPES] = at->u, first[GROUPS][M];
   double last = INFINITY;
   int status = 0;
-  memcpy(first, x, sizeof first);
+  for (int n = 0; n < GROUPS; n++)
+    memcpy(first[n], x[n], sizeof first[n]);
   for (int k = 0; status == 0; k++) {
     lanes change[GROUPS], size[GROUPS];
-    by_slopes(at, back, x, f);
+    through_slopes(at, back, f);
     memset(change, 0, sizeof change);
     memset(size, 0, sizeof size);
     for (int i = 0; i < M; i++)
@@ -97,46 +103,50 @@ static inline int settle(const swept_step *at, int back, lanes (*x)[M], lanes (*
       *sweeps = status == 1 ? k : *sweeps;
     }
   }
-  by_slopes(at, back, x, f);
+  through_slopes(at, back, f);
   return status == 1 ? OK : NOT_CONVERGED;
 }
 
 /* How much the masses change. */
-static inline void masses_changed(const swept_step *at, const double *v, double *dm)
+static inline void masses_changed(swept_step *at, const double *v, double *dm)
 {
   memset(dm, 0, sizeof(double) * M);
+#ifdef MASSES_GIVEN
   for (int e = 0; e < MASS_SLOPES; e++)
     dm[MASS_GIVEN[e][0]] += at->mass_slope[e] * v[2 * M + MASS_GIVEN[e][1]];
+#else
+  (void)at, (void)v;
+#endif
 }
 
 /* The changes of forces, points held. */
-static inline void forces_changed(const swept_step *at, const double *v, lanes (*F)[M])
+static inline void forces_changed(swept_step *at, const double *v, lanes (*F)[M])
 {
   memset(F, 0, sizeof(lanes) * GROUPS * M);
   for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < FORCES_GIVEN; e++) {
-      const int from = 2 * M + FORCE_GIVEN[e][1];
+    for (int e = 0; e < GIVEN_SLOPES; e++) {
+      const int from = 2 * M + POINT_GIVEN[e][1];
       const lanes by = from == GIVEN_T ? v[GIVEN_T] + v[GIVEN_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
-      F[n][FORCE_GIVEN[e][0]] += at->given[n][e] * by;
+      F[n][POINT_GIVEN[e][0]] += at->given[n][e] * by;
     }
 }
 
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
-static int push_swept(const swept_step *at, double *v, int *sweeps)
+static int push_swept(swept_step *at, double *v, int *sweeps)
 {
   const sweep_data *data = at->data;
   const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
   double dm[M];
-  lanes x[GROUPS][M], f[GROUPS][M], F[GROUPS][M];
+  lanes f[GROUPS][M], F[GROUPS][M];
   masses_changed(at, v, dm);
   forces_changed(at, v, F);
   for (int i = 0; i < M; i++) {
     const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
     const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
     for (int n = 0; n < GROUPS; n++)
-      x[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i] + at->scale[i] * apply(PRODUCT, n, F, i);
+      at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i] + at->scale[i] * apply(PRODUCT, n, F, i);
   }
-  if (settle(at, 0, x, f, sweeps) != OK)
+  if (settle(at, 0, f, sweeps) != OK)
     return NOT_CONVERGED;
   for (int i = 0; i < M; i++) {
     const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
@@ -150,15 +160,15 @@ static int push_swept(const swept_step *at, double *v, int *sweeps)
   return OK;
 }
 
-/* What slopes y by the forces come to, by what else these depend on: added to v. */
-static inline void given_back(const swept_step *at, lanes (*y)[M], double *v)
+/* What slopes by the forces, in u, come to, by what else these depend on: added to v. */
+static inline void given_back(swept_step *at, double *v)
 {
   lanes by[GIVEN - 2 * M][GROUPS];
   memset(by, 0, sizeof by);
   for (int n = 0; n < GROUPS; n++)
-    for (int e = 0; e < FORCES_GIVEN; e++) {
-      const int to = FORCE_GIVEN[e][1];
-      const lanes part = at->given[n][e] * y[n][FORCE_GIVEN[e][0]];
+    for (int e = 0; e < GIVEN_SLOPES; e++) {
+      const int to = POINT_GIVEN[e][1];
+      const lanes part = at->given[n][e] * at->u[n][POINT_GIVEN[e][0]];
       by[to][n] += part;
       if (to == GIVEN_T - 2 * M)
         by[to + 1][n] += ABSCISSA[n] * part;
@@ -168,19 +178,19 @@ static inline void given_back(const swept_step *at, lanes (*y)[M], double *v)
 }
 
 /* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
-static int pull_swept(const swept_step *at, double *v, int *sweeps)
+static int pull_swept(swept_step *at, double *v, int *sweeps)
 {
   const sweep_data *data = at->data;
   const double h = at->step->h;
   double by_length[M], by_h = 0.0;
-  lanes y[GROUPS][M], f[GROUPS][M];
+  lanes f[GROUPS][M];
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++)
-      y[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
-  if (settle(at, 1, y, f, sweeps) != OK)
+      at->u[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
+  if (settle(at, 1, f, sweeps) != OK)
     return NOT_CONVERGED;
   v[GIVEN_T + 1] += v[GIVEN_T];
-  given_back(at, y, v);
+  given_back(at, v);
   for (int i = 0; i < M; i++) {
     lanes part[GROUPS], turned[GROUPS], drifted[GROUPS];
     for (int n = 0; n < GROUPS; n++) {
@@ -195,9 +205,11 @@ static int pull_swept(const swept_step *at, double *v, int *sweeps)
     v[M + i] += drift;
   }
   v[GIVEN_T + 1] += by_h / h;
+#ifdef MASSES_GIVEN
   for (int e = 0; e < MASS_SLOPES; e++) {
     const int i = MASS_GIVEN[e][0];
     v[2 * M + MASS_GIVEN[e][1]] -= data->inverse_mass[i] * at->mass_slope[e] * by_length[i];
   }
+#endif
   return OK;
 }
