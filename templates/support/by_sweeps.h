@@ -52,7 +52,7 @@ static int carry_by_sweeps(carriage *over, long long k, const double *kept)
   for (int j = 0; j < over->count; j++) {
     double v[GIVEN];
     memcpy(v, from + j * GIVEN, sizeof v);
-    if ((over->back ? pull_swept : push_swept)(&at, v, &over->sweeps) != OK)
+    if ((over->back ? pull_swept : push_swept)(&at, v, &over->look) != OK)
       return j;
     for (int i = 0; i < GIVEN; i++)
       to[j * GIVEN + i] += v[i];

@@ -8,7 +8,7 @@ typedef struct {
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
   long long guess; /* from how many steps the next is continued, where there are sweeps */
-  int sweeps; /* and how many of these changes took the last time */
+  int look; /* and which sweep of these changes is the first to be looked at */
 } carriage;
 
 static step_data step_of(const carriage *over, long long k, const real *nothing)

@@ -3,7 +3,7 @@
  *   x = x0 + h A v,        f = L_qq x + L_qv v,        p = p0 + h W f,        v = L_vv^-1 (p - L_vq x),
  * and the slopes of a number by them, the other way, are the same but for transposes, with y for f, z for x, w for p:
  *   y = y0 + h W^T w,      z = L_qq y - L_qv w,        v = v0 + h A^T z,      w = L_vv^-1 (v + L_vq y).
- * All are exact: those of the map which the equations define. Before it: coupled_sweep.h; CHANGE_POSITION, A, and
+ * All are exact: those of the map which the equations define. Before it: coupled_sweep.h, changes_at_rest.h; CHANGE_POSITION, A, and
  * CHANGE_MOMENTUM, W, and with _BACK their transposes; the kernels point_slopes, by_slopes, BY_SLOPES_BACK; POINT_GIVEN
  * and given_slopes. */
 
@@ -58,55 +58,53 @@ static void slopes_of_step(const step_data *step, const sweep_data *data, const 
   }
 }
 
-/* f and v from their first parts, x0 and p0 (back: y and w from y0 and v0); x and v stand in u, f behind it. Corrections
- * are measured by the masses, as are kinetic energies, whatever the units of coordinates. The first ones where they came
- * to rest the last time, less one sweep. */
-static inline int settle(swept_step *at, int back, lanes (*x0)[M], lanes (*p0)[M], lanes (*f)[2 * M], int *sweeps)
+/* The changes of positions by those of velocities v (back: of forces by those of momenta), from x0; what both make of
+ * the next, f and a part of p. */
+static inline void place_changes(swept_step *at, int back, lanes (*x0)[M], lanes (*v)[M], lanes (*f)[2 * M])
 {
-  const solver_options options = NAME(default_options)();
-  const lanes *first = back ? CHANGE_MOMENTUM_BACK : CHANGE_POSITION;
-  const lanes *second = back ? CHANGE_POSITION_BACK : CHANGE_MOMENTUM;
   const step_data *step = at->step;
-  lanes v[GROUPS][M], F[GROUPS][M], before[GROUPS][M];
+  const lanes *table = back ? CHANGE_MOMENTUM_BACK : CHANGE_POSITION;
+  for (int n = 0; n < GROUPS; n++) {
+    for (int i = 0; i < M; i++)
+      at->u[n][i] = x0[n][i] + step->h * apply(table, n, v, i);
+    memcpy(at->u[n] + M, v[n], sizeof v[n]);
+    (back ? BY_SLOPES_BACK : by_slopes)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
+  }
+}
+
+/* f and v from their first parts, x0 and p0 (back: z and w from y0 and v0); x and v (y and w) stand in u, f behind.
+ * Measured by the masses, as are kinetic energies: whatever the units of coordinates. */
+static inline int settle(swept_step *at, int back, lanes (*x0)[M], lanes (*p0)[M], lanes (*f)[2 * M], int *look)
+{
+  const lanes *table = back ? CHANGE_POSITION_BACK : CHANGE_MOMENTUM;
+  lanes v[GROUPS][M], F[GROUPS][M], p[GROUPS][M];
   double last = INFINITY;
   int status = 0;
   memset(v, 0, sizeof v);
-  memset(before, 0, sizeof before);
-  for (int k = 0;; k++) {
-    lanes change[GROUPS], size[GROUPS];
-    for (int n = 0; n < GROUPS; n++) {
-      for (int i = 0; i < M; i++) {
-        at->u[n][i] = x0[n][i] + step->h * apply(first, n, v, i);
-        at->u[n][M + i] = v[n][i];
-      }
-      (back ? BY_SLOPES_BACK : by_slopes)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
-      memcpy(F[n], f[n], sizeof F[n]);
-    }
-    if (status != 0)
-      return status == 1 ? OK : NOT_CONVERGED;
-    for (int n = 0; n < GROUPS; n++) {
-      lanes r[M], new_v[M];
-      change[n] = size[n] = lanes_of(0.0);
-      for (int i = 0; i < M; i++)
-        new_v[i] = r[i] = p0[n][i] + step->h * apply(second, n, F, i) + f[n][M + i];
-      solve_mass(at->mass[n], new_v);
-      for (int i = 0; i < M; i++) {
-        change[n] += (r[i] - before[n][i]) * (new_v[i] - v[n][i]);
-        size[n] += r[i] * new_v[i];
-        before[n][i] = r[i];
-      }
-      memcpy(at->u[n] + M, new_v, sizeof new_v);
-    }
+  memset(p, 0, sizeof p);
+  place_changes(at, back, x0, v, f);
+  for (int k = 0; status == 0; k++) {
+    lanes moved[GROUPS], size[GROUPS];
     for (int n = 0; n < GROUPS; n++)
-      memcpy(v[n], at->u[n] + M, sizeof v[n]);
-    if (k + 1 >= *sweeps) {
-      const double moved = fabs(points_total(change)), whole = fabs(points_total(size));
-      const double relative = whole > 0.0 ? moved / whole : moved;
-      status = sweep_status(relative, last, &options, k);
-      last = relative;
-      *sweeps = status == 1 ? k : *sweeps;
+      memcpy(F[n], f[n], sizeof F[n]);
+    for (int n = 0; n < GROUPS; n++) {
+      lanes next[M], before[M];
+      moved[n] = size[n] = lanes_of(0.0);
+      memcpy(before, p[n], sizeof before);
+      for (int i = 0; i < M; i++)
+        next[i] = p[n][i] = p0[n][i] + at->step->h * apply(table, n, F, i) + f[n][M + i];
+      solve_mass(at->mass[n], next);
+      for (int i = 0; i < M; i++) {
+        moved[n] += (p[n][i] - before[i]) * (next[i] - v[n][i]);
+        size[n] += p[n][i] * next[i];
+        v[n][i] = next[i];
+      }
     }
+    if (k >= *look)
+      status = changes_rest(fabs(points_total(moved)), fabs(points_total(size)), &last, k, look);
+    place_changes(at, back, x0, v, f);
   }
+  return status == 1 ? OK : NOT_CONVERGED;
 }
 
 /* The changes of forces and momenta, points held. */
@@ -122,7 +120,7 @@ static inline void given_changed(const swept_step *at, const double *v, lanes (*
 }
 
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
-static int push_swept(swept_step *at, double *v, int *sweeps)
+static int push_swept(swept_step *at, double *v, int *look)
 {
   const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
   lanes given[GROUPS][2 * M], x0[GROUPS][M], p0[GROUPS][M], f[GROUPS][2 * M], F[GROUPS][M];
@@ -134,7 +132,7 @@ static int push_swept(swept_step *at, double *v, int *sweeps)
       x0[n][i] = v[i] + dh * at->D[n][i];
       p0[n][i] = v[M + i] + dh * at->E[n][i] + h * apply(CHANGE_MOMENTUM, n, F, i) - given[n][M + i];
     }
-  if (settle(at, 0, x0, p0, f, sweeps) != OK)
+  if (settle(at, 0, x0, p0, f, look) != OK)
     return NOT_CONVERGED;
   for (int i = 0; i < M; i++) {
     lanes moved[GROUPS], pushed[GROUPS];
@@ -167,7 +165,7 @@ static inline void given_back(const swept_step *at, double *v)
 }
 
 /* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
-static int pull_swept(swept_step *at, double *v, int *sweeps)
+static int pull_swept(swept_step *at, double *v, int *look)
 {
   double by_h = 0.0;
   lanes y0[GROUPS][M], v0[GROUPS][M], z[GROUPS][2 * M];
@@ -176,7 +174,7 @@ static int pull_swept(swept_step *at, double *v, int *sweeps)
       y0[n][i] = at->end_momentum[n] * v[M + i];
       v0[n][i] = at->end_position[n] * v[i];
     }
-  if (settle(at, 1, y0, v0, z, sweeps) != OK)
+  if (settle(at, 1, y0, v0, z, look) != OK)
     return NOT_CONVERGED;
   v[GIVEN_T + 1] += v[GIVEN_T];
   given_back(at, v);

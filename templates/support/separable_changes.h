@@ -3,7 +3,7 @@
  * a number by the forces are the fixed points of
  *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
  * whose rate of contraction is that of the step itself. All are exact: those of the map which the equations define.
- * Before it: separable_sweep.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes, BY_SLOPES_BACK, POINT_GIVEN and
+ * Before it: separable_sweep.h, changes_at_rest.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes, BY_SLOPES_BACK, POINT_GIVEN and
  * given_slopes, MASS_GIVEN and mass_by_given. */
 
 enum {
@@ -71,39 +71,41 @@ static inline void through_slopes(swept_step *at, int back, lanes (*f)[M])
     (back ? BY_SLOPES_BACK : by_slopes)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
 }
 
-/* The x in u, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies: whatever the
- * units of coordinates, and together, as every part contracts by the others. The changes are first measured where they
- * came to rest the last time, less one sweep. */
-static inline int settle(swept_step *at, int back, lanes (*f)[M], int *sweeps)
+/* The next x, whose first part is x0. */
+static inline lanes next_change(const swept_step *at, const lanes *table, lanes (*x0)[M], lanes (*f)[M], int n, int i)
 {
-  const solver_options options = NAME(default_options)();
+  return x0[n][i] + at->scale[i] * apply(table, n, f, i);
+}
+
+/* The x in u, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies:
+ * whatever the units of coordinates. */
+static inline int settle(swept_step *at, int back, lanes (*f)[M], int *look)
+{
   const lanes *table = back ? PRODUCT_BACK : PRODUCT;
-  lanes(*x)[M + POINT_SLOPES] = at->u, first[GROUPS][M];
+  lanes(*x)[M + POINT_SLOPES] = at->u, x0[GROUPS][M];
   double last = INFINITY;
   int status = 0;
   for (int n = 0; n < GROUPS; n++)
-    memcpy(first[n], x[n], sizeof first[n]);
-  for (int k = 0; status == 0; k++) {
-    lanes change[GROUPS], size[GROUPS];
-    through_slopes(at, back, f);
-    memset(change, 0, sizeof change);
-    memset(size, 0, sizeof size);
-    for (int i = 0; i < M; i++)
-      for (int n = 0; n < GROUPS; n++) {
-        const lanes next = first[n][i] + at->scale[i] * apply(table, n, f, i), moved = next - x[n][i];
-        change[n] += at->mass[i] * (moved * moved);
-        size[n] += at->mass[i] * (next * next);
-        x[n][i] = next;
-      }
-    if (k + 1 >= *sweeps) {
-      const double moved = points_total(change), whole = points_total(size);
-      const double relative = whole > 0.0 ? moved / whole : moved;
-      status = sweep_status(relative, last, &options, k);
-      last = relative;
-      *sweeps = status == 1 ? k : *sweeps;
-    }
-  }
+    memcpy(x0[n], x[n], sizeof x0[n]);
   through_slopes(at, back, f);
+  for (int k = 0; status == 0; k++) {
+    if (k < *look) {
+      for (int i = 0; i < M; i++)
+        for (int n = 0; n < GROUPS; n++)
+          x[n][i] = next_change(at, table, x0, f, n, i);
+    } else {
+      lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}};
+      for (int i = 0; i < M; i++)
+        for (int n = 0; n < GROUPS; n++) {
+          const lanes next = next_change(at, table, x0, f, n, i), change = next - x[n][i];
+          moved[n] += at->mass[i] * (change * change);
+          size[n] += at->mass[i] * (next * next);
+          x[n][i] = next;
+        }
+      status = changes_rest(points_total(moved), points_total(size), &last, k, look);
+    }
+    through_slopes(at, back, f);
+  }
   return status == 1 ? OK : NOT_CONVERGED;
 }
 
@@ -132,7 +134,7 @@ static inline void forces_changed(swept_step *at, const double *v, lanes (*F)[M]
 }
 
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
-static int push_swept(swept_step *at, double *v, int *sweeps)
+static int push_swept(swept_step *at, double *v, int *look)
 {
   const sweep_data *data = at->data;
   const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
@@ -146,7 +148,7 @@ static int push_swept(swept_step *at, double *v, int *sweeps)
     for (int n = 0; n < GROUPS; n++)
       at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i] + at->scale[i] * apply(PRODUCT, n, F, i);
   }
-  if (settle(at, 0, f, sweeps) != OK)
+  if (settle(at, 0, f, look) != OK)
     return NOT_CONVERGED;
   for (int i = 0; i < M; i++) {
     const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
@@ -178,7 +180,7 @@ static inline void given_back(swept_step *at, double *v)
 }
 
 /* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
-static int pull_swept(swept_step *at, double *v, int *sweeps)
+static int pull_swept(swept_step *at, double *v, int *look)
 {
   const sweep_data *data = at->data;
   const double h = at->step->h;
@@ -187,7 +189,7 @@ static int pull_swept(swept_step *at, double *v, int *sweeps)
   for (int i = 0; i < M; i++)
     for (int n = 0; n < GROUPS; n++)
       at->u[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
-  if (settle(at, 1, f, sweeps) != OK)
+  if (settle(at, 1, f, look) != OK)
     return NOT_CONVERGED;
   v[GIVEN_T + 1] += v[GIVEN_T];
   given_back(at, v);
