@@ -1,10 +1,10 @@
-/* Vectors over steps that sweeps solve, STEPS_OF_PIECE at a time: first these, each continued from the one before, then the
- * vectors, in either direction. Before it: carry_by_newton.h, which takes pieces that sweeps fail on; a sweep, and how
- * its steps change: keep_step, slopes_of_step, push_swept, pull_swept. */
+/* Vectors over steps that sweeps solve, STEPS_AT_ONCE at a time: first these, each continued from the one before, then
+ * the vectors, in either direction. Before it: carry_by_newton.h, which takes all of them where sweeps fail on one; a
+ * sweep, and how its steps change: keep_step, slopes_of_step, push_swept, pull_swept. */
 
-static double *kept_of(const carriage *over, long long number)
+static double *kept_of(const carriage *over, long long k)
 {
-  return over->workspace + LINEARISED + number * KEPT_OF_STEP;
+  return over->workspace + LINEARISED + k * KEPT_OF_STEP;
 }
 
 /* The increments by sweeps continued from the steps before, or afresh. */
@@ -18,8 +18,8 @@ static int solve_by_sweeps(carriage *over, const step_data *step, const sweep_da
   return 0;
 }
 
-/* Solves the steps of a piece; 0 if sweeps do not solve one of them. */
-static int solve_piece(carriage *over, long long first, long long end)
+/* Solves these steps; 0 if sweeps do not solve one of them. */
+static int solve_steps(carriage *over, long long first, long long end)
 {
   const double nothing[M] = {0.0};
   for (long long k = first; k < end; k++) {
@@ -61,11 +61,11 @@ static int carry_by_sweeps(carriage *over, long long k, const double *kept)
 }
 
 /* Over the steps from the first until before `end`. */
-static int carry_piece(carriage *over, long long first, long long end)
+static int carry_steps(carriage *over, long long first, long long end)
 {
   int swept, status = OK;
   over->guess = over->back ? 0 : over->guess;
-  swept = solve_piece(over, first, end);
+  swept = solve_steps(over, first, end);
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
     const int carried = swept ? carry_by_sweeps(over, k, kept_of(over, k - first)) : 0;

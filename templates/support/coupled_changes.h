@@ -1,19 +1,20 @@
 /* How a step by coupled_sweep.h changes with what it starts from, and the transpose, by sweeps again. With A and W the
- * tables that make positions of velocities and momenta of forces, the changes x, v, f, p of all these at the points are
+ * tables that make positions of velocities and momenta of forces, the changes x, v, f, p of all these at the points
+ * are
  *   x = x0 + h A v,        f = L_qq x + L_qv v,        p = p0 + h W f,        v = L_vv^-1 (p - L_vq x),
  * and the slopes of a number by them, the other way, are the same but for transposes, with y for f, z for x, w for p:
  *   y = y0 + h W^T w,      z = L_qq y - L_qv w,        v = v0 + h A^T z,      w = L_vv^-1 (v + L_vq y).
- * All are exact: those of the map which the equations define. Before it: coupled_sweep.h, changes_at_rest.h; CHANGE_POSITION, A, and
- * CHANGE_MOMENTUM, W, and with _BACK their transposes; the kernels point_slopes, by_slopes, BY_SLOPES_BACK; POINT_GIVEN
- * and given_slopes. */
+ * All are exact: those of the map which the equations define. Before it: coupled_sweep.h, changes_at_rest.h;
+ * CHANGE_POSITION, A, and CHANGE_MOMENTUM, W, and with _BACK their transposes; the kernels point_slopes, by_slopes,
+ * BY_SLOPES_BACK; POINT_GIVEN and given_slopes. */
 
 enum {
   KEPT_OF_STEP = M * (POINTS + 2), /* numbers: velocities, then the increments of q and p */
   GIVEN_T = GIVEN - 2
 };
 
-/* A solved step: its increments, how its points stand from (q0, p0), room for x and v and behind it the slopes of forces
- * and momenta by these; those by what is given; factors of masses. */
+/* A solved step: its increments, how its points stand from (q0, p0), room for x and v and behind it the slopes of
+ * forces and momenta by these; those by what is given; factors of masses. */
 typedef struct {
   const step_data *step;
   const double *dq, *dp;
@@ -31,7 +32,8 @@ static void keep_step(const step_data *step, const sweep_data *data, const doubl
   memcpy(to + M * (POINTS + 1), dp, sizeof(double) * M);
 }
 
-static void slopes_of_step(const step_data *step, const sweep_data *data, const double *told, swept_step *at)
+static __attribute__((noinline)) void slopes_of_step(const step_data *step, const sweep_data *data,
+    const double *told, swept_step *at)
 {
   lanes V[GROUPS][M], value[M + POINT_SLOPES];
   at->step = step;
@@ -120,7 +122,7 @@ static inline void given_changed(const swept_step *at, const double *v, lanes (*
 }
 
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
-static int push_swept(swept_step *at, double *v, int *look)
+static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *look)
 {
   const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
   lanes given[GROUPS][2 * M], x0[GROUPS][M], p0[GROUPS][M], f[GROUPS][2 * M], F[GROUPS][M];
@@ -165,7 +167,7 @@ static inline void given_back(const swept_step *at, double *v)
 }
 
 /* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
-static int pull_swept(swept_step *at, double *v, int *look)
+static __attribute__((noinline)) int pull_swept(swept_step *at, double *v, int *look)
 {
   double by_h = 0.0;
   lanes y0[GROUPS][M], v0[GROUPS][M], z[GROUPS][2 * M];

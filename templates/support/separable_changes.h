@@ -1,10 +1,10 @@
-/* How a step by separable_sweep.h changes with what it starts from, and the transpose, by sweeps again. With D = X - q0,
- * the slopes K = F_q at the points, s = h^2 / m and P the table PRODUCT, the changes x of the points and the slopes y of
- * a number by the forces are the fixed points of
+/* How a step by separable_sweep.h changes with what it starts from, and the transpose, by sweeps again. With D = X -
+ * q0, the slopes K = F_q at the points, s = h^2 / m and P the table PRODUCT, the changes x of the points and the
+ * slopes y of a number by the forces are the fixed points of
  *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
  * whose rate of contraction is that of the step itself. All are exact: those of the map which the equations define.
- * Before it: separable_sweep.h, changes_at_rest.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes, BY_SLOPES_BACK, POINT_GIVEN and
- * given_slopes, MASS_GIVEN and mass_by_given. */
+ * Before it: separable_sweep.h, changes_at_rest.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes,
+ * BY_SLOPES_BACK, POINT_GIVEN and given_slopes, MASS_GIVEN and mass_by_given. */
 
 enum {
   KEPT_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
@@ -39,7 +39,8 @@ static void keep_step(const step_data *step, const sweep_data *data, const doubl
   memcpy(to + M * (POINTS + 1), dp, sizeof(double) * M);
 }
 
-static void slopes_of_step(const step_data *step, const sweep_data *data, const double *told, swept_step *at)
+static __attribute__((noinline)) void slopes_of_step(const step_data *step, const sweep_data *data,
+    const double *told, swept_step *at)
 {
   lanes X[GROUPS][M];
   at->step = step;
@@ -133,11 +134,21 @@ static inline void forces_changed(swept_step *at, const double *v, lanes (*F)[M]
     }
 }
 
+/* Whether q0 and p0 alone change. */
+static inline int is_of_state(const double *v)
+{
+  int none = 1;
+  for (int j = 2 * M; j < GIVEN; j++)
+    none &= v[j] == 0.0;
+  return none;
+}
+
 /* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
-static int push_swept(swept_step *at, double *v, int *look)
+static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *look)
 {
   const sweep_data *data = at->data;
   const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
+  const int of_state = is_of_state(v);
   double dm[M];
   lanes f[GROUPS][M], F[GROUPS][M];
   masses_changed(at, v, dm);
@@ -146,7 +157,9 @@ static int push_swept(swept_step *at, double *v, int *look)
     const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
     const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
     for (int n = 0; n < GROUPS; n++)
-      at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i] + at->scale[i] * apply(PRODUCT, n, F, i);
+      at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i];
+    for (int n = 0; !of_state && n < GROUPS; n++)
+      at->u[n][i] += at->scale[i] * apply(PRODUCT, n, F, i);
   }
   if (settle(at, 0, f, look) != OK)
     return NOT_CONVERGED;
@@ -180,7 +193,7 @@ static inline void given_back(swept_step *at, double *v)
 }
 
 /* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
-static int pull_swept(swept_step *at, double *v, int *look)
+static __attribute__((noinline)) int pull_swept(swept_step *at, double *v, int *look)
 {
   const sweep_data *data = at->data;
   const double h = at->step->h;
