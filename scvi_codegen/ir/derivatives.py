@@ -46,19 +46,16 @@ class SweptSlopes:
 
     Attributes:
         slopes: what slopes have at the points, each value of them once, behind ``beside`` other values; with lanes.
-        forward, back: at u = (changes, these) their matrix times changes, and its transpose; the same of a potential.
-        given_entries, given: (i, j) of force i, or behind these of a momentum, by parameter j, or, by their number, by
-            time; with lanes.
+        products: at u = (changes, these) their matrix times changes, and its transpose; of a potential the same twice.
+        given: of forces, or behind these of momenta, with lanes.
         masses: constant ones by parameters, where they are; numbers.
         steps: that are solved before vectors are carried over them.
     """
 
     slopes: Kernel
     beside: int
-    forward: Kernel
-    back: Kernel
-    given_entries: tuple[tuple[int, int], ...]
-    given: Kernel
+    products: tuple[Kernel, Kernel]
+    given: GivenSlopes
     masses: GivenSlopes | None = None
     steps: int = 32
 
@@ -109,10 +106,8 @@ class Derivatives:
     @property
     def lane_kernels(self) -> tuple[Kernel, ...]:
         """Those with lanes that its sweep lacks."""
-        if self.swept is None:
-            return ()
-        swept = self.swept
-        return tuple(dict.fromkeys((swept.slopes, swept.given, swept.forward, swept.back)))
+        kernels = (self.swept.slopes, self.swept.given.kernel, *self.swept.products) if self.swept else ()
+        return tuple(dict.fromkeys(kernel for kernel in kernels if kernel))
 
     @property
     def bent(self) -> tuple[int, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from sympy import Add, Expr, Mul, S, Symbol
 
@@ -40,8 +39,8 @@ def _separable(system: LagrangianSystem) -> SweptSlopes:
     return SweptSlopes(
         slopes=system_kernel(system, "point_slopes", different, of=q, purpose="L_qq at all points, each value once."),
         beside=0,
-        **_products(system, slopes, different, size=len(q)),
-        **_by_given(system, forms.force, q),
+        products=_products(system, slopes, different, size=len(q)),
+        given=_by_given(system, forms.force, q),
         masses=GivenSlopes(entries=tuple(masses), kernel=kernel) if masses else None,
     )
 
@@ -66,8 +65,8 @@ def _coupled(system: LagrangianSystem) -> SweptSlopes:
     return SweptSlopes(
         slopes=at_points,
         beside=m,
-        **_products(system, slopes, different, size=2 * m),
-        **_by_given(system, (*forms.force, *forms.momentum), of),
+        products=_products(system, slopes, different, size=2 * m),
+        given=_by_given(system, (*forms.force, *forms.momentum), of),
     )
 
 
@@ -77,16 +76,16 @@ MAKERS: dict[str, Callable[[LagrangianSystem], SweptSlopes]] = {
 }
 
 
-def _by_given(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Symbol]) -> dict[str, Any]:
+def _by_given(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Symbol]) -> GivenSlopes:
     entries = jacobian(results, (*system.parameters, system.time)) or NOTHING
     purpose = "What these have by parameters and time, at all points."
     kernel = system_kernel(system, "given_slopes", entries.values(), of=of, purpose=purpose)
-    return {"given_entries": tuple(entries), "given": kernel}
+    return GivenSlopes(entries=tuple(entries), kernel=kernel)
 
 
 def _products(
     system: LagrangianSystem, slopes: Entries, different: tuple[Expr, ...], *, size: int
-) -> dict[str, Kernel]:
+) -> tuple[Kernel, Kernel]:
     """The matrix of slopes, by their different values, times x, and its transpose; one kernel if they are the same."""
     number = {value: k for k, value in enumerate(different)}
     x = [Symbol(f"x[{i}]", real=True) for i in range(size)]
@@ -101,4 +100,4 @@ def _products(
 
     forward = product("by_slopes", slopes, "The matrix of slopes times x, u = (x, its values).")
     turned = product("by_slopes_back", back, "Its transpose times x.") if back != slopes else forward
-    return {"forward": forward, "back": turned}
+    return forward, turned
