@@ -10,13 +10,14 @@ static inline int changes_rest(double moved, double size, double *last, int k, i
 {
   const double before = *last, relative = size > 0.0 ? moved / size : moved;
   const int first = !(before < INFINITY);
+  const int small = relative <= (first ? MOVED_BY_ROUNDING : LEFT_TO_COME);
+  const int last_but_one = !first && relative * relative <= LEFT_TO_COME * before;
   const int stopped = !first && relative >= before && relative < ROUNDING_LEVEL;
+  const int shrinks = first || relative < 0.5 * before || relative < PROGRESS_LEVEL;
   *last = relative;
-  if (relative <= (first ? MOVED_BY_ROUNDING : LEFT_TO_COME) || stopped || (!first && relative * relative <= LEFT_TO_COME * before)) {
+  if (small || last_but_one || stopped) {
     *look = k - 1;
     return 1;
   }
-  return relative < INFINITY && k < MAX_ITERATIONS && (first || relative < 0.5 * before || relative < PROGRESS_LEVEL)
-      ? 0
-      : -1;
+  return relative < INFINITY && k < MAX_ITERATIONS && shrinks ? 0 : -1;
 }
