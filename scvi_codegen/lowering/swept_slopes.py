@@ -18,14 +18,17 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["swept_slopes"]
 
+MOST_SLOPES = 4096
+"""At a point, of which a step keeps those of all on the stack: a quarter of a megabyte of vectors."""
 NOTHING: Entries = {(0, 0): S.Zero}
 """In place of no entries: C has no empty arrays."""
 
 
 def swept_slopes(system: MechanicalSystem, sweep: Sweep) -> SweptSlopes | None:
-    """Of a system whose steps the sweep solves; ``None`` where it does not carry changes."""
+    """Of a system whose steps the sweep solves; ``None`` where it does not carry changes, or there are too many."""
     twin, make = lagrangian_twin(system), MAKERS.get(sweep.changes_part)
-    return make(twin) if twin and make else None
+    found = make(twin) if twin and make else None
+    return found if found and found.count + len(found.given.entries) <= MOST_SLOPES else None
 
 
 def _separable(system: LagrangianSystem) -> SweptSlopes:

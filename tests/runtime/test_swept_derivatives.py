@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from samples import tangle
+from samples import sweep, tangle
 
 from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
+from scvi_codegen.lowering import swept_slopes
 
 WHIRL = LagrangianSystem.from_text(
     name="whirl in a moving trap",
@@ -82,9 +83,18 @@ def test_steps_that_sweeps_do_not_solve_are_carried_over_by_factors():
         steppers["fixed-point"].integrate([1.0], [0.0], h=0.25, steps=STEPS)
 
 
+def test_slopes_that_are_too_many_for_the_stack_are_left_to_factors(monkeypatch):
+    system = problem("kepler").system
+    found = sweep(system, SVI(2))
+    slopes = swept_slopes.swept_slopes(system, found)
+    assert slopes is not None
+    monkeypatch.setattr(swept_slopes, "MOST_SLOPES", slopes.count + len(slopes.given.entries) - 1)
+    assert swept_slopes.swept_slopes(system, found) is None
+
+
 def test_units_of_coordinates_do_not_tell_when_sweeps_end():
-    """Two of three bodies in units a million times as small, or large: the same derivative, entry by entry."""
-    text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + {a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
+    """A stiff coordinate, in units a million times as small or large: the same derivative, entry by entry."""
+    text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + 36*{a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
     derivatives = []
     for unit in ("1", "1000000", "1/1000000"):
         system = LagrangianSystem.from_text(
