@@ -8,7 +8,7 @@ from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 
-__all__ = ["Derivatives", "GivenSlopes", "LinearClock"]
+__all__ = ["Derivatives", "GivenSlopes", "LinearClock", "SweptSlopes"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +41,31 @@ class LinearClock:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SweptSlopes:
+    """What steps by sweeps need to carry changes and slopes by sweeps, too; entries are never empty.
+
+    Attributes:
+        slopes: what slopes have at the points, each value of them once, behind ``beside`` other values; with lanes.
+        products: at u = (changes, these) their matrix times changes, and its transpose; of a potential the same twice.
+        given: of forces, or behind these of momenta, with lanes.
+        masses: constant ones by parameters, where they are; numbers.
+        steps: that are solved before vectors are carried over them.
+    """
+
+    slopes: Kernel
+    beside: int
+    products: tuple[Kernel, Kernel]
+    given: GivenSlopes
+    masses: GivenSlopes | None = None
+    steps: int = 32
+
+    @property
+    def count(self) -> int:
+        """Different slopes."""
+        return self.slopes.values - self.beside
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Derivatives:
     """Steps of a program with their derivative by all they start from.
 
@@ -52,6 +77,7 @@ class Derivatives:
             by y, as they change along dy; ``None`` where phi is linear.
         damping: slopes of the rate of a damping, by parameters.
         clock: of time where it is transformed.
+        swept: where its sweeps carry changes, too; ``None`` where Newton's factors do so alone.
         lanes: changes that are carried along at a time.
     """
 
@@ -60,6 +86,7 @@ class Derivatives:
     curvatures: tuple[Kernel | None, ...] = ()
     damping: GivenSlopes | None = None
     clock: LinearClock | None = None
+    swept: SweptSlopes | None = None
     lanes: int = 8
 
     @property
@@ -71,9 +98,16 @@ class Derivatives:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that the program lacks."""
-        given = (*self.by_given, *((self.damping,) if self.damping else ()))
+        given: tuple[GivenSlopes, ...] = (*self.by_given, *((self.damping,) if self.damping else ()))
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
+        given += (self.swept.masses,) if self.swept and self.swept.masses else ()
         return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock) if each)
+
+    @property
+    def lane_kernels(self) -> tuple[Kernel, ...]:
+        """Those with lanes that its sweep lacks."""
+        kernels = (self.swept.slopes, self.swept.given.kernel, *self.swept.products) if self.swept else ()
+        return tuple(dict.fromkeys(kernel for kernel in kernels if kernel))
 
     @property
     def bent(self) -> tuple[int, int]:
@@ -110,6 +144,12 @@ class Derivatives:
         if self.curvatures:
             wide += 4 * self.given + 2 * program.unknowns + 3 * self.at_points
         return self.slopes + wide * self.lanes + self.places
+
+    @property
+    def kept(self) -> int:
+        """Doubles behind these: of a piece of steps by sweeps how the points stand from q0, and the increments."""
+        sweep = self.program.sweep
+        return self.swept.steps * self.program.dimension * (sweep.lanes + 2) if self.swept and sweep else 0
 
     @property
     def places(self) -> int:

@@ -11,7 +11,7 @@ from typing import ClassVar
 from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
-__all__ = ["GuessTables", "Kept", "Sweep", "SweepTable"]
+__all__ = ["GuessTables", "Kept", "Sweep", "SweepTable", "transposed"]
 
 
 class Kept(Enum):
@@ -117,6 +117,16 @@ class Sweep(ABC):
         return None
 
     @property
+    def changes_part(self) -> str:
+        """The part that carries changes, and slopes back, by the same sweeps; ``""`` where Newton's factors do."""
+        return ""
+
+    @property
+    def changes_tables(self) -> tuple[SweepTable, ...]:
+        """What that takes beside :attr:`tables`."""
+        return ()
+
+    @property
     def damping(self) -> Kernel | None:
         """The rate of a uniform damping, a number of the parameters, where there is one."""
         return None
@@ -150,3 +160,10 @@ class Sweep(ABC):
     def mass_part(self) -> str:
         """The part that solves with the mass."""
         return "diagonal_mass" if self.diagonal else "full_mass"
+
+
+def transposed(table: NumberTable, points: int) -> NumberTable:
+    """Of a padded table; lanes beyond the points neither give nor take."""
+    padding = (0,) * (len(table) - points)
+    columns = tuple(zip(*table[:points], strict=True))[:points]
+    return (*((*column, *padding) for column in columns), *((0,) * len(table) for _ in padding))

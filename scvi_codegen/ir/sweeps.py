@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 from scvi_codegen.ir.kernel import IndexedSum, Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.ir.sweep import GuessTables, Kept, Sweep, SweepTable
+from scvi_codegen.ir.sweep import GuessTables, Kept, Sweep, SweepTable, transposed
 
 __all__ = [
     "CoupledSweep",
@@ -74,6 +74,16 @@ class SeparableSweep(Sweep):
         if self.velocity:
             yield SweepTable("VELOCITY", self.velocity)
         yield from self.guess.tables
+
+    @property
+    def changes_part(self) -> str:
+        """By forces and their slopes."""
+        return "" if self.velocity else "separable_changes"
+
+    @property
+    def changes_tables(self) -> tuple[SweepTable, ...]:
+        """The transpose of what leads from forces to positions."""
+        return (SweepTable("PRODUCT_BACK", transposed(self.product, self.points)),)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -235,6 +245,21 @@ class CoupledSweep(PointSweep):
         return (*damped, "point_weights", self.mass_part, "places", corrections, "coupled_sweep")
 
     @property
+    def changes_part(self) -> str:
+        """By velocities, where these are the unknowns and nothing else is carried along."""
+        return "" if self.projected or self.damping or self.integrands else "coupled_changes"
+
+    @property
+    def changes_tables(self) -> tuple[SweepTable, ...]:
+        """Positions from velocities, momenta from forces, and their transposes."""
+        tables = {
+            "CHANGE_POSITION": _weighed(self.position, self.position_weights),
+            "CHANGE_MOMENTUM": _weighed(self.momentum, self.momentum_weights),
+        }
+        back = (SweepTable(f"{name}_BACK", transposed(table, self.points)) for name, table in tables.items())
+        return (*(SweepTable(name, table) for name, table in tables.items()), *back)
+
+    @property
     def integral_part(self) -> str:
         """Along the velocities."""
         return "coupled_integrals" if self.integrands else ""
@@ -298,3 +323,8 @@ class Splitting:
     def acts(self) -> bool:
         """Whether it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
         return self.by_masses and sum(x != 0 for x in self.drifts) == 1
+
+
+def _weighed(table: NumberTable, weights: tuple[Number, ...]) -> NumberTable:
+    """Columns times weights."""
+    return tuple(tuple(x * weight for x, weight in zip(row, weights, strict=True)) for row in table)

@@ -11,6 +11,7 @@ from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes, LinearClock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.swept_slopes import swept_slopes
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import PointFamily, StageSystem
@@ -33,6 +34,7 @@ def derivatives_of(
         curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
         damping=_given_slopes(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_linear_clock(system, stages.families[0].arguments) if system.clock else None,
+        swept=swept_slopes(system, program.sweep) if program.sweep else None,
     )
 
 

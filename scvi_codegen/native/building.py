@@ -23,6 +23,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -216,7 +217,8 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
     """The parts at the same time, each in a process; then one library of them, and what describes it."""
     source.write(folder)
-    cut = any("support/parts.h" in each.files for each in source.sources)
+    is_cut = any("support/parts.h" in each.files for each in source.sources)
+    cut = CUT_FLAGS if is_cut and _takes_flags(compiler, CUT_FLAGS) else ()
     threads = THREADS if any(SHARED_BY_THREADS in each.files for each in source.sources) else ()
     wanted = [*threads, *shlex.split(os.environ.get(FLAGS_VARIABLE, ""))]
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
@@ -261,12 +263,25 @@ def _write_binding(declarations: str, folder: Path) -> None:
     make_py_source(binding, folder.name, str(_binding(folder)), verbose=False)
 
 
-def _passes(part: Source, flags: tuple[str, ...], cut: bool) -> tuple[str, ...]:
+@cache
+def _takes_flags(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
+    """Whether the compiler knows them: clang refuses most passes of gcc."""
+    with tempfile.TemporaryDirectory() as folder:
+        empty = Path(folder, "empty.c")
+        empty.touch()
+        try:
+            run_compiler([*compiler, *flags, "-E", empty.name, "-o", "empty.i"], empty.parent)
+        except BuildError:
+            return False
+    return True
+
+
+def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple[str, ...]:
     """What gcc does otherwise than -O3 says."""
     if "-O3" not in flags:
         return ()
     rolled = ROLLED_FLAGS if "support/run.h" in part.files and WRITTEN_OUT.isdisjoint(part.files) else ()
-    return (*CUT_FLAGS, *rolled) if cut else rolled
+    return (*cut, *rolled)
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:

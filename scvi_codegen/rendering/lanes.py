@@ -101,7 +101,12 @@ class SweepText:
 
 
 def sweep_text(
-    sweep: Sweep, meaning: Lanes, *, fallback: Fallback, kernels: Sequence[Kernel] | None = None
+    sweep: Sweep,
+    meaning: Lanes,
+    *,
+    fallback: Fallback,
+    kernels: Sequence[Kernel] | None = None,
+    changes: bool = False,
 ) -> SweepText:
     """A sweep in vectors.
 
@@ -110,6 +115,7 @@ def sweep_text(
         meaning: of a lane.
         fallback: what is tried where it fails.
         kernels: those applied to vectors, if they are not the sweep's own.
+        changes: whether it carries changes, too.
     """
     kernels = tuple(sweep.kernels if kernels is None else kernels)
     mass = sweep.constant_mass
@@ -126,7 +132,7 @@ def sweep_text(
             **{name: str(value) for name, value in sweep.facts.items()},
         },
         functions=tuple(map(_function, sorted(functions))),
-        tables=tuple(_tables(sweep, meaning)),
+        tables=tuple(_tables(sweep, meaning, changes=changes)),
         kernels=kernels,
         mass=mass,
         damping=damping,
@@ -167,10 +173,10 @@ def _solver(sweep: Sweep, fallback: Fallback) -> tuple[str, ...]:
     return (*solver, sweep.integral_part, f"integrals_after_{'sweep' if fallback == 'none' else 'fallback'}")
 
 
-def _tables(sweep: Sweep, meaning: Lanes) -> Iterator[str]:
+def _tables(sweep: Sweep, meaning: Lanes, *, changes: bool) -> Iterator[str]:
     points = len(sweep.guess.abscissae)
     vector, matrix = _printers(meaning, points) if sweep.in_groups else (_vector, _columns)
-    for each in sweep.tables:
+    for each in (*sweep.tables, *(sweep.changes_tables if changes else ())):
         print_table: Callable[[str, Any], str] = matrix if each.is_matrix else vector
         yield print_table(each.name, each.numbers)
         if each.in_two_parts:

@@ -136,8 +136,9 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
 
 def render_derivatives(derivatives: Derivatives) -> Source:
     """The text of a program solved by Newton's iteration, with the derivative of steps and its transpose."""
-    context = _context(derivatives.program, DOUBLE, None, kernels=(*derivatives.program.kernels, *derivatives.kernels))
-    return _render(derivatives.program.prefix, context | {"derivatives": derivatives, "written_out": None})
+    program = derivatives.program
+    context = _context(program, DOUBLE, None, kernels=(*program.kernels, *derivatives.kernels), beside=derivatives)
+    return _render(program.prefix, context | {"derivatives": derivatives, "written_out": None})
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
@@ -256,16 +257,18 @@ def _context(
     fallback: Fallback | None = None,
     *,
     kernels: Sequence[Kernel] | None = None,
+    beside: Derivatives | None = None,
 ) -> dict[str, object]:
     kernels = program.kernels if kernels is None else kernels
     fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
+    lanes = beside.lane_kernels if beside else ()
     return {
         "program": program,
         "prefix": program.prefix,
         "target": target,
         "real": target.scalar,
         "kernels": kernels,
-        "cut": _is_cut((*scalars, *(program.sweep.kernels if program.sweep else ()))),
+        "cut": _is_cut((*scalars, *(program.sweep.kernels if program.sweep else ()), *lanes)),
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
@@ -276,7 +279,7 @@ def _context(
         "written_out": written_out(program, target),
         "fallback": fallback,
         **_control_context(program, control),
-        **_lane_context(program, fallback),
+        **_lane_context(program, fallback, lanes),
     }
 
 
@@ -293,13 +296,14 @@ def _is_cut(kernels: Iterable[Kernel]) -> bool:
     return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
 
 
-def _lane_context(program: Program, fallback: Fallback) -> dict[str, object]:
-    """What the templates of the fixed-point solver need; nothing without one."""
+def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]) -> dict[str, object]:
+    """What the templates of the fixed-point solver need; nothing without one. ``beside``: kernels of its derivative."""
     sweep = program.sweep
     if sweep is None:
         return {"sweep": None}
     hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
-    text = sweep_text(sweep, POINTS, fallback=fallback)
+    kernels = (*sweep.kernels, *beside)
+    text = sweep_text(sweep, POINTS, fallback=fallback, kernels=kernels, changes=bool(beside))
     return {"sweep": text, "hot": hot}
 
 

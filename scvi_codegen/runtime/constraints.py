@@ -47,8 +47,10 @@ def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, p
 
 def projected(
     stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters
-) -> tuple[Array, Array, float]:
-    """The nearest state on the constraints, in the metric of the masses, and how far it is, relative to |q| and |p|.
+) -> tuple[Array, Array, Array]:
+    """The nearest state on the constraints, and (2,) how far it is, in parts of q and of p.
+
+    Both in the metric of the masses, at the nearest state: whatever the units of coordinates.
 
     Raises:
         StateError: if none is found, or constraints depend on each other there.
@@ -62,8 +64,11 @@ def projected(
     )
     if status:
         _refuse(stepper, status, q0)
-    moved = max(_relative(q1 - q0, np.concatenate([q0, q1])), _relative(p1 - p0, np.concatenate([p0, p1])))
-    return q1, p1, moved
+    apart = np.empty(2)
+    status = binding.function("apart")(t, *map(binding.pointer, (q0, p0, q1, p1, values, apart)), binding.workspace())
+    if status:
+        _refuse(stepper, status, q0)
+    return q1, p1, apart
 
 
 def consistent(
@@ -78,7 +83,8 @@ def consistent(
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
             raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
-    q1, p1, moved = projected(stepper, q0, p0, t, parameters)
+    q1, p1, apart = projected(stepper, q0, p0, t, parameters)
+    moved = float(apart.max())
     if moved <= ROUNDED * np.finfo(float).eps:
         return q0, p0
     if moved <= TYPED:
@@ -111,7 +117,7 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
 
     Rates may jump: momenta then do, by an impulse along the slopes of the constraints. Positions cannot.
     """
-    moved = _relative(projected(stepper, q, p, t, parameters)[0] - q, q)
+    moved = projected(stepper, q, p, t, parameters)[2][0]
     if moved > TYPED:
         g = constraint_values(stepper, q, p, t, parameters)[0, 0]
         k = int(np.abs(g).argmax())
@@ -144,8 +150,3 @@ def _refuse(stepper: Integrator, status: int, q: Array) -> None:
     shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
     near = np.array2string(q, threshold=2 * MOST_SHOWN)
     raise StateError(f"the constraints {shown} cannot be met near q = {near} ({STATUS[status]}{hint})")
-
-
-def _relative(change: Array, beside: Array) -> float:
-    size = float(np.abs(beside).max())
-    return float(np.abs(change).max()) / size if size > 0.0 else 0.0

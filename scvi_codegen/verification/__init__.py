@@ -29,6 +29,7 @@ from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
+from scvi_codegen.verification.clock_derivatives import clock_derivative_checks
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
 from scvi_codegen.verification.guesses import guess_checks
@@ -94,13 +95,15 @@ def verify(
         steps = compile_stepper(single, method, solver=solver, flags=flags)
     subject = Subject(single, method, steps, _newton(single, method, steps, solver, flags), given)
     paced = steps is not stepper or tolerance is not None
+    pace = Pace(subject, stepper, _in_own_time(system), system, tolerance)
     checks = (
-        *(pace_checks(Pace(subject, stepper, _in_own_time(system), tolerance)) if paced else ()),
+        *(pace_checks(pace) if paced else ()),
         *step_checks(subject),
         *guess_checks(subject),
         *(() if system.constraints else roundoff_checks(subject)),
         *structure_checks(subject),
         *derivative_checks(subject),
+        *(clock_derivative_checks(pace) if system.clock else ()),
         *convergence_checks(subject),
         *identity_checks(subject),
         largest_step(subject),

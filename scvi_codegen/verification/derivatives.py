@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.subject import State, Subject
@@ -41,10 +42,11 @@ def _derivative(subject: Subject) -> Finding | None:
         return None
     state = subject.states[0]
     scales, direction = subject.scales(state), _direction(subject, state)
-    found = _carried(subject, state, direction, back=False)[: len(scales)]
     exact, m = _by_differences(subject, state, direction), len(state.q)
-    parts = (slice(m), slice(m, None))
-    apart = max(np.abs((found - exact) / scales)[part].max() for part in parts)
+    apart = 0.0
+    for stepper in _steppers(subject):
+        found = _carried(subject, stepper, state, direction, back=False)[: len(scales)]
+        apart = max(apart, *(np.abs((found - exact) / scales)[part].max() for part in (slice(m), slice(m, None))))
     return Finding(float(apart / np.abs(exact / scales).max()), BOUND, "relative, along one direction")
 
 
@@ -55,9 +57,20 @@ def _transpose(subject: Subject) -> Finding | None:
     state = subject.states[0]
     v = _direction(subject, state)
     w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
-    forward, back = (_carried(subject, state, vector, back=which) for vector, which in ((v, False), (w, True)))
-    size = max(np.abs(forward * w).max(), np.abs(v * back).max())
-    return Finding(float(abs(forward @ w - v @ back) / size), BOUND, "relative, along one direction")
+    apart = 0.0
+    for stepper in _steppers(subject):
+        forward, back = (
+            _carried(subject, stepper, state, vector, back=which) for vector, which in ((v, False), (w, True))
+        )
+        size = max(np.abs(forward * w).max(), np.abs(v * back).max())
+        apart = max(apart, float(abs(forward @ w - v @ back) / size))
+    return Finding(apart, BOUND, "relative, along one direction")
+
+
+def _steppers(subject: Subject) -> list[Stepper]:
+    """The artefact; and Newton's solver beside it, by whose factors changes are carried where sweeps fail."""
+    others = [subject.newton] if subject.newton and subject.newton is not subject.stepper else []
+    return [subject.stepper, *others]
 
 
 def _differentiable(subject: Subject) -> bool:
@@ -138,12 +151,12 @@ def _direction(subject: Subject, state: State, phase: float = 1.0) -> Array:
     return direction
 
 
-def _carried(subject: Subject, state: State, vector: Array, *, back: bool) -> Array:
+def _carried(subject: Subject, stepper: Stepper, state: State, vector: Array, *, back: bool) -> Array:
     """What the compiled derivative, or its transpose, makes of a vector."""
     starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
     vectors = np.zeros((2, 1, len(vector)))
     vectors[int(back)] = vector
-    subject.stepper.linearise(starts, vectors, np.array(list(subject.parameters.values())), None, back=back)
+    stepper.linearise(starts, vectors, np.array(list(subject.parameters.values())), None, back=back)
     carried: Array = vectors[int(not back), 0]
     return carried
 

@@ -49,12 +49,14 @@ class Pace:
         subject: those steps; in transformed time of a system in whose time tau nothing is special.
         stepper: of the runs: in transformed time, with a monitor, or one whose steps choose their length.
         system: what moves, in its own time.
+        transformed: the same in that of the stepper, or in its own.
         tolerance: of steps that choose their length, 0 for round-off.
     """
 
     subject: Subject
     stepper: Stepper
     system: MechanicalSystem
+    transformed: MechanicalSystem
     tolerance: float | None
 
     @cached_property

@@ -177,6 +177,58 @@ int NAME(project)(real t, const real *q0, const real *p0, const real *parameters
   return OK;
 }
 
+/* y = L_vv x. */
+static void times_mass(const real *mass, const real *x, real *y)
+{
+  memset(y, 0, sizeof(real) * M);
+  for (int e = 0; e < MASS_ENTRIES; e++)
+    y[MASS_ENTRY[e][0]] += mass[e] * x[MASS_ENTRY[e][1]];
+}
+
+/* How far x[0] is from x[1], as a part of their size: lengths squared are x times y, what a metric makes of x. */
+static real part_of(real (*x)[M], real (*y)[M])
+{
+  real apart = 0, one = 0, other = 0;
+  for (int i = 0; i < M; i++) {
+    apart += (x[0][i] - x[1][i]) * (y[0][i] - y[1][i]);
+    one += x[0][i] * y[0][i];
+    other += x[1][i] * y[1][i];
+  }
+  one = larger(MATH(fabs)(one), MATH(fabs)(other));
+  return one > 0 ? MATH(sqrt)(MATH(fabs)(apart) / one) : 0;
+}
+
+/* That of momenta is by the inverse masses: what they add to the velocities. */
+int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const real *p1, const real *parameters,
+    real *apart, real *workspace)
+{
+  const real still[M] = {0};
+  real u[2 * M], x[2][M], y[2][M], p[M], mass[MASS_ENTRIES];
+  int status = NAME(velocity)(t, q1, p0, parameters, y[0], workspace);
+  if (status == OK)
+    status = NAME(velocity)(t, q1, p1, parameters, y[1], workspace);
+  memcpy(u, q1, sizeof(real) * M);
+  memcpy(u + M, y[1], sizeof y[1]);
+  if (status == OK)
+    status = NAME(velocity)(t, q1, still, parameters, p, workspace);
+  if (status != OK)
+    return status;
+  for (int i = 0; i < M; i++) {
+    y[0][i] -= p[i];
+    y[1][i] -= p[i];
+  }
+  memcpy(x[0], p0, sizeof x[0]);
+  memcpy(x[1], p1, sizeof x[1]);
+  apart[1] = part_of(x, y);
+  legendre(u, t, parameters, p, mass);
+  memcpy(x[0], q0, sizeof x[0]);
+  memcpy(x[1], q1, sizeof x[1]);
+  times_mass(mass, x[0], y[0]);
+  times_mass(mass, x[1], y[1]);
+  apart[0] = part_of(x, y);
+  return all_finite(apart, 2) ? OK : NOT_FINITE;
+}
+
 /* lambda of d/dt L_v = L_q + f + G^T lambda at states: L_vv a - G^T lambda = F, G a = - what rates grow by. */
 int NAME(multipliers)(long long count, const real *t, const real *q, const real *p, const real *parameters,
     real *multiplier, real *workspace)

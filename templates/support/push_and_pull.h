@@ -183,27 +183,3 @@ static int carry_over(const linearised_step *at, int back, int count, const real
   }
   return all_finite(to, count * GIVEN) ? OK : NOT_FINITE;
 }
-
-int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
-    const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
-    solver_report *report, real *workspace)
-{
-  const solver_options standard = NAME(default_options)();
-  const real carry[M] = {0};
-  const long long across = (long long)count * GIVEN;
-  memset(report, 0, sizeof *report);
-  for (long long done = 0; done < steps; done++) {
-    const long long k = back ? steps - 1 - done : done;
-    const step_data step = {t[k], h[k], q + k * M, p + k * M, carry, carry, parameters, workspace, 1, NULL};
-    linearised_step at = linearised_in(&step, workspace);
-    int status;
-    report->t = t[k];
-    status = linearise_step(&at, options ? options : &standard, q1 ? q1 + k * M : NULL, p1 ? p1 + k * M : NULL, report);
-    if (status == OK)
-      status = carry_over(&at, back, count, vectors + (k + back) * across, vectors + (k + !back) * across);
-    if (status != OK)
-      return status;
-    report->steps++;
-  }
-  return OK;
-}

@@ -112,7 +112,7 @@ static void add_response(const step_data *step, const held_step *now, const real
 }
 
 /* Velocities z that forces f lead to. */
-static void follow(const step_data *step, const held_step *now, const real *f, real *z)
+static void velocities_by(const step_data *step, const held_step *now, const real *f, real *z)
 {
   for (int i = 0; i < M; i++) {
     real sum[DEGREE] = {0}, low[DEGREE] = {0};
@@ -169,7 +169,7 @@ static int meet(const step_data *step, held_step *now, const newton_data *data, 
     movement moved;
     int met;
     all_forces(now, f);
-    follow(step, now, f, data->z);
+    velocities_by(step, now, f, data->z);
     places(step, data->z, change);
     for (int j = 0; j < M * DEGREE; j++)
       change[j] -= now->u[j];
@@ -234,7 +234,7 @@ static int arrive(const step_data *step, const held_step *now, const newton_data
   solve_held(data, value + M, 1, lambda);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
     dp[CONSTRAINT_ENTRY[e][1]] += weight * now->slope[e * B + DEGREE] * lambda[CONSTRAINT_ENTRY[e][0]];
-  follow(step, now, f, data->z);
+  velocities_by(step, now, f, data->z);
   for (int i = 0; i < M; i++)
     data->z[i * B + DEGREE] = (step->p0[i] + dp[i]) * now->inverse_mass[i];
   for (int k = 0; k < CONSTRAINTS; k++) {

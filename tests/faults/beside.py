@@ -202,6 +202,17 @@ C_TEXT = (
         r"flow\(0, at->v \+ GIVEN_H - 1, 1, at->v \+ GIVEN_H\);",
         "",
     ),
+    ("swept changes stretched by h once too little", "kepler/svi-3", "push_swept", r"2\.0 \* dh", "1.0 * dh"),
+    ("swept slopes by momenta without the drift", "kepler/svi-3", "pull_swept", r"v\[M \+ i\] \+= drift;", ""),
+    ("swept momenta that h does not change", "double/svi", "push_swept", r"dh \* at->E\[n\]\[i\]", "0 * dh"),
+    ("swept slopes by masses of the other sign", "double/svi", "given_back", r"part : -part", "part : part"),
+    (
+        "sweeps of changes that end early",
+        "kepler/svi-3",
+        "changes_rest",
+        r"<= LEFT_TO_COME \* before",
+        "<= 1e-14 * before",
+    ),
     ("a matrix not transposed", "double/svi", "solve_back", r"pivot, 1, at->x", "pivot, 0, at->x"),
     (
         "half of the last row",

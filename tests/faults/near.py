@@ -28,6 +28,11 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_deviations.py",
         "rendering/test_support.py",
     ),
+    **{
+        f"templates/support/{stem}": ("runtime/test_swept_derivatives.py", "runtime/test_sensitivity.py")
+        for stem in ("by_sweeps", "carry_by", "changes_at", "coupled_changes", "separable_changes", "one_by_one")
+    },
+    "scvi_codegen/lowering/swept": ("runtime/test_swept_derivatives.py",),
     "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
     "templates/support/flow": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
     "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),

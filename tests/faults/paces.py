@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from certified_cases import CONTROLLED, REVERSIBLE, case
-from faults import function, text
+from faults import function, here, text
+from sabotage import changed_result
 
+from scvi_codegen.lowering import derivatives as lowered_derivatives
 from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = ["PACES"]
@@ -22,6 +24,36 @@ PACES = (
         Integrator,
         "parameters_at",
         lambda original: lambda self, q, p, parameters=None: original(self, q, 1.01 * p, parameters),
+    ),
+    text(
+        "time held where h changes",
+        case("slowed/svi-3"),
+        r"flow\(back, time, weight \* rate, at->v \+ GIVEN_H\);",
+        "",
+        within="end_time",
+    ),
+    text(
+        "the slopes of the rate of time without the length of the step",
+        case("slowed/svi-3"),
+        r"step->h \* weight \* slope\[e\]",
+        "weight * slope[e]",
+        within="end_time",
+    ),
+    text(
+        "time that has no slopes by positions on the way back",
+        case("slowed/svi-3"),
+        r"\n  if \(back\)\n    arguments_wide",
+        "\n  if (0)\n    arguments_wide",
+        within="end_time",
+    ),
+    here(
+        "the energy of the start that falls with the momentum",
+        case("slowed/svi-3"),
+        lowered_derivatives,
+        "_level_slopes",
+        changed_result(
+            lambda kernel: replace(kernel, results=(*kernel.results[:2], *kernel.results[:1], *kernel.results[3:]))
+        ),
     ),
     text("a step allowed ten thousand times the error", TO_NINE_DIGITS, r"\(tolerance, 1 /", "(1e4 * tolerance, 1 /"),
     text("stages of chosen steps not solved", TO_NINE_DIGITS, r"REAL\(0.00390625\)", "REAL(1e10)"),

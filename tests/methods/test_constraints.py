@@ -1,5 +1,6 @@
 """Holonomic constraints: orders against minimal coordinates, what is kept, and what keeps it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -223,6 +224,43 @@ def test_initial_states_are_projected_or_refused():
     with pytest.warns(AccuracyWarning, match=r"moved to the nearest"):
         moved = Ensemble(stepper, [[1.061, -1.061]], [[0.0, 0.0]], h=0.1, steps=1)
     assert np.abs(stepper.constraint_values(moved.q[0], moved.p[0])).max() < 1e-15
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e-3])
+def test_what_is_off_the_constraints_is_so_in_any_units(unit):
+    """A slide in metres, an angle in radians: how far they are off is told, and refused, whatever the metre is."""
+
+    def crank(metre):
+        slide = LagrangianSystem.from_text(
+            name="crank",
+            coordinates=["x", "a"],
+            lagrangian="2*l**2*x_dot**2/2 + a_dot**2/2 + x_dot*l/5 - cos(a)",
+            parameters={"l": metre},
+            constraints=["l*x = sin(a)"],
+        )
+        return compile_stepper(slide, lobatto(2))
+
+    plain, scaled = crank(1.0), crank(unit)
+    for slide, angle, rate, said in (
+        (0.3, np.arcsin(0.3) + 2e-4, 0.5, None),
+        (0.3, np.arcsin(0.3), 0.501, None),
+        (1e-3, 1.002e-3, 0.5, None),
+        (0.3, 0.36, 0.5, StateError),
+    ):
+        q = np.array([slide, angle])
+        p = plain.momentum(q, [0.5 * np.cos(angle), rate])
+        other = q / [unit, 1.0], p * [unit, 1.0]
+        found = []
+        for stepper, start in ((plain, (q, p)), (scaled, other)):
+            if said:
+                with pytest.raises(said, match="off the constraints") as told:
+                    stepper.integrate(*start, h=0.1, steps=1)
+            else:
+                with pytest.warns(AccuracyWarning, match="off the constraints") as warned:
+                    stepper.integrate(*start, h=0.1, steps=1)
+                told = warned[0].message
+            found.append(re.search(r"is (\S+) \(relative\)", str(getattr(told, "value", told))).group(1))
+        assert found[0] == found[1]
 
 
 def test_parts_of_steps_events_and_chosen_steps():

@@ -449,3 +449,14 @@ def test_a_text_that_is_refused_leaves_nothing_in_the_cache(cache):
 def test_nothing_is_printed(capfd):
     answer()
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_passes_of_gcc_are_left_out_of_what_other_compilers_are_asked(compiler, monkeypatch):
+    """Of text that is cut into functions, as large systems are: clang refuses what it does not know."""
+    if not shutil.which(compiler):
+        pytest.skip(f"needs {compiler}")
+    monkeypatch.setenv("CC", compiler)
+    cut = source('#include "support/parts.h"\ndouble tiny_answer(void)\n{\n  return 42.0;\n}\n')
+    cut = replace(cut, support=(("support/parts.h", "/* nothing */\n"),))
+    assert building.load(cut, flags=("-O3",)).lib.tiny_answer() == 42.0

@@ -3,7 +3,7 @@
 import subprocess
 
 import pytest
-from samples import damped_pendulum, linkage, pumped_cart_pole, two_rods
+from samples import damped_pendulum, linkage, pumped_cart_pole, pushed_pendulum, two_rods
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, Gauss, hamiltonian_of, problem, reparametrise
@@ -20,6 +20,9 @@ CASES = {
     "damped": (damped_pendulum(), SVI(2)),
     "rods": (two_rods(), SVI(1, "gauss-lobatto:2")),
     "double": (problem("double-pendulum").system, SCVI(2)),
+    "swept": (problem("kepler").system, SVI(4)),
+    "swept, coupled": (problem("double-pendulum").system, SVI(2)),
+    "swept, pushed": (pushed_pendulum(), Gauss(3)),
     "clock": (reparametrise(problem("kepler").system, "frequency"), SVI(2)),
     "clock of momenta": (reparametrise(hamiltonian_of(problem("kepler").system), "arclength"), Gauss(2)),
 }
@@ -33,7 +36,7 @@ def test_compiles_without_a_warning(name, second, compiler, tmp_path):
     system, method = CASES[name]
     if second and system.clock:
         pytest.skip("there are no second derivatives in transformed time")
-    program = program_of(system, method, solver="newton")
+    program = program_of(system, method, solver="auto" if name.startswith("swept") else "newton")
     derivatives = derivatives_of(system, discretise(system, method), program, second=second)
     source = render_derivatives(derivatives).amalgamated()
     (tmp_path / f"{source.prefix}.h").write_text(source.header)

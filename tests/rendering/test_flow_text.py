@@ -3,7 +3,7 @@
 import subprocess
 
 import pytest
-from samples import linkage, pumped_cart_pole
+from samples import linkage, pumped_cart_pole, two_rods
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet, compile_stepper, problem
@@ -18,6 +18,7 @@ CASES = {
     "collocation": (problem("planar-pendulum").system, SpectralCollocation(3)),
     "vortices": (problem("point-vortices").system, SVI(2)),
     "gauss": (problem("henon-heiles").system, Gauss(2)),
+    "rods": (two_rods(), SVI(1, "gauss-lobatto:2")),
     "leapfrog": (problem("henon-heiles").system, StoermerVerlet()),
 }
 

@@ -1,0 +1,106 @@
+"""What the forces and momenta of a step by sweeps depend on at its points: kernels, so that changes are swept, too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from sympy import Add, Expr, Mul, S, Symbol
+
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.ir.derivatives import GivenSlopes, SweptSlopes
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.mechanics.forms import Entries, forms_of
+from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+
+__all__ = ["swept_slopes"]
+
+MOST_SLOPES = 4096
+"""At a point, of which a step keeps those of all on the stack: a quarter of a megabyte of vectors."""
+NOTHING: Entries = {(0, 0): S.Zero}
+"""In place of no entries: C has no empty arrays."""
+
+
+def swept_slopes(system: MechanicalSystem, sweep: Sweep) -> SweptSlopes | None:
+    """Of a system whose steps the sweep solves; ``None`` where it does not carry changes, or there are too many."""
+    twin, make = lagrangian_twin(system), MAKERS.get(sweep.changes_part)
+    found = make(twin) if twin and make else None
+    return found if found and found.count + len(found.given.entries) <= MOST_SLOPES else None
+
+
+def _separable(system: LagrangianSystem) -> SweptSlopes:
+    """By the slopes of forces at u = q; and those of constant masses by parameters."""
+    forms, q = forms_of(system), tuple(system.coordinates)
+    slopes = jacobian(forms.force, q) or NOTHING
+    different = tuple(dict.fromkeys(slopes.values()))
+    masses = jacobian(tuple(forms.mass.values()), system.parameters)
+    purpose = "Slopes of the constant masses by parameters."
+    kernel = system_kernel(system, "mass_by_given", masses.values(), of=(), purpose=purpose)
+    return SweptSlopes(
+        slopes=system_kernel(system, "point_slopes", different, of=q, purpose="L_qq at all points, each value once."),
+        beside=0,
+        products=_products(system, slopes, different, size=len(q)),
+        given=_by_given(system, forms.force, q),
+        masses=GivenSlopes(entries=tuple(masses), kernel=kernel) if masses else None,
+    )
+
+
+def _coupled(system: LagrangianSystem) -> SweptSlopes:
+    """By the slopes of (L_q, -L_v) at u = (q, v), those of L_v by v apart: these are the mass."""
+    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    m = system.dimension
+    slopes = jacobian(forms.force, of)
+    by_position = jacobian(forms.momentum, system.coordinates)
+    slopes |= {(m + i, j): Mul(S.NegativeOne, value) for (i, j), value in by_position.items()}
+    slopes = slopes or NOTHING
+    different = tuple(dict.fromkeys(slopes.values()))
+    at_points = system_kernel(
+        system,
+        "point_slopes",
+        (*forms.momentum, *different),
+        of=of,
+        slopes=forms.lower_mass.values(),
+        purpose="L_v, what L_qq, L_qv and -L_vq have, each value once, and the lower triangle of L_vv at all points.",
+    )
+    return SweptSlopes(
+        slopes=at_points,
+        beside=m,
+        products=_products(system, slopes, different, size=2 * m),
+        given=_by_given(system, (*forms.force, *forms.momentum), of),
+    )
+
+
+MAKERS: dict[str, Callable[[LagrangianSystem], SweptSlopes]] = {
+    "separable_changes": _separable,
+    "coupled_changes": _coupled,
+}
+
+
+def _by_given(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Symbol]) -> GivenSlopes:
+    entries = jacobian(results, (*system.parameters, system.time)) or NOTHING
+    purpose = "What these have by parameters and time, at all points."
+    kernel = system_kernel(system, "given_slopes", entries.values(), of=of, purpose=purpose)
+    return GivenSlopes(entries=tuple(entries), kernel=kernel)
+
+
+def _products(
+    system: LagrangianSystem, slopes: Entries, different: tuple[Expr, ...], *, size: int
+) -> tuple[Kernel, Kernel]:
+    """The matrix of slopes, by their different values, times x, and its transpose; one kernel if they are the same."""
+    number = {value: k for k, value in enumerate(different)}
+    x = [Symbol(f"x[{i}]", real=True) for i in range(size)]
+    values = [Symbol(f"slope[{k}]", real=True) for k in range(len(different))]
+    back = {(j, i): value for (i, j), value in slopes.items()}
+
+    def product(name: str, matrix: Entries, purpose: str) -> Kernel:
+        rows: list[list[Expr]] = [[] for _ in x]
+        for (i, j), value in matrix.items():
+            rows[i].append(Mul(values[number[value]], x[j]))
+        return system_kernel(system, name, [Add(*row) for row in rows], of=(*x, *values), purpose=purpose)
+
+    forward = product("by_slopes", slopes, "The matrix of slopes times x, u = (x, its values).")
+    turned = product("by_slopes_back", back, "Its transpose times x.") if back != slopes else forward
+    return forward, turned

@@ -1,0 +1,125 @@
+"""The derivative of a compiled step in transformed time, by all it starts from, also of the time it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.exact.motion import exact_motion
+from scvi_codegen.exact.step import compiled_equations
+from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.tables.precision import mp
+from scvi_codegen.verification.certificate import Check, Finding, checked
+from scvi_codegen.verification.derivatives import BOUND, WIDTH
+from scvi_codegen.verification.pace import Pace
+from scvi_codegen.verification.subject import State
+
+__all__ = ["clock_derivative_checks"]
+
+Array = NDArray[np.float64]
+
+ROUGHNESS = 1e-12
+"""Of areas: what is left by the rounding of a derivative that is exact."""
+
+
+def clock_derivative_checks(pace: Pace) -> Iterator[Check]:
+    """Along one direction in which nothing stands still, the energy among it, as far as there are derivatives."""
+    promise = "a step of tau and its time change by all they start from as the equations do (differences in 60 digits)"
+    yield from checked("derivatives in tau", promise, partial(_derivative, pace))
+    promise = "the energy on whose level steps are taken changes with the start as its formula does (60 digits)"
+    yield from checked("level", promise, partial(_level, pace))
+    yield from checked("adjoint in tau", "the transposed derivative is that, times included", partial(_transpose, pace))
+    if is_symplectic(pace.subject.method, pace.transformed) and not pace.transformed.constraints:
+        promise = "J^T Omega J = Omega, J the compiled derivative of a step of tau at an energy that is given"
+        yield from checked("symplecticity in tau", promise, partial(_symplecticity, pace))
+
+
+def _derivative(pace: Pace) -> Finding:
+    """The change of the end and of its time, the energy given and changed like all else."""
+    state, direction = _first(pace), _direction(pace)
+    told, scales = pace.stepper.told, np.append(pace.subject.scales(state), state.h)
+    found = _carried(pace, direction, back=False)[told]
+    ends = [_end(pace, direction * (sign * WIDTH)) for sign in (1, -1)]
+    exact = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
+    apart = np.abs((found - exact) / scales).max() / np.abs(exact / scales).max()
+    return Finding(float(apart), BOUND, "relative, along one direction")
+
+
+def _level(pace: Pace) -> Finding:
+    """Of the energy of the state, beside the largest term of its change."""
+    state, direction, m = _first(pace), _direction(pace), len(_first(pace).q)
+    values = np.array(list(pace.at_level(state).values()))
+    terms = pace.stepper.level(state.q, state.p, values) * direction
+    motion, own = exact_motion(pace.system), len(pace.system.parameters)
+    energies = []
+    for sign in (1, -1):
+        moved = _given(pace) + direction * (sign * WIDTH)
+        at = motion.with_parameters(moved[2 * m : 2 * m + own].tolist())
+        energies.append(at.energy(moved[:m], moved[m : 2 * m], mp.zero))
+    exact = float((energies[0] - energies[1]) / (2 * WIDTH))
+    return Finding(abs(float(terms.sum()) - exact) / float(np.abs(terms).max()), BOUND, "relative, along one direction")
+
+
+def _transpose(pace: Pace) -> Finding:
+    """(J v, w) - (v, J^T w), w weighing all parts of the end alike."""
+    v = _direction(pace)
+    w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
+    forward, back = (_carried(pace, vector, back=which) for vector, which in ((v, False), (w, True)))
+    size = max(np.abs(forward * w).max(), np.abs(v * back).max())
+    return Finding(float(abs(forward @ w - v @ back) / size), BOUND, "relative, along one direction")
+
+
+def _symplecticity(pace: Pace) -> Finding:
+    """In units of the areas of pairs of coordinates."""
+    state = _first(pace)
+    parameters, scales, m = pace.at_level(state), pace.subject.scales(state), len(state.q)
+    J = pace.stepper.jacobian(state.q, state.p, state.h, state.t, parameters) * scales / scales[:, np.newaxis]
+    omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scales, scales)
+    areas = np.tile(scales[:m] * scales[m:], 2)
+    largest = float(np.abs(J).max()) ** 2
+    defect = float((np.abs(J.T @ omega @ J - omega) / np.sqrt(np.outer(areas, areas))).max())
+    return Finding(defect / largest, ROUGHNESS, "in units of the areas of coordinates")
+
+
+def _first(pace: Pace) -> State:
+    return pace.subject.states[0]
+
+
+def _direction(pace: Pace) -> Array:
+    """Of (q, p, parameters, energy, t, h), each in parts of its size."""
+    state = _first(pace)
+    values = np.array(list(pace.at_level(state).values()))
+    sizes = np.concatenate([pace.subject.scales(state), np.where(values, values, 1.0), [state.h, state.h]])
+    direction: Array = sizes * (1.5 + np.sin(1.0 + 1.7 * np.arange(len(sizes))))
+    return direction
+
+
+def _carried(pace: Pace, vector: Array, *, back: bool) -> Array:
+    """What the compiled derivative at the energy of the state, or its transpose, makes of a vector."""
+    state = _first(pace)
+    starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
+    vectors = np.zeros((2, 1, len(vector)))
+    vectors[int(back)] = vector
+    values = np.array(list(pace.at_level(state).values()))
+    pace.stepper.linearise(starts, vectors, values, None, back=back)
+    carried: Array = vectors[int(not back), 0]
+    return carried
+
+
+def _given(pace: Pace) -> Array:
+    state = _first(pace)
+    values = (*state.z, *pace.at_level(state).values(), state.t, state.h)
+    return np.array([mp.mpf(float(x)) for x in values], dtype=object)
+
+
+def _end(pace: Pace, change: Array) -> Array:
+    """(2m + 1,) where a step leads and when, from what is given, changed, in 60 digits."""
+    m, moved = len(_first(pace).q), (_given(pace) + change).tolist()
+    step = compiled_equations(pace.transformed, pace.subject.method).with_parameters(moved[2 * m : -2])
+    q, p, h = moved[:m], moved[m : 2 * m], moved[-1]
+    end = step(q, p, h)
+    return np.array([*end.q, *end.p, moved[-2] + step.duration(end, q, p, h)], dtype=object)

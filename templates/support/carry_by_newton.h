@@ -1,0 +1,47 @@
+/* Vectors over steps whose equations Newton's iteration solves. Before it: push_and_pull.h. */
+
+/* Steps and what is carried over them: vectors (steps + 1, count, GIVEN). */
+typedef struct {
+  const real *t, *h, *q, *p, *parameters;
+  const solver_options *options;
+  int back, count;
+  real *vectors, *q1, *p1, *workspace;
+  solver_report *report;
+  long long guess; /* from how many steps the next is continued, where there are sweeps */
+  int look; /* and which sweep of these changes is the first to be looked at */
+} carriage;
+
+static step_data step_of(const carriage *over, long long k, const real *nothing)
+{
+  const step_data step = {over->t[k], over->h[k], over->q + k * M, over->p + k * M, nothing, nothing, over->parameters,
+      over->workspace, 1, NULL};
+  return step;
+}
+
+/* What is carried to step k, and where to. */
+static const real *vectors_from(const carriage *over, long long k)
+{
+  return over->vectors + (k + over->back) * over->count * GIVEN;
+}
+
+static real *vectors_to(const carriage *over, long long k)
+{
+  return over->vectors + (k + !over->back) * over->count * GIVEN;
+}
+
+/* The vectors from number `first` on over step k. */
+static int carry_by_newton(carriage *over, long long k, int first)
+{
+  const real nothing[M] = {0};
+  const step_data step = step_of(over, k, nothing);
+  linearised_step at = linearised_in(&step, over->workspace);
+  int status;
+  over->report->t = step.t;
+  status = linearise_step(&at, over->options, over->q1 ? over->q1 + k * M : NULL, over->q1 ? over->p1 + k * M : NULL,
+      over->report);
+  over->guess = 0;
+  if (status == OK)
+    status = carry_over(&at, over->back, over->count - first, vectors_from(over, k) + first * GIVEN,
+        vectors_to(over, k) + first * GIVEN);
+  return status;
+}

@@ -1,0 +1,230 @@
+/* How a step by separable_sweep.h changes with what it starts from, and the transpose, by sweeps again. With D = X -
+ * q0, the slopes K = F_q at the points, s = h^2 / m and P the table PRODUCT, the changes x of the points and the
+ * slopes y of a number by the forces are the fixed points of
+ *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
+ * whose rate of contraction is that of the step itself. All are exact: those of the map which the equations define.
+ * Before it: separable_sweep.h, changes_at_rest.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes,
+ * BY_SLOPES_BACK, POINT_GIVEN and given_slopes, MASS_GIVEN and mass_by_given. */
+
+enum {
+  KEPT_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
+  GIVEN_T = GIVEN - 2
+};
+
+/* A solved step: how its points stand from q0, the increments, the slopes of its forces behind room
+ * for M changes. */
+typedef struct {
+  const step_data *step;
+  const sweep_data *data;
+  const double *dq, *dp;
+  double scale[M], mass[M];
+#ifdef MASSES_GIVEN
+  double mass_slope[MASS_SLOPES];
+#endif
+  lanes D[GROUPS][M], u[GROUPS][M + POINT_SLOPES], given[GROUPS][GIVEN_SLOPES];
+} swept_step;
+
+/* What is told of a step from its increments and the forces it keeps. */
+static void keep_step(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
+    const double *dp, double *to)
+{
+  lanes F[GROUPS][M], D[GROUPS][M];
+  lanes_load(memory, F);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      D[n][i] = DRIFT[n] * (step->h * (data->inverse_mass[i] * step->p0[i])) +
+          (data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i);
+  lanes_store(D, to);
+  memcpy(to + M * POINTS, dq, sizeof(double) * M);
+  memcpy(to + M * (POINTS + 1), dp, sizeof(double) * M);
+}
+
+static __attribute__((noinline)) void slopes_of_step(const step_data *step, const sweep_data *data,
+    const double *told, swept_step *at)
+{
+  lanes X[GROUPS][M];
+  at->step = step;
+  at->data = data;
+  at->dq = told + M * POINTS;
+  at->dp = at->dq + M;
+  lanes_load(told, at->D);
+  for (int i = 0; i < M; i++) {
+    at->scale[i] = data->square * data->inverse_mass[i];
+    at->mass[i] = fabs(1.0 / data->inverse_mass[i]);
+  }
+  for (int n = 0; n < GROUPS; n++) {
+    const lanes t = step->t + step->h * ABSCISSA[n];
+    for (int i = 0; i < M; i++)
+      X[n][i] = step->q0[i] + at->D[n][i];
+    point_slopes(X[n], t, step->parameters, at->u[n] + M);
+    given_slopes(X[n], t, step->parameters, at->given[n]);
+  }
+#ifdef MASSES_GIVEN
+  mass_by_given(NULL, step->t, step->parameters, at->mass_slope);
+#endif
+}
+
+/* f = K x, or back: K^T x. */
+static inline void through_slopes(swept_step *at, int back, lanes (*f)[M])
+{
+  const step_data *step = at->step;
+  for (int n = 0; n < GROUPS; n++)
+    (back ? BY_SLOPES_BACK : by_slopes)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
+}
+
+/* The next x, whose first part is x0. */
+static inline lanes next_change(const swept_step *at, const lanes *table, lanes (*x0)[M], lanes (*f)[M], int n, int i)
+{
+  return x0[n][i] + at->scale[i] * apply(table, n, f, i);
+}
+
+/* The x in u, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies:
+ * whatever the units of coordinates. */
+static inline int settle(swept_step *at, int back, lanes (*f)[M], int *look)
+{
+  const lanes *table = back ? PRODUCT_BACK : PRODUCT;
+  lanes(*x)[M + POINT_SLOPES] = at->u, x0[GROUPS][M];
+  double last = INFINITY;
+  int status = 0;
+  for (int n = 0; n < GROUPS; n++)
+    memcpy(x0[n], x[n], sizeof x0[n]);
+  through_slopes(at, back, f);
+  for (int k = 0; status == 0; k++) {
+    if (k < *look) {
+      for (int i = 0; i < M; i++)
+        for (int n = 0; n < GROUPS; n++)
+          x[n][i] = next_change(at, table, x0, f, n, i);
+    } else {
+      lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}};
+      for (int i = 0; i < M; i++)
+        for (int n = 0; n < GROUPS; n++) {
+          const lanes next = next_change(at, table, x0, f, n, i), change = next - x[n][i];
+          moved[n] += at->mass[i] * (change * change);
+          size[n] += at->mass[i] * (next * next);
+          x[n][i] = next;
+        }
+      status = changes_rest(points_total(moved), points_total(size), &last, k, look);
+    }
+    through_slopes(at, back, f);
+  }
+  return status == 1 ? OK : NOT_CONVERGED;
+}
+
+/* How much the masses change. */
+static inline void masses_changed(swept_step *at, const double *v, double *dm)
+{
+  memset(dm, 0, sizeof(double) * M);
+#ifdef MASSES_GIVEN
+  for (int e = 0; e < MASS_SLOPES; e++)
+    dm[MASS_GIVEN[e][0]] += at->mass_slope[e] * v[2 * M + MASS_GIVEN[e][1]];
+#else
+  (void)at, (void)v;
+#endif
+}
+
+/* The changes of forces, points held. */
+static inline void forces_changed(swept_step *at, const double *v, lanes (*F)[M])
+{
+  memset(F, 0, sizeof(lanes) * GROUPS * M);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < GIVEN_SLOPES; e++) {
+      const int from = 2 * M + POINT_GIVEN[e][1];
+      const lanes by = from == GIVEN_T ? v[GIVEN_T] + v[GIVEN_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
+      F[n][POINT_GIVEN[e][0]] += at->given[n][e] * by;
+    }
+}
+
+/* Whether q0 and p0 alone change. */
+static inline int is_of_state(const double *v)
+{
+  int none = 1;
+  for (int j = 2 * M; j < GIVEN; j++)
+    none &= v[j] == 0.0;
+  return none;
+}
+
+/* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
+static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *look)
+{
+  const sweep_data *data = at->data;
+  const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
+  const int of_state = is_of_state(v);
+  double dm[M];
+  lanes f[GROUPS][M], F[GROUPS][M];
+  masses_changed(at, v, dm);
+  forces_changed(at, v, F);
+  for (int i = 0; i < M; i++) {
+    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
+    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
+    for (int n = 0; n < GROUPS; n++)
+      at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i];
+    for (int n = 0; !of_state && n < GROUPS; n++)
+      at->u[n][i] += at->scale[i] * apply(PRODUCT, n, F, i);
+  }
+  if (settle(at, 0, f, look) != OK)
+    return NOT_CONVERGED;
+  for (int i = 0; i < M; i++) {
+    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
+    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
+    for (int n = 0; n < GROUPS; n++)
+      F[n][i] += f[n][i];
+    v[i] += drift + by_length * at->dq[i] + at->scale[i] * weigh(POINT_END_POSITION, F, i);
+    v[M + i] += dh * at->dp[i] + weigh(data->kick, F, i);
+  }
+  v[GIVEN_T] += v[GIVEN_T + 1];
+  return OK;
+}
+
+/* What slopes by the forces, in u, come to, by what else these depend on: added to v. */
+static inline void given_back(swept_step *at, double *v)
+{
+  lanes by[GIVEN - 2 * M][GROUPS];
+  memset(by, 0, sizeof by);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < GIVEN_SLOPES; e++) {
+      const int to = POINT_GIVEN[e][1];
+      const lanes part = at->given[n][e] * at->u[n][POINT_GIVEN[e][0]];
+      by[to][n] += part;
+      if (to == GIVEN_T - 2 * M)
+        by[to + 1][n] += ABSCISSA[n] * part;
+    }
+  for (int j = 0; j < GIVEN - 2 * M; j++)
+    v[2 * M + j] += points_total(by[j]);
+}
+
+/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
+static __attribute__((noinline)) int pull_swept(swept_step *at, double *v, int *look)
+{
+  const sweep_data *data = at->data;
+  const double h = at->step->h;
+  double by_length[M], by_h = 0.0;
+  lanes f[GROUPS][M];
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      at->u[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
+  if (settle(at, 1, f, look) != OK)
+    return NOT_CONVERGED;
+  v[GIVEN_T + 1] += v[GIVEN_T];
+  given_back(at, v);
+  for (int i = 0; i < M; i++) {
+    lanes part[GROUPS], turned[GROUPS], drifted[GROUPS];
+    for (int n = 0; n < GROUPS; n++) {
+      part[n] = f[n][i];
+      turned[n] = f[n][i] * at->D[n][i];
+      drifted[n] = f[n][i] * DRIFT[n];
+    }
+    const double drift = h * data->inverse_mass[i] * (v[i] + points_total(drifted));
+    by_length[i] = v[i] * at->dq[i] + points_total(turned);
+    by_h += 2.0 * by_length[i] - drift * at->step->p0[i] + v[M + i] * at->dp[i];
+    v[i] += points_total(part);
+    v[M + i] += drift;
+  }
+  v[GIVEN_T + 1] += by_h / h;
+#ifdef MASSES_GIVEN
+  for (int e = 0; e < MASS_SLOPES; e++) {
+    const int i = MASS_GIVEN[e][0];
+    v[2 * M + MASS_GIVEN[e][1]] -= data->inverse_mass[i] * at->mass_slope[e] * by_length[i];
+  }
+#endif
+  return OK;
+}

@@ -1,0 +1,109 @@
+"""Derivatives that sweeps carry, beside those of Newton's factors: the same equations, solved in two ways."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from samples import sweep, tangle
+
+from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
+from scvi_codegen.lowering import swept_slopes
+
+WHIRL = LagrangianSystem.from_text(
+    name="whirl in a moving trap",
+    coordinates=["x", "y"],
+    lagrangian="m*x_dot**2/2 + (m + n)*y_dot**2/2 - k*(x**2 + y**4/2)*(1 + cos(w*t)/3)",
+    forces={"x": "-c*y*x", "y": "c*x + sin(t)*y"},
+    parameters={"m": 1.2, "n": 0.4, "k": 0.8, "w": 1.1, "c": 0.3},
+)
+"""Forces without a potential, masses that are parameters, time."""
+
+RUBBED = LagrangianSystem.from_text(
+    name="rubbed pendulum on a cart",
+    coordinates=["x", "a"],
+    lagrangian="m*x_dot**2/2 + x_dot*a_dot*cos(a) + a_dot**2/2 - (1 + cos(t)/3)*x**2 + cos(a)",
+    forces={"x": "-r*x_dot*(1 + a**2)", "a": "r*x*x_dot - a_dot*r/2"},
+    parameters={"m": 2.0, "r": 0.4},
+)
+"""Forces of velocities, so that no matrix of slopes is symmetric."""
+
+CASES = {
+    "whirl": (WHIRL, SVI(2, "gauss-lobatto:5"), 0.2),
+    "chain": (problem("fput-chain:10").system, Gauss(2), 0.2),
+    "tangle": (tangle(), SVI(2), 0.02),
+    "rubbed": (RUBBED, SVI(5), 0.1),
+}
+STEPS = 70
+"""More than are solved before vectors are carried over them."""
+
+
+def numbers_of(gradient):
+    return np.concatenate([gradient.q, gradient.p, gradient.parameters, [gradient.t, gradient.h]])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_sweeps_carry_what_factors_do(name):
+    """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
+    system, method, h = CASES[name]
+    swept, factored = (compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
+    assert "by_sweeps.h" in swept.derivatives.code
+    assert "by_sweeps.h" not in factored.derivatives.code
+    random, m = np.random.default_rng(20261122), swept.dimension
+    q = np.array([0.9, -0.4, 0.1, 0.6, -0.8, 0.2, 0.5, -0.3, 0.4, 0.7])[:m]
+    p = swept.momentum(q, random.uniform(-0.4, 0.4, m) + (np.arange(m) == 1))
+    directions = random.normal(size=(swept.given, 9))
+    slopes = random.normal(size=(STEPS + 1, 2 * m, 2))
+    found = []
+    for stepper in (swept, factored):
+        run = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3)
+        some = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3, every=35)
+        gradient, other = run.pullback(slopes), some.pullback(slopes[::35])
+        step = stepper.sensitivity(q, p, h, 0.3)
+        columns = (step.state, step.parameters, step.t[:, np.newaxis], step.h[:, np.newaxis])
+        found.append((np.hstack(columns), run.tangent(directions)[-1], numbers_of(gradient), numbers_of(other)))
+    for one, other in zip(*found, strict=True):
+        assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
+
+
+def test_steps_that_sweeps_do_not_solve_are_carried_over_by_factors():
+    """A spring that is too stiff for sweeps now and then."""
+    spring = LagrangianSystem.from_text(
+        name="spring that stiffens",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - (1 + k*sin(t/4)**8)*x**2/2",
+        parameters={"k": 900.0},
+    )
+    steppers = {solver: compile_stepper(spring, SVI(2), solver=solver) for solver in ("auto", "newton", "fixed-point")}
+    runs = [steppers[solver].integrate([1.0], [0.0], h=0.25, steps=STEPS) for solver in ("auto", "newton")]
+    one, other = (run.sensitivity() for run in runs)
+    assert_allclose(one.state, other.state, rtol=0, atol=1e-12 * np.abs(other.state).max())
+    assert_allclose(one.parameters, other.parameters, rtol=0, atol=1e-12 * np.abs(other.parameters).max())
+    back = [numbers_of(run.pullback(np.ones((STEPS + 1, 2)))) for run in runs]
+    assert_allclose(*back, rtol=0, atol=1e-12 * np.abs(back[1]).max())
+    with pytest.raises(StepFailedError):
+        steppers["fixed-point"].integrate([1.0], [0.0], h=0.25, steps=STEPS)
+
+
+def test_slopes_that_are_too_many_for_the_stack_are_left_to_factors(monkeypatch):
+    system = problem("kepler").system
+    found = sweep(system, SVI(2))
+    slopes = swept_slopes.swept_slopes(system, found)
+    assert slopes is not None
+    monkeypatch.setattr(swept_slopes, "MOST_SLOPES", slopes.count + len(slopes.given.entries) - 1)
+    assert swept_slopes.swept_slopes(system, found) is None
+
+
+def test_units_of_coordinates_do_not_tell_when_sweeps_end():
+    """A stiff coordinate, in units a million times as small or large: the same derivative, entry by entry."""
+    text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + 36*{a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
+    derivatives = []
+    for unit in ("1", "1000000", "1/1000000"):
+        system = LagrangianSystem.from_text(
+            name="two units", coordinates=["x", "y"], lagrangian=text.format(a=f"({unit})")
+        )
+        a = {"1": 1.0, "1000000": 1e6, "1/1000000": 1e-6}[unit]
+        scale = np.array([1.0, a, 1.0, 1.0 / a])
+        stepper = compile_stepper(system, SVI(4))
+        matrix = stepper.jacobian([0.3, 0.2 / a], [0.4, 0.1 * a], 0.2)
+        derivatives.append(scale[:, np.newaxis] * matrix / scale)
+    for other in derivatives[1:]:
+        assert_allclose(other, derivatives[0], rtol=1e-14)
