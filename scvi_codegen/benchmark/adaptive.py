@@ -125,7 +125,7 @@ def _by_so_many(stepper: Stepper, span: float, count: int, q: Array, p: Array) -
     run = stepper.start(q, p, h=span / count)
 
     def integrate() -> Array:
-        run.skip(count)
+        run.advance(count)
         return run.q
 
     return integrate

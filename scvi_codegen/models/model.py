@@ -159,6 +159,16 @@ class Model:
             raise ModelFileError("the reversible controller chooses how long steps are: leave it out for this")
         return self.h
 
+    def first_step(self, stepper: Stepper) -> float:
+        """The step h; where steps choose their length, that of the first one, of tau in transformed time."""
+        if self.h is not None and self.monitor is None:
+            return self.h
+        run = self.start(stepper)
+        if self.system.clock is not None:
+            return run.h
+        run.advance(1)
+        return run.t - self.t
+
     @property
     def covered(self) -> float:
         """The span of time, negative for a run backward."""

@@ -34,10 +34,15 @@ def here(name: str, where: Case, home: Any, attribute: str, make: Make) -> Mutat
     return Mutation(name, where, lambda sabotage: sabotage.replace_here(home, attribute, make))
 
 
+def inside(function: str, pattern: str) -> str:
+    """The first place with a pattern after the head of a function; what stands before it is a group."""
+    return rf"(\b{function}\([^;{{]*\)\n\{{\n(?:.*\n)*?.*?){pattern}"
+
+
 def text(name: str, where: Case, pattern: str, replacement: str, *, within: str = "") -> Mutation:
     """An edit of the C text, the first place after the head of the function ``within``."""
     if within:
-        pattern, replacement = rf"(\b{within}\([^;{{]*\)\n\{{\n(?:.*\n)*?.*?){pattern}", rf"\g<1>{replacement}"
+        pattern, replacement = inside(within, pattern), rf"\g<1>{replacement}"
     return Mutation(name, where, lambda sabotage: sabotage.edit(pattern, replacement), edits_text=True)
 
 

@@ -118,7 +118,7 @@ MUTATIONS = (
         case("kepler/svi-3"),
         arithmetic,
         "INVERSE_ROOTS",
-        lambda own: {**own, sympy.Integer(-3): "inverse_root_5"},
+        lambda own: {**own, 3: "inverse_root_5"},
     ),
     function(
         "a power of h too much in a gather",

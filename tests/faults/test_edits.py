@@ -37,6 +37,7 @@ def test_edits_find_their_text() -> None:
         if (ROOT / edit["file"]).read_text("utf-8").count(edit["old"]) != 1
     ]
     assert lost == []
+    assert [edit["name"] for edit in EDITS if not (ROOT / "tests" / edit["test"].split("::")[0]).exists()] == []
 
 
 def test_what_random_faults_are_shown_to_is_there() -> None:

@@ -23,7 +23,7 @@ STEPS = 100
 ROUNDING = 0.02
 EXPECTED = {
     ("kepler/svi-3", "fixed-point"): {1: 223, 8: 201, 64: 183},
-    ("cart/svi", "fixed-point"): {1: 812, 8: 426, 64: 303},
+    ("cart/svi", "fixed-point"): {1: 457, 8: 299, 64: 202},
     ("field/gauss", "fixed-point"): {1: 980, 8: 451, 64: 303},
     ("tangle/scvi", "fixed-point"): {1: 1090, 8: 563, 64: 401},
     ("tangle/sc", "fixed-point"): {1: 969, 8: 430, 64: 203},

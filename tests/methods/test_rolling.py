@@ -173,7 +173,7 @@ def test_what_is_refused():
     with pytest.raises(MethodError, match="no polynomials"):
         compile_stepper(sleigh(), SVI(3, "gauss-lobatto:4", space="trigonometric:0.5"))
     stepper = compile_stepper(sleigh(), lobatto(2))
-    with pytest.raises(StateError, match=r"the rate of x_dot\*sin\(a\) - y_dot\*cos\(a\) is"):
+    with pytest.raises(StateError, match=r"x_dot\*sin\(a\) - y_dot\*cos\(a\) is [-\d.]+, not 0"):
         stepper.integrate([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0], h=0.1, steps=1)
     q, p = stepper.project([0.0, 0.0, 0.5], velocity=[1.0, 1.0, 0.0])
     assert np.abs(stepper.constraint_values(q, p)[1]).max() < 1e-15

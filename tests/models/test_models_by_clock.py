@@ -85,6 +85,23 @@ def test_the_command_line_finds_a_step_and_tells_when_it_does_not_serve() -> Non
     assert "Error" in invoke("run", "kepler", *far, "--tolerance", "1e-10", status=1)
 
 
+@pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
+@pytest.mark.parametrize("system", [{}, {"monitor": "frequency"}], ids=["t", "tau"])
+def test_what_takes_one_step_takes_the_first_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:
+    """As certificates do: of tau in transformed time."""
+    model = catalogue_model("kepler", {"run": run, "system": system})
+    stepper = model.stepper()
+    h = model.first_step(stepper)
+    started = model.start(stepper)
+    started.advance(1)
+    if system:
+        level = {"E": stepper.energy(model.q, model.momenta(stepper))}
+        assert np.array_equal(stepper.step(model.q, model.momenta(stepper), h, parameters=level)[0], started.q)
+    else:
+        assert h == started.t
+    assert (h < 0.0) == (run.get("span", 1.0) < 0.0)
+
+
 def test_folders_hold_a_number_of_steps(tmp_path: Path) -> None:
     folder, by_clock = str(tmp_path / "orbit.run"), ("run", "kepler", "--monitor", "frequency")
     assert "give --step and --steps" in invoke(*by_clock, "--step", "0.2", "--span", "9", "-o", folder, status=2)

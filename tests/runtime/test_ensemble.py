@@ -165,8 +165,9 @@ class TestFailures:
         assert np.isnan(result.energy()[reached:, 3]).all()
 
     @pytest.mark.parametrize("place", [3, 6])
-    def test_neighbours_of_a_lane_that_never_starts_keep_their_bits(self, place: int):
-        """Between others, and as the last, whose place is filled up with copies."""
+    def test_a_lane_that_never_starts_leaves_its_neighbours_alone(self, place: int):
+        """Between others, and as the last, whose place is filled up with copies: to roundings, as lanes that step
+        together take as many sweeps as the slowest of them needs."""
         stepper = stepper_for("relativistic-particle", SVI(5))
         q, p = states("relativistic-particle", 7)
         values, others = np.tile(stepper.defaults, (7, 1)), np.arange(7) != place
@@ -175,8 +176,8 @@ class TestFailures:
         without = stepper.integrate_ensemble(q[others], p[others], h=0.05, steps=50)
         assert result.ok.tolist() == others.tolist()
         assert result.steps[place] == 0
-        assert np.array_equal(result.q[:, others], without.q)
-        assert np.array_equal(result.p[:, others], without.p)
+        np.testing.assert_allclose(result.q[:, others], without.q, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(result.p[:, others], without.p, rtol=0, atol=1e-14)
 
     def test_newton_goes_on_where_the_fixed_point_cannot(self):
         stepper = stepper_for("harmonic-oscillator", SVI(5))

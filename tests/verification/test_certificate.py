@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from beside import C_TEXT
 from certified_cases import CASES
+from checkout import ROOT
 from click.testing import CliRunner
-from faults import Mutation
+from faults import Mutation, inside
 from mutations import MUTATIONS
 from sabotage import certified
 from samples import QUICK_FLAGS, pushed_pendulum
@@ -62,6 +65,13 @@ def test_every_fault_is_caught(mutation: Mutation, record_property) -> None:
     found = caught(mutation)
     record_property("caught by", ", ".join(check.name for check in found))
     assert found
+
+
+def test_faults_find_their_text() -> None:
+    """Otherwise text that was rewritten takes its faults with it, and only the full tier says so."""
+    texts = [path.read_text("utf-8") for path in ROOT.glob("templates/support/*.h")]
+    places = {what: inside(within, pattern) for what, _, within, pattern, _ in C_TEXT}
+    assert [what for what, place in places.items() if not any(re.search(place, text) for text in texts)] == []
 
 
 def test_nothing_of_a_fault_is_left_in_the_process() -> None:

@@ -53,7 +53,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         emit(text, output, **about, text=text)
         return
     if html is not None:
-        start = Start(q=model.q, velocity=model.velocity, p=model.p, h=model.step, t=model.t)
+        h = model.first_step(model.stepper()) if model.h is None else model.step
+        start = Start(q=model.q, velocity=model.velocity, p=model.p, h=h, t=model.t)
         emit(derivation_html(model.system, model.method, start=start), html, **about)
         return
     equations = derive_equations(model.system, model.method, radicals=radicals)

@@ -93,7 +93,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
         model.method,
         model.q,
         p,
-        h=model.step,
+        h=model.first_step(stepper),
         t=model.t,
         stepper=stepper,
         tolerance=model.tolerance,
