@@ -28,7 +28,7 @@ static error_limits limits_of(real tolerance)
 {
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
   const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
-      MATH(exp2)(MATH(log2)(most) / (OCTAVE * MATH(log2)(GROWTH) - 2))};
+      MATH(exp2)(MATH(log2)(most) / ((real)OCTAVE * MATH(log2)(GROWTH) - 2))};
   return limits;
 }
 
