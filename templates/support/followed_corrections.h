@@ -12,7 +12,8 @@ static inline lanes row_times(const lanes *row, const lanes *x)
 }
 
 /* How the forces F follow the changes r of the velocities, and, less that, the residual momenta are the momenta. */
-static inline void follow(const sweep_data *data, lanes (*value)[VALUES], lanes (*r)[M], lanes (*F)[M], lanes (*P)[M])
+static inline void forces_follow(const sweep_data *data, lanes (*value)[VALUES], lanes (*r)[M], lanes (*F)[M],
+    lanes (*P)[M])
 {
   lanes scaled[GROUPS][M], moved[M];
   scale(data->position_weight, r, scaled);
@@ -35,7 +36,7 @@ static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes
   memcpy(first, r, sizeof first);
   for (int n = 0; n < GROUPS; n++)
     solve_mass(mass[n], first[n]);
-  follow(data, value, first, force, momentum);
+  forces_follow(data, value, first, force, momentum);
   scale(data->momentum_weight, force, impulse);
   for (int n = 0; n < GROUPS; n++) {
     for (int i = 0; i < M; i++)
@@ -50,7 +51,7 @@ static inline void forces_at_rest(const step_data *step, const sweep_data *data,
 {
   lanes momentum[GROUPS][M];
   (void)step, (void)z;
-  follow(data, value, r, F, momentum);
+  forces_follow(data, value, r, F, momentum);
   for (int n = 0; n < GROUPS; n++)
     for (int i = 0; i < M; i++)
       F[n][i] += value[n][i];

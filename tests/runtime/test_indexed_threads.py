@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -243,7 +244,10 @@ def test_ctrl_c_ends_a_run_between_steps() -> None:
 def test_a_process_that_is_forked_off_has_threads_of_its_own() -> None:
     stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
     expected = bits(stepper.integrate(q, h=0.01, steps=3, threads=3))
-    if (child := os.fork()) == 0:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of JAX, where another test has imported it
+        child = os.fork()
+    if child == 0:
         os._exit(int(bits(stepper.integrate(q, h=0.01, steps=3, threads=3)) != expected))
     assert os.waitpid(child, 0)[1] == 0
 

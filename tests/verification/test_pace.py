@@ -30,7 +30,7 @@ def checks_of(given: Case) -> Iterator[Check]:
     steps = of_one_pace(given.system, runs.energy(q, p))
     single = compile_stepper(steps, given.method(), flags=QUICK_FLAGS)
     subject = Subject(steps, given.method(), single, None, State(q, p, 0.0, given.h))
-    return pace_checks(Pace(subject, runs, own, given.tolerance))
+    return pace_checks(Pace(subject, runs, own, given.system, given.tolerance))
 
 
 @pytest.mark.parametrize("name", PACES)
