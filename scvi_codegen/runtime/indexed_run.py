@@ -40,7 +40,7 @@ ADVICE_BY_SOLVER = {
 }
 CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
 """Of steps that choose their length."""
-MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOICE)
+MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", "largest_q", "largest_p", "leaving", *CHOICE)
 """Of a run, beside its arrays."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of numbers that change from step to step, but for what guesses are made of."""
