@@ -146,8 +146,9 @@ class IndexedRun:
         self.goal = goal or self.goal
 
     def _take(self, problem: IndexedProblem) -> None:
-        """Go on with another of the same sizes, by forces of its own."""
-        former, self.problem, self._run.guess = self.problem, problem, 0
+        """Go on with another of the same sizes, by forces of its own: those that were kept are others, guesses stay."""
+        former, self.problem = self.problem, problem
+        self._run.guess *= self.interface.continued
         self._find_masses()
         if self.interface.constraints:
             try:
