@@ -412,6 +412,7 @@ static const lanes NEXT[GROUPS] = {1.0, 0.0};
 
 #include "support/curve_error.h"
 #include "support/sweep_or_stage_error.h"
+#include "support/sizes.h"
 #include "support/observed_error.h"
 #else
 static const double EXTRAPOLATION[5][5] = {
@@ -425,6 +426,7 @@ static const double EXTRAPOLATION[5][5] = {
 #include "support/newton_error.h"
 
 #define ERROR_POWER STAGE_POWER
+#include "support/sizes.h"
 #include "support/observed_error.h"
 #endif
 

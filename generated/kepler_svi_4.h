@@ -60,6 +60,8 @@ typedef struct {
   long long guess; /* what memory holds of the steps before, 0 if nothing */
   long long iterations; /* since the last stored state */
   double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
+  double largest_q, largest_p; /* numbers yet of the states that were asked */
+  long long leaving; /* steps from an origin at rest in which error falls as the state grows */
 } kepler_svi_4_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */
@@ -95,7 +97,8 @@ int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,
     double *workspace);
 /* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
- * each step is resolved. Negative where the method has no curve that tells it. */
+ * each step is resolved, beside its state; beside the largest yet where it is near rest at the origin. Negative where
+ * the method has no curve that tells it. */
 double kepler_svi_4_step_error(const kepler_svi_4_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */

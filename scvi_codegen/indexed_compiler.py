@@ -136,4 +136,5 @@ def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInt
         inputs=system.inputs,
         constraints=tuple(term.loops for term in system.constraints),
         conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
+        continued=not (method.fractions or system.constraints),
     )

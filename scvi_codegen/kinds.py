@@ -20,6 +20,7 @@ from scvi_codegen.errors import ArgumentError, ScviCodegenError
 
 __all__ = [
     "CANVAS",
+    "FORMULA",
     "FORMULAS",
     "FUNCTION",
     "MAPPED",
@@ -66,6 +67,10 @@ def _is_sequence(value: Any) -> bool:
 
 
 TEXT = of("text", str)
+FORMULA = Kind(
+    "a formula as text, or a number",
+    lambda value: isinstance(value, str | numbers.Real) and not isinstance(value, bool),
+)
 TEXTS = several("a list of texts", str)
 NAMES = several("a list of names, as ['x', 'y']", str)
 SWITCH = of("True or False", bool, np.bool_)

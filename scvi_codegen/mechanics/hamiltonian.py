@@ -21,7 +21,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
@@ -72,7 +72,7 @@ class HamiltonianSystem(MechanicalSystem):
         hamiltonian=TEXT,
         momenta=NAMES,
         parameters=MAPPING,
-        damping=TEXT,
+        damping=FORMULA,
         constraints=TEXTS,
         inputs=NAMES,
     )
@@ -85,7 +85,7 @@ class HamiltonianSystem(MechanicalSystem):
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
-        damping: str | None = None,
+        damping: str | float | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
     ) -> HamiltonianSystem:
@@ -98,7 +98,7 @@ class HamiltonianSystem(MechanicalSystem):
             momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
-            damping: the rate at which all momenta shrink, a formula of parameters
+            damping: the rate at which all momenta shrink, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
             constraints: none; :func:`lagrangian_of` takes them.
             inputs: names of functions of time that are given as data with each run
@@ -128,7 +128,7 @@ class HamiltonianSystem(MechanicalSystem):
             defaults=tuple(number(given, value) for given, value in values.items()),
             hamiltonian=read(hamiltonian),
             forces=forces_by_coordinate(variables, forces or {}, read),
-            damping=damping_rate(damping, read),
+            damping=damping_rate(damping, lambda given: read(str(given))),
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )

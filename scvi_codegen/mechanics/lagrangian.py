@@ -14,7 +14,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.kinds import FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, Kind, takes
+from scvi_codegen.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, Kind, takes
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
@@ -81,7 +81,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters=MAPPING,
         forces=MAPPING,
         dissipation=TEXT,
-        damping=TEXT,
+        damping=FORMULA,
         constraints=TEXTS,
         inputs=NAMES,
     )
@@ -94,7 +94,7 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
-        damping: str | None = None,
+        damping: str | float | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
     ) -> LagrangianSystem:
@@ -107,7 +107,7 @@ class LagrangianSystem(MechanicalSystem):
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
-            damping: the rate at which all momenta shrink, a formula of parameters
+            damping: the rate at which all momenta shrink, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
             constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``;
                 linear in velocities those of wheels and skates (:mod:`scvi_codegen.mechanics.constraints`).
@@ -139,7 +139,7 @@ class LagrangianSystem(MechanicalSystem):
             defaults=tuple(number(parameter, value) for parameter, value in values.items()),
             lagrangian=read(lagrangian),
             forces=_forces(variables, forces, dissipation, read),
-            damping=damping_rate(damping, read),
+            damping=damping_rate(damping, lambda given: read(str(given))),
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )

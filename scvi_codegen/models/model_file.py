@@ -8,7 +8,7 @@
                                                         # time; without a step tolerance = 0
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
-    # damping = "gamma"                                 # the rate at which all momenta shrink; left out: 0
+    # damping = "gamma"                                 # the rate at which all momenta shrink, or a number; left out: 0
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
     # inputs = ["u"]                                    # functions of time that are data
 
@@ -84,6 +84,7 @@ from scvi_codegen.models.sections import (
     check_keys,
     check_one,
     chosen_method,
+    formula_of,
     in_section,
     laid_over,
     names_of,
@@ -296,8 +297,8 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     check_one(section, "system", "lagrangian", "hamiltonian")
     name, coordinates = text_of(section, "name", "[system]"), names_of(section, "coordinates")
     common: dict[str, Any] = {"name": name, "coordinates": coordinates, "parameters": values}
-    common["forces"] = {key: text_of(forces, key, "[forces]") for key in forces}
-    common["damping"] = text_of(section, "damping", "[system]") if "damping" in section else None
+    common["forces"] = {key: formula_of(forces, key, "[forces]") for key in forces}
+    common["damping"] = formula_of(section, "damping", "[system]") if "damping" in section else None
     common["inputs"] = names_of(section, "inputs") if "inputs" in section else ()
     if "hamiltonian" in section:
         bound = names_of(section, "constraints") if "constraints" in section else ()

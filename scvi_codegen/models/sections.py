@@ -7,7 +7,9 @@ from typing import Any, TypeVar
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
+from scvi_codegen.kinds import FORMULA
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
+from scvi_codegen.models.meant import meant_by
 from scvi_codegen.models.model import DEFAULT_METHOD, real
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "check_keys",
     "check_one",
     "chosen_method",
+    "formula_of",
     "in_section",
     "laid_over",
     "names_of",
@@ -123,12 +126,20 @@ def text_of(section: Section, key: str, where: str) -> str:
     return value
 
 
+def formula_of(section: Section, key: str, where: str) -> str:
+    """A formula under a key, as text or a number."""
+    if not FORMULA.holds(required(section, key, where)):
+        raise ModelFileError(f"{where} {key} must be a formula between quotes or a number, not {section[key]!r}")
+    return str(section[key])
+
+
 def check_keys(section: Section, known: Iterable[str], what: str, where: str = "the file") -> None:
     """Refuse keys that are not known."""
     names = list(known)
+    hint = meant_by if what in ("key", "section") else closest
     for key in section:
         if key not in names:
-            raise ModelFileError(f"unknown {what} '{key}' in {where}{closest(key, names)} Known: {', '.join(names)}")
+            raise ModelFileError(f"unknown {what} '{key}' in {where}{hint(key, names)} Known: {', '.join(names)}")
 
 
 def in_section(where: str, build: Callable[[], Built]) -> Built:

@@ -15,6 +15,7 @@ import numpy as np
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.goal import Goal
@@ -201,6 +202,8 @@ def drive(
         pieces.append(with_end(run.record(steps, every=every, progress=told), run))
         if pieces[-1].ended_by is not None:
             break
+    if run.leaving and pieces:
+        warn_of_long_steps(pieces[-1])
     return DrivenTrajectory(tuple(pieces or [run.record(0)]))
 
 

@@ -43,6 +43,7 @@ class IndexedInterface:
         solver: of the equations of a step, in a word.
         constraints: the loops of each.
         conserves_energy: whether the motion of a Lagrangian does.
+        continued: whether steps are guessed from those before, not begun with the forces that these ended with.
     """
 
     prefix: str
@@ -64,6 +65,7 @@ class IndexedInterface:
     solver: str = "fixed-point"
     constraints: tuple[tuple[Loop, ...], ...] = ()
     conserves_energy: bool = False
+    continued: bool = False
     energy_parameter = ""
     """That of transformed time, which sums over indices do not have."""
 

@@ -40,7 +40,7 @@ ADVICE_BY_SOLVER = {
 }
 CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
 """Of steps that choose their length."""
-MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", *CHOICE)
+MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", "largest_q", "largest_p", "leaving", *CHOICE)
 """Of a run, beside its arrays."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of numbers that change from step to step, but for what guesses are made of."""
@@ -146,8 +146,9 @@ class IndexedRun:
         self.goal = goal or self.goal
 
     def _take(self, problem: IndexedProblem) -> None:
-        """Go on with another of the same sizes, by forces of its own."""
-        former, self.problem, self._run.guess = self.problem, problem, 0
+        """Go on with another of the same sizes, by forces of its own: those that were kept are others, guesses stay."""
+        former, self.problem = self.problem, problem
+        self._run.guess *= self.interface.continued
         self._find_masses()
         if self.interface.constraints:
             try:

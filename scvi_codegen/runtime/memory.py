@@ -287,6 +287,11 @@ class Memory:
         error = float(self.stepper.binding.function("step_error")(self._memory))
         return (error, float(self._memory.error_t)) if error >= 0.0 else (np.nan, np.nan)
 
+    @property
+    def leaving(self) -> bool:
+        """Whether it began at the origin and is near it yet: what its steps are wrong by is not known beside a size."""
+        return bool(getattr(self._memory, "leaving", 0))
+
 
 def fill(
     memory: Memory, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]

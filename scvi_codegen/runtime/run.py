@@ -37,18 +37,20 @@ class Run(Memory):
 
         The events of the stepper, if it has any, are recorded; a terminal one ends the run before the step it is in.
 
-        An :class:`~scvi_codegen.AccuracyWarning` says when a step is first found to be too long for the motion.
+        An :class:`~scvi_codegen.AccuracyWarning` says when a step is first found to be too long for the motion, but not
+        while one that began at the origin is leaving it, for 16 steps at most: it has no size yet.
 
         Raises:
             StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
             EventError: where an event function is not finite.
         """
-        before, _ = self.step_error
+        before = 0.0 if self.leaving else self.step_error[0]
         if self.stepper.events:
             trajectory = Observation(self, every=every).advance(steps, progress)
         else:
             trajectory = record(self, steps, every=every, progress=progress)
-        warn_of_long_steps(trajectory, before=before)
+        if not self.leaving:
+            warn_of_long_steps(trajectory, before=before)
         warn_of_lost_energy(trajectory)
         return trajectory
 

@@ -114,7 +114,10 @@ class Stepper(Ensembles):
         if run.goal is not None and steps is not None:
             raise StateError(f"steps that choose their length go to t_end={t_end}: leave out steps={steps}")
         if t_eval is None:
-            return run.record(steps, every=every, progress=progress)
+            found = run.record(steps, every=every, progress=progress)
+            if run.leaving:
+                warn_of_long_steps(found)
+            return found
         if clocked:
             raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
         return _said(Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress))

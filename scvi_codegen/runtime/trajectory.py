@@ -60,8 +60,9 @@ class Trajectory(NearbyMotions):
         events: the zero crossings found, parallel to ``stepper.events``.
         goal: where steps that choose their length led, and their tolerance; ``h`` is then the first of them.
         steps, rejected: taken since the start of the run; tried, and repeated shorter.
-        step_error, step_error_t: an estimate of the relative error of the worst step of the run, and when it began; not
-            numbers for methods without a curve to tell them from, or with curves that are no polynomials.
+        step_error, step_error_t: an estimate of the relative error of the worst step of the run, beside its state, or
+            beside the largest of the run where that is near rest at the origin; and when it began. Not numbers for
+            methods without a curve to tell them from, or with curves that are no polynomials.
     """
 
     iterations: NDArray[np.int32]

@@ -16,6 +16,14 @@ from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.cli import main
 from scvi_codegen.cli.wording import in_known_digits
 
+PUSHED = sc.LagrangianSystem.from_text(
+    name="pushed",
+    coordinates=["x"],
+    lagrangian="x_dot**2/2 - x**2/2",
+    forces={"x": "a*cos(t) + b*sin(3*t)"},
+    parameters={"a": 1.0, "b": 0.0},
+)
+FORCED = {"a": 1.0, "b": 0.0}
 NEARLY_RADIAL = [1.999, 0.0], [0.0, 0.022366272]
 
 
@@ -55,6 +63,71 @@ class TestLongSteps:
         better = stepper.integrate(run.q[k], run.p[k], h=h / 16, steps=16).q[-1]
         true = np.abs(run.q[k + 1] - better).max() / np.abs(better).max()
         assert true / 10 < run.step_error < 1e-3
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("method", ["svi:1", "svi:2", "scvi:2", "svi:3"])
+    @pytest.mark.parametrize("h", [0.1, 0.02])
+    def test_nor_is_a_start_from_rest_at_the_origin(self, method, h):
+        """x = t sin(t) / 2: the first step is right to 2e-3 of its own way, which is a thousandth of the motion's."""
+        run = sc.compile_stepper(PUSHED, method).integrate([0.0], [0.0], h=h, steps=round(20 / h), parameters=FORCED)
+        assert np.abs(run.q[:, 0] - run.t * np.sin(run.t) / 2).max() < 0.1  # of 9
+        assert 0.0 < run.step_error < 3e-4
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
+    def test_nor_rest_at_the_origin_on_the_way(self, method):
+        """x = (3 sin(t) - sin(3 t)) / 8 rests at 0 whenever t is a multiple of pi."""
+        run = sc.compile_stepper(PUSHED, method).integrate(
+            [0.0], [0.0], h=0.1, steps=400, parameters={"a": 0.0, "b": 1.0}
+        )
+        assert np.abs(run.q[:, 0] - (3 * np.sin(run.t) - np.sin(3 * run.t)) / 8).max() < 0.1
+
+    @pytest.mark.filterwarnings("error")
+    def test_nor_a_state_that_is_pushed_late_or_step_by_step(self):
+        held = sc.LagrangianSystem.from_text(
+            name="held", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2 + u*x", inputs=["u"]
+        )
+        stepper = sc.compile_stepper(held, "svi:1")
+        stepper.drive([0.0], [0.0], inputs={"u": ([0.0, 1.0, 1.1, 30.0], [0.0, 0.0, 1.0, 1.0])}, h=0.1, t_end=30.0)
+        going = stepper.start([0.0], [0.0], h=0.1)
+        for k in range(200):
+            going.hold(u=math.cos(0.1 * k))
+            going.record(1)
+        assert 0.0 < going.step_error[0] < 1e-3
+
+    @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:4"])
+    def test_a_blow_that_the_first_step_misjudges_is_said(self, method):
+        """A flight goes on from it, whose way grows: the momentum is as wrong as ever."""
+        blow = sc.LagrangianSystem.from_text(
+            name="blow", coordinates=["x"], lagrangian="x_dot**2/2 + x*exp(-(t/0.03)**2)"
+        )
+        with pytest.warns(sc.AccuracyWarning, match="from t = 0 with h = 0.1 is too long"):
+            run = sc.compile_stepper(blow, method).integrate([0.0], [0.0], h=0.1, steps=200)
+        assert abs(run.p[-1, 0] / (0.03 * math.sqrt(math.pi) / 2) - 1.0) > 1e-3
+
+    @pytest.mark.parametrize("steps", [3, 30])
+    def test_a_motion_that_grows_from_the_origin_by_steps_too_long_is_said(self, steps):
+        unstable = sc.LagrangianSystem.from_text(name="unstable", coordinates=["x"], lagrangian="x_dot**2/2 + x**2/2")
+        with pytest.warns(sc.AccuracyWarning, match="too long"):
+            sc.compile_stepper(unstable, "svi:1").integrate([0.0], [1e-6], h=1.0, steps=steps)
+
+    def test_a_near_meeting_of_bodies_from_far_is_said(self):
+        """There positions are a fortieth of those before; momenta are the largest of all."""
+        stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
+        with pytest.warns(sc.AccuracyWarning, match="from t = 3.14 with h = 0.02 is too long"):
+            stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
+    @pytest.mark.parametrize("method", ["svi:2", "svi:3"])
+    def test_sums_from_rest_at_the_origin_are_no_reason(self, method, solver):
+        chain = sc.IndexedSystem.from_text(
+            name="pushed chain",
+            coordinates=["x[N]"],
+            lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2) - sum(i in N-1, (x[i+1] - x[i])**2/2) + x[0]*cos(t)",
+        )
+        run = sc.compile_indexed(chain, method, solver=solver).integrate(np.zeros(40), h=0.1, steps=200)
+        assert 0.0 < run.step_error < 1e-4
 
     def test_where_nothing_tells_it_that_is_said(self):
         verlet = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())

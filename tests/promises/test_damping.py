@@ -4,6 +4,8 @@ The references are L exp(gamma t) with momenta scaled by hand, where time occurs
 SciPy's DOP853 on the equations of motion.
 """
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import sympy
@@ -19,6 +21,7 @@ from scvi_codegen import (
     LagrangianSystem,
     LobattoIIIA,
     MethodError,
+    ModelFileError,
     RadauIIA,
     SpectralCollocation,
     StoermerVerlet,
@@ -28,6 +31,7 @@ from scvi_codegen import (
     reparametrise,
     verify,
 )
+from scvi_codegen.models.model_file import parse_model
 
 L = "(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*cos(2*t)/5"
 GAMMA = 0.4 * 0.9
@@ -206,6 +210,40 @@ def test_the_certificate_says_so():
     names = {check.name for check in certificate.checks}
     assert "conformal symplecticity" in names
     assert "symplecticity" not in names
+
+
+@pytest.mark.parametrize(
+    "given", [0.25, "0.25", np.float64(0.25), Fraction(1, 4), sympy.Rational(1, 4)], ids=lambda x: type(x).__name__
+)
+def test_a_rate_may_be_a_number(given):
+    """In text, SymPy and model files alike; what is neither number nor text is refused by name."""
+    x = sympy.Function("x")(sympy.Symbol("t", real=True))
+    systems = []
+    if not isinstance(given, str):
+        systems += [LagrangianSystem.from_sympy(name="a", coordinates=[x], lagrangian=x.diff() ** 2, damping=given)]
+    if not isinstance(given, sympy.Expr):
+        one = {"name": "a", "coordinates": ["x"], "damping": given}
+        systems += [
+            LagrangianSystem.from_text(lagrangian="x_dot**2", **one),
+            HamiltonianSystem.from_text(hamiltonian="p_x**2", **one),
+        ]
+    assert [system.damping for system in systems] == [sympy.Rational(1, 4)] * len(systems)
+    with pytest.raises(SystemDefinitionError, match=r"damping must be a formula as text, or a number, not \['c'\]"):
+        LagrangianSystem.from_text(name="a", coordinates=["x"], lagrangian="x_dot**2", damping=["c"])
+
+
+@pytest.mark.parametrize("written", ["0.25", '"0.25"', "'1/4'"])
+def test_a_rate_may_be_a_number_in_a_model_file(written):
+    text = f"""
+        system = {{ name = "a", coordinates = ["x"], lagrangian = "x_dot**2/2", damping = {written} }}
+        initial = {{ q = [0.0], q_dot = [1.0] }}
+        run = {{ step = 0.1, steps = 10 }}
+        forces = {{ x = 0.5 }}
+    """
+    model = parse_model(text)
+    assert (model.system.damping, model.system.forces) == (sympy.Rational(1, 4), (sympy.Rational(1, 2),))
+    with pytest.raises(ModelFileError, match="damping must be a formula between quotes or a number, not"):
+        parse_model(text.replace(f"damping = {written}", "damping = true"))
 
 
 def test_who_does_not_take_it():

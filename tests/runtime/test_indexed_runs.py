@@ -1,5 +1,6 @@
 """Runs of sums over indices beside those written out: controlled steps, events, inputs, states between."""
 
+import math
 import pickle
 
 import numpy as np
@@ -197,6 +198,29 @@ class TestInputs:
         assert np.abs(runs[0].q["q"] - runs[1].q).max() < 1e-14
         with pytest.raises(StateError, match="'G' is no input"):
             runs[0].hold(G=1.0)
+
+    @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
+    def test_what_is_held_leaves_the_guess_of_the_next_step(self, driven, method):
+        """Samples of the same number cost no sweep more than none; of another, fewer than from nothing."""
+        stepper = sc.compile_indexed(driven, method)
+        runs = [stepper.start(Q, velocity=V, h=0.05) for _ in range(4)]
+        for run in runs:
+            run.hold(F=0.3)
+            run.advance(1)
+        free, same, others, none = runs
+        free.advance(100)
+        for _ in range(100):
+            same.hold(F=0.3)
+            same.advance(1)
+            for run in (others, none):
+                run.hold(F=math.cos(run.t))
+                if run is none:
+                    run.rewind(run.mark)
+                run.advance(1)
+        assert same.iterations == free.iterations
+        assert np.abs(same.q["q"] - free.q["q"]).max() < 1e-15
+        assert others.iterations < none.iterations
+        assert np.abs(others.q["q"] - none.q["q"]).max() < 1e-13
 
     def test_they_are_missed(self, driven):
         stepper = sc.compile_indexed(driven, "svi:6")
