@@ -223,7 +223,10 @@ class TestChoices:
             ("kepler --method gauss:", "a number, its stages, follows the colon, as in gauss:8"),
             ("kepler --method collocation:2", "no number follows collocation; it takes abscissae, form"),
             ("kepler --method gaus:2", "did you mean 'gauss'?"),
-            ("kepler --stages 3", "unknown key 'stages' in [method] for svi. Known: method, degree, quadrature"),
+            (
+                "kepler --stages 3",
+                "unknown key 'stages' in [method] for svi; did you mean 'degree'? Known: method, degree, quadrature",
+            ),
             ("kepler --quadrature gauss-legendre", "lacks its number of points"),
             ("kepler --degree x", "'x' is not a valid integer"),
             ("kepler --q 1,a", "could not convert string to float: 'a'"),
