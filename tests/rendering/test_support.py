@@ -147,12 +147,13 @@ int main(void)
 """
 
 
+@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 @pytest.mark.parametrize(
     "system", [problem("harmonic-oscillator").system, problem("kepler").system], ids=lambda system: system.name
 )
-def test_derivatives_read_and_write_nothing_but_their_own(system, tmp_path):
+def test_derivatives_read_and_write_nothing_but_their_own(system, solver, tmp_path):
     """Forward and back, in a workspace of exactly the length that they ask for."""
-    stepper = compile_stepper(system, SVI(2))
+    stepper = compile_stepper(system, SVI(2), solver=solver)
     assert stepper.derivatives is not None
     prefix = written(stepper.derivatives, tmp_path)
     names = re.sub(r"\b([A-Z_]{5,})\b", rf"{prefix.upper()}_\1", DERIVATIVES.format(defaults="1.0, 1.0"))
