@@ -1,6 +1,7 @@
 /* Newton's iteration for the points of a step of any number of coordinates. Before it: indexed_newton.h, gmres.h. */
 
 #define REFRESHED 1e-6 /* the inverses are made again while points move by more than 1e-3 of the state */
+#define UNSOLVED 1e-10 /* of the state: more than this is not left by rounding */
 
 /* The parts of work behind those of sweeps. */
 static linear_system linear_of(const run_memory *run, const problem *given, const parts_of_work *parts, long long n)
@@ -19,7 +20,9 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
       .product = work + 2 * count,
       .forces = work + 3 * count,
       .inverse = work + 4 * count,
-      .basis = work + (4 + POINTS) * count};
+      .spare = work + (4 + POINTS) * count,
+      .basis = work + (4 + POINTS + SPARE_VECTORS) * count,
+      .roots = (double *)(work + (4 + POINTS + SPARE_VECTORS + BASIS + 1) * count)};
   return of;
 }
 
@@ -87,14 +90,17 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   start_nearer(&of, &parts);
   while (now.status == 0) {
     const double size = find_residual(&of, parts.X, parts.F);
-    double change;
+    double change, left;
+    of.state = sqrt(size);
     if (now.last > REFRESHED) /* as before the first */
       find_inverses(&of);
-    find_correction(&of, report);
+    left = find_correction(&of, report);
     add_multiple(&of, parts.X, 1.0, of.correction);
     forces_at_points(run, given, parts.X, parts.F, n);
     change = inner_product(&of, of.correction, of.correction);
     judge(&now, beside_state(change, size, options), options, report);
+    if (now.status > 0 && left > UNSOLVED * of.state) /* no correction is small for want of a solution */
+      now.status = -1;
   }
   if (now.status < 0)
     return failure_of(&now);
