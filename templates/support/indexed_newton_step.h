@@ -26,34 +26,39 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
   return of;
 }
 
-/* What a sweep would change at points X with forces F, of a block; returned is the size of the coordinates, squared. */
-static double residual_of_block(linear_system *of, const lanes *X, const lanes *F, section here)
+/* What a sweep would change at points X with forces F; of every thread its own coordinates. */
+static void find_residual(linear_system *of, const lanes *X, const lanes *F)
 {
   const run_memory *run = of->run;
   const long long n = of->n;
-  double size = 0.0;
-  for (long long i = here.first; i < here.end; i++) {
-    double low, of_one;
+  for (long long i = of->own.first; i < of->own.end; i++) {
+    double low;
     const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
       const lanes sum = given_by_all(PRODUCT, g, &F[i], n) + given_by_all(PRODUCT_LOW, g, &F[i], n);
       const lanes rest = run->carry_q[i] + DRIFT[g] * low + DRIFT_LOW[g] * drift;
       of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (unit * sum + rest);
     }
-    of_one = fabs(run->q[i]) + fabs(drift) + fabs(at_point(&X[i], n, KEPT - 1) - run->q[i]);
-    size += of_one * of_one;
   }
-  return size;
 }
 
-/* The same of all. */
-static double find_residual(linear_system *of, const lanes *X, const lanes *F)
+/* The size of the coordinates in the step, squared. */
+static double size_of_state(const linear_system *of, const lanes *X)
 {
+  const run_memory *run = of->run;
   sums all;
-  begin_sums(&all, of->run, of->n);
-  while (next_block(&all))
-    add_block(&all, residual_of_block(of, X, F, all.here), 0.0);
-  wait_for_others(of->run);
+  begin_sums(&all, run, of->n);
+  while (next_block(&all)) {
+    double size = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      double low;
+      const double part = fabs(run->q[i]) + fabs(drift_of(run, i, &low));
+      const double of_one = part + fabs(at_point(&X[i], of->n, KEPT - 1) - run->q[i]);
+      size += of_one * of_one;
+    }
+    add_block(&all, size, 0.0);
+  }
+  wait_for_others(run);
   return sum_of(&all, 0);
 }
 
@@ -88,19 +93,21 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   iteration now = at_its_start();
   forces_at_points(run, given, parts.X, parts.F, n);
   start_nearer(&of, &parts);
+  of.state = sqrt(size_of_state(&of, parts.X));
   while (now.status == 0) {
-    const double size = find_residual(&of, parts.X, parts.F);
-    double change, left;
-    of.state = sqrt(size);
+    double change, size, left;
+    find_residual(&of, parts.X, parts.F);
     if (now.last > REFRESHED) /* as before the first */
       find_inverses(&of);
     left = find_correction(&of, report);
     add_multiple(&of, parts.X, 1.0, of.correction);
     forces_at_points(run, given, parts.X, parts.F, n);
     change = inner_product(&of, of.correction, of.correction);
+    size = size_of_state(&of, parts.X);
+    of.state = sqrt(size);
     judge(&now, beside_state(change, size, options), options, report);
-    if (now.status > 0 && left > UNSOLVED * of.state) /* no correction is small for want of a solution */
-      now.status = -1;
+    if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* no correction is small for want of a solution */
+      now.status = -1, now.last = left;
   }
   if (now.status < 0)
     return failure_of(&now);

@@ -60,6 +60,23 @@ def test_runs_take_as_many_iterations_as_they_did(method, solver, h):
     assert run_of(method, solver, h, 1.0).iterations == pytest.approx(WAYS[method, solver][h], rel=0.02, abs=2)
 
 
+@pytest.mark.parametrize(("method", "solver"), WAYS)
+@pytest.mark.parametrize("force", [0.0, 2.0**-90])
+def test_forces_from_rest_at_the_origin_know_no_size_either(method, solver, force):
+    """Where there is nothing yet, beside which a change would be small."""
+    hamiltonian = {"momenta": ["p[N]"], "hamiltonian": "sum(i in N, p[i]**2/2 + q[i]**2/2) - e*cos(t)*q[0]"}
+    lagrangian = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + e*cos(t)*q[0]"}
+    form = hamiltonian if method == "hamiltonian" else lagrangian
+    driven = sc.IndexedSystem.from_text(name="driven", coordinates=["q[N]"], parameters={"e": 1}, **form)
+    made = sc.compile_indexed(driven, "svi:4" if method == "hamiltonian" else method, solver=solver)
+    ends = []
+    for e in (1.0, force):
+        run = made.start(np.zeros(6), h=0.1, parameters={"e": e})
+        run.advance(3)
+        ends.append(run.q["q"])
+    assert np.abs(ends[1] - force * ends[0]).max() <= 1e-15 * force
+
+
 def test_a_momentum_that_is_no_number_is_no_step():
     """The last kick of a leapfrog step is at a wall, which the positions just reach."""
     wall = sc.IndexedSystem.from_text(
