@@ -52,4 +52,4 @@ def _same_loops(one: Access, other: Access) -> bool:
 
 def _distance(one: Access, other: Access) -> int:
     pairs = zip(one.places, other.places, strict=False)
-    return max(abs(a.base.number - b.base.number) for a, b in pairs if a.index)
+    return max((abs(a.base.number - b.base.number) for a, b in pairs if a.index), default=0)

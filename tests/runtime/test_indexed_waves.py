@@ -141,6 +141,7 @@ def test_the_diagonal_stays_where_waves_do_not_serve():
         ("sum(i in 2..N-4, u[i-2, 0]*u[i+3, 0])", 5),
         ("sum(i in N, (u[i, 0] - u[i, 1])**2)", 0),
         ("sum(i in N, u[i, 0]*u[0, 0])", 0),
+        ("sum(b in B, w[b]*u[0, 0]*u[1, 0])", 0),
         ("sum(i < j in N, u[i, 0]*u[j, 0])", 0),
         ("sum(b in B, u[bonds[b, 0], 0]*u[bonds[b, 1], 0])", 0),
         ("sum(i in N periodic, u[i, 0]*u[i+1, 0]) - sum(b in B, u[bonds[b, 0], 0]*u[bonds[b, 1], 0])", 0),
@@ -150,6 +151,7 @@ def test_which_systems_have_waves(term, reach):
     system = sc.IndexedSystem.from_text(
         name="some",
         coordinates=["u[N, 2]"],
+        parameters={"w[B]": 1},
         tables=["bonds[B, 2]"],
         lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
     )
