@@ -106,9 +106,10 @@ def test_steps_are_those_of_the_system_written_out(name, k):
         assert np.abs(run.p["q"].ravel() - momenta).max() < 16 * grain
 
 
-def test_no_correction_is_small_for_want_of_a_solution():
+@pytest.mark.parametrize("name", ["chain", "beam"])
+def test_no_correction_is_small_for_want_of_a_solution(name):
     """The size has a factor beyond those that are transformed, and the diagonal says nothing of long waves."""
-    run = stepper_of("chain").start(smooth(503), h=0.5, parameters={"k": 1e5})
+    run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
     with pytest.raises(StepFailedError, match="GMRES"):
         run.advance(1)
 
