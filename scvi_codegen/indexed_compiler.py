@@ -53,7 +53,8 @@ def compile_indexed(
         method: how its motion is discretised, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods, and
             those whose equations sweeps over positions solve: SVI, SC, Runge-Kutta.
         solver: of the equations of a step: ``"fixed-point"``, sweeps, or ``"newton"`` for stiff systems: Newton's
-            iteration, its linear systems by GMRES from products with the derivatives of the forces alone.
+            iteration, its linear systems by GMRES from products with the derivatives of the forces alone, which their
+            diagonal preconditions, or on lattices their mean in Fourier space.
         flags: for the C compiler; by default tuned to this processor.
         prefix: of the C names; by default made from the names of system and method.
 

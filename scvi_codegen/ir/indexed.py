@@ -73,6 +73,7 @@ class IndexedProgram:
         control: steps that choose their length, if they are wanted.
         products, diagonals: the derivatives of the forces times a direction, and their diagonals, where Newton's
             iteration takes the place of the sweeps.
+        reach: of these, how far they couple places of lattices; 0 where they do not, or not at constant distances.
     """
 
     prefix: str
@@ -95,6 +96,7 @@ class IndexedProgram:
     held: HeldSteps | None = None
     products: tuple[LoopedKernel, ...] = ()
     diagonals: tuple[LoopedKernel, ...] = ()
+    reach: int = 0
 
     @property
     def error_power(self) -> int:

@@ -19,6 +19,7 @@ from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
 from scvi_codegen.lowering.indexed_constraints import held_steps
 from scvi_codegen.lowering.indexed_kernels import given_of, kernel_of
+from scvi_codegen.lowering.lattices import reach_of
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.choice import sweep_of
@@ -88,6 +89,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
         held=held,
         products=products,
         diagonals=diagonals,
+        reach=reach_of(system.coordinates, diagonals),
     )
 
 

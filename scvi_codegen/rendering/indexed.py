@@ -19,6 +19,7 @@ from scvi_codegen.rendering.sizes import product_text, sizes_text
 from scvi_codegen.rendering.source import Source, included
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS
 from scvi_codegen.rendering.target import DOUBLE
+from scvi_codegen.rendering.waves import roots_of, waves_context
 
 __all__ = ["render_indexed", "render_indexed_example"]
 
@@ -27,6 +28,8 @@ EXPLICIT_VECTORS, HELD_VECTORS, SWEEP_VECTORS = 4, 7, 4
 the points, forces in this step and two before."""
 NEWTON_VECTORS = 4 + 17
 """Beside these residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
+WAVE_VECTORS = 2
+"""Beside these scratch of transforms (templates/support/indexed_waves.h)."""
 
 
 def render_indexed(program: IndexedProgram) -> Source:
@@ -59,6 +62,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "work": _work(program),
         "sweep_vectors": SWEEP_VECTORS,
         "hot": "static",
+        "waves": waves_context(program) if program.reach else None,
         **held_context(program),
     }
     code = environment.get_template("indexed.c.jinja").render(context)
@@ -92,7 +96,8 @@ def _work(program: IndexedProgram) -> int:
         return HELD_VECTORS if program.held else EXPLICIT_VECTORS
     own = 2 * SWEEP_VECTORS if program.momenta else SWEEP_VECTORS + bool(program.velocities)
     linear = NEWTON_VECTORS + program.sweep.lanes if program.products else 0
-    return (own + linear) * program.sweep.lanes
+    waves = WAVE_VECTORS * program.sweep.lanes + roots_of(program) if program.reach else 0
+    return (own + linear) * program.sweep.lanes + waves
 
 
 def _sweep_text(program: IndexedProgram) -> SweepText | None:

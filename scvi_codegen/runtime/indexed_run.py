@@ -28,7 +28,7 @@ __all__ = ["IndexedRun"]
 
 ADVICE = {
     "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
-    "or solver='newton' where the fast motions are stiff bonds at rest",
+    "or solver='newton' where the fast motions are at rest: stiff bonds, short waves on a lattice",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
     "singular": "constraints contradict each other there, or say the same",
     "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",

@@ -1,7 +1,7 @@
 /* Linear systems that are known by their products alone: GMRES, restarted (Y. Saad, Iterative Methods for Sparse Linear
  * Systems, 2003, algorithm 9.5: preconditioned from the right), on vectors over all points of all coordinates. Before
- * it: points.h, indexed_blocks.h; linear_system with run, n, own, count, basis, residual, correction and product;
- * multiply and precondition. */
+ * it: linear_vectors.h; linear_system with count, state, basis, residual, correction and product; multiply,
+ * precondition and reconsider. */
 
 enum {
   BASIS = 16, /* vectors until it begins anew */
@@ -9,50 +9,7 @@ enum {
 };
 
 #define LINEAR_TOLERANCE 1e-6 /* of a system, relative: so much an iteration of Newton's gains */
-
-static double inner_product(const linear_system *of, const lanes *x, const lanes *y)
-{
-  sums all;
-  begin_sums(&all, of->run, of->n);
-  while (next_block(&all)) {
-    lanes a = lanes_of(0.0), b = lanes_of(0.0);
-    for (int g = 0; g < GROUPS; g++) {
-      long long i = g * of->n + all.here.first;
-      const long long end = g * of->n + all.here.end;
-      for (; i + 1 < end; i += 2) {
-        a += x[i] * y[i];
-        b += x[i + 1] * y[i + 1];
-      }
-      if (i < end)
-        a += x[i] * y[i];
-    }
-    add_block(&all, lanes_total(a + b), 0.0);
-  }
-  wait_for_others(of->run);
-  return sum_of(&all, 0);
-}
-
-/* y += by x; of every thread its own coordinates. */
-static void add_multiple(const linear_system *of, lanes *restrict y, double by, const lanes *restrict x)
-{
-  for (int g = 0; g < GROUPS; g++)
-    for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
-      y[i] += by * x[i];
-}
-
-/* x = by y. */
-static void scale(const linear_system *of, lanes *x, double by, const lanes *y)
-{
-  for (int g = 0; g < GROUPS; g++)
-    for (long long i = g * of->n + of->own.first; i < g * of->n + of->own.end; i++)
-      x[i] = by * y[i];
-}
-
-static void make_zero(const linear_system *of, lanes *x)
-{
-  for (int g = 0; g < GROUPS; g++)
-    memset(x + g * of->n + of->own.first, 0, sizeof(lanes) * (size_t)(of->own.end - of->own.first));
-}
+#define LINEAR_GRAIN (DBL_EPSILON / 4) /* and beside the state: less is rounding of what is solved for */
 
 /* The triangle that Givens' rotations make of the products of the basis with itself, and what they make of the norm. */
 typedef struct {
@@ -118,10 +75,13 @@ static void add_combination(linear_system *of, triangle *all, int size)
   add_multiple(of, of->correction, 1.0, of->product);
 }
 
-/* The correction whose product is the residual, as nearly as LINEAR_TOLERANCE. */
-static void find_correction(linear_system *of, solver_report *report)
+/* The correction whose product is the residual, as nearly as LINEAR_TOLERANCE or LINEAR_GRAIN; returned is the size of
+ * what it leaves, of which there is too much where cycles no longer help. */
+static double find_correction(linear_system *of, solver_report *report)
 {
   const double size = sqrt(inner_product(of, of->residual, of->residual));
+  const double enough = larger(LINEAR_TOLERANCE * size, LINEAR_GRAIN * of->state);
+  double last = size;
   make_zero(of, of->correction);
   for (int cycle = 0; cycle < MOST_CYCLES; cycle++) {
     triangle all = {.rest = {0.0}};
@@ -132,9 +92,13 @@ static void find_correction(linear_system *of, solver_report *report)
       add_multiple(of, left, -1.0, of->product);
     }
     all.rest[0] = sqrt(inner_product(of, left, left));
-    if (!(all.rest[0] > LINEAR_TOLERANCE * size && all.rest[0] < INFINITY))
-      return;
+    if (!(all.rest[0] > enough && all.rest[0] < INFINITY))
+      return all.rest[0];
+    if (cycle > 0)
+      reconsider(of, all.rest[0] / last);
+    last = all.rest[0];
     scale(of, left, 1.0 / all.rest[0], left);
-    add_combination(of, &all, build_basis(of, &all, LINEAR_TOLERANCE * size, report));
+    add_combination(of, &all, build_basis(of, &all, enough, report));
   }
+  return last;
 }

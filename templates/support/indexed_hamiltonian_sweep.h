@@ -129,7 +129,7 @@ static double unresolved_of_block(const run_memory *run, const lanes *velocity, 
     const double ends = fabs(at_point(rate, 2 * n, KEPT - 1) - start) + fabs(middle - start);
     const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
     const double top = run->h * top_coefficient(rate, 2 * n, decay);
-    least = larger(least, top * top / (bend * size));
+    least = larger(least, top * top / larger(bend * size, DBL_MIN)); /* all may be 0 */
   }
   return least;
 }

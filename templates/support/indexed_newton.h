@@ -1,7 +1,6 @@
 /* The points of a step of any number of coordinates, by Newton's iteration: (1 - h^2 A F' / m) dX = what a sweep would
  * change, where A is PRODUCT and F' the derivative of the forces at the points, of which only products with vectors are
- * made, family by family. Preconditioned by the diagonal of F', coordinate by coordinate. Before it: indexed_sweep.h;
- * products and diagonals of F'. */
+ * made, family by family. Before it: indexed_sweep.h; products and diagonals of F'. */
 
 typedef struct {
   const run_memory *run;
@@ -9,8 +8,12 @@ typedef struct {
   lengths by;
   long long n, count; /* coordinates, and vectors over all points */
   section own; /* coordinates of this thread */
+  double state; /* the size of the coordinates */
   const lanes *X;
-  lanes *residual, *correction, *product, *forces, *inverse, *basis;
+  lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
+  double *roots;
+  int by_waves, tried; /* whether the inverses are those of waves; how many ways one cycle was too few for */
+  double left; /* by the first of them */
 } linear_system;
 
 /* y = x - h^2 A F' x / m. */
@@ -25,11 +28,16 @@ static void multiply(const linear_system *of, const lanes *x, lanes *y)
   }
 }
 
-static void precondition(const linear_system *of, const lanes *x, lanes *y)
+/* y = what the inverses make of x, coordinate by coordinate; x may be y. */
+static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, section here)
 {
-  for (long long i = of->own.first; i < of->own.end; i++)
+  for (long long i = here.first; i < here.end; i++) {
+    lanes all[GROUPS];
     for (int g = 0; g < GROUPS; g++)
-      y[g * of->n + i] = given_by_all(of->inverse + i * POINTS * GROUPS, g, x + i, of->n);
+      all[g] = given_by_all(of->inverse + i * POINTS * GROUPS, g, x + i, of->n);
+    for (int g = 0; g < GROUPS; g++)
+      y[g * of->n + i] = all[g];
+  }
 }
 
 /* The inverse of a matrix by columns, in its place (Gauss and Jordan, with pivots). */
@@ -59,20 +67,34 @@ static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
   }
 }
 
-/* 1 - h^2 A F'_ii / m of every coordinate, F'_ii being the mean over the points, inverted. */
-static void find_inverses(linear_system *of)
+/* So many times the inverse of 1 - slope A, as that of a coordinate; of a slope that is not stable 1. */
+static void keep_inverse(linear_system *of, long long i, double slope, double by)
 {
-  const long long n = of->n;
-  diagonals(of->run, of->given, of->X, of->forces, n);
-  for (long long i = of->own.first; i < of->own.end; i++) {
-    double matrix[POINTS][POINTS], inverse[POINTS][POINTS], mean = 0.0;
-    for (int j = 0; j < KEPT; j++)
-      mean += at_point(&of->forces[i], n, j) / KEPT;
-    mean = of->by.square * of->run->inverse_mass[i] * smaller(mean, 0.0);
-    for (int j = 0; j < POINTS; j++)
-      for (int k = 0; k < POINTS; k++)
-        matrix[j][k] = (j == k) - mean * at_point(&PRODUCT[j * GROUPS], 1, k);
-    invert(matrix, inverse);
-    memcpy(of->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
-  }
+  double matrix[POINTS][POINTS], inverse[POINTS][POINTS];
+  slope = smaller(slope, 0.0);
+  for (int j = 0; j < POINTS; j++)
+    for (int k = 0; k < POINTS; k++)
+      matrix[j][k] = (j == k) - slope * at_point(&PRODUCT[j * GROUPS], 1, k);
+  invert(matrix, inverse);
+  for (int j = 0; j < POINTS; j++)
+    for (int k = 0; k < POINTS; k++)
+      inverse[j][k] *= by;
+  memcpy(of->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
+}
+
+/* h^2 x / m of a coordinate, where x is the mean over the points. */
+static double slope_of(const linear_system *of, const lanes *x, long long i)
+{
+  double mean = 0.0;
+  for (int j = 0; j < KEPT; j++)
+    mean += at_point(&x[i], of->n, j) / KEPT;
+  return of->by.square * of->run->inverse_mass[i] * mean;
+}
+
+/* 1 - h^2 A F'_ii / m of every coordinate inverted. */
+static void find_own_inverses(linear_system *of)
+{
+  diagonals(of->run, of->given, of->X, of->forces, of->n);
+  for (long long i = of->own.first; i < of->own.end; i++)
+    keep_inverse(of, i, slope_of(of, of->forces, i), 1.0);
 }

@@ -1,6 +1,7 @@
 /* Newton's iteration for the points of a step of any number of coordinates. Before it: indexed_newton.h, gmres.h. */
 
 #define REFRESHED 1e-6 /* the inverses are made again while points move by more than 1e-3 of the state */
+#define UNSOLVED 1e-10 /* of the state: more than this is not left by rounding */
 
 /* The parts of work behind those of sweeps. */
 static linear_system linear_of(const run_memory *run, const problem *given, const parts_of_work *parts, long long n)
@@ -19,38 +20,45 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
       .product = work + 2 * count,
       .forces = work + 3 * count,
       .inverse = work + 4 * count,
-      .basis = work + (4 + POINTS) * count};
+      .spare = work + (4 + POINTS) * count,
+      .basis = work + (4 + POINTS + SPARE_VECTORS) * count,
+      .roots = (double *)(work + (4 + POINTS + SPARE_VECTORS + BASIS + 1) * count)};
   return of;
 }
 
-/* What a sweep would change at points X with forces F, of a block; returned is the size of the coordinates, squared. */
-static double residual_of_block(linear_system *of, const lanes *X, const lanes *F, section here)
+/* What a sweep would change at points X with forces F; of every thread its own coordinates. */
+static void find_residual(linear_system *of, const lanes *X, const lanes *F)
 {
   const run_memory *run = of->run;
   const long long n = of->n;
-  double size = 0.0;
-  for (long long i = here.first; i < here.end; i++) {
-    double low, of_one;
+  for (long long i = of->own.first; i < of->own.end; i++) {
+    double low;
     const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
       const lanes sum = given_by_all(PRODUCT, g, &F[i], n) + given_by_all(PRODUCT_LOW, g, &F[i], n);
       const lanes rest = run->carry_q[i] + DRIFT[g] * low + DRIFT_LOW[g] * drift;
       of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (unit * sum + rest);
     }
-    of_one = fabs(run->q[i]) + fabs(drift) + fabs(at_point(&X[i], n, KEPT - 1) - run->q[i]);
-    size += of_one * of_one;
   }
-  return size;
 }
 
-/* The same of all. */
-static double find_residual(linear_system *of, const lanes *X, const lanes *F)
+/* The size of the coordinates in the step, squared. */
+static double size_of_state(const linear_system *of, const lanes *X)
 {
+  const run_memory *run = of->run;
   sums all;
-  begin_sums(&all, of->run, of->n);
-  while (next_block(&all))
-    add_block(&all, residual_of_block(of, X, F, all.here), 0.0);
-  wait_for_others(of->run);
+  begin_sums(&all, run, of->n);
+  while (next_block(&all)) {
+    double size = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      double low;
+      const double part = fabs(run->q[i]) + fabs(drift_of(run, i, &low));
+      const double of_one = part + fabs(at_point(&X[i], of->n, KEPT - 1) - run->q[i]);
+      size += of_one * of_one;
+    }
+    add_block(&all, size, 0.0);
+  }
+  wait_for_others(run);
   return sum_of(&all, 0);
 }
 
@@ -85,16 +93,21 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   iteration now = at_its_start();
   forces_at_points(run, given, parts.X, parts.F, n);
   start_nearer(&of, &parts);
+  of.state = sqrt(size_of_state(&of, parts.X));
   while (now.status == 0) {
-    const double size = find_residual(&of, parts.X, parts.F);
-    double change;
+    double change, size, left;
+    find_residual(&of, parts.X, parts.F);
     if (now.last > REFRESHED) /* as before the first */
       find_inverses(&of);
-    find_correction(&of, report);
+    left = find_correction(&of, report);
     add_multiple(&of, parts.X, 1.0, of.correction);
     forces_at_points(run, given, parts.X, parts.F, n);
     change = inner_product(&of, of.correction, of.correction);
+    size = size_of_state(&of, parts.X);
+    of.state = sqrt(size);
     judge(&now, beside_state(change, size, options), options, report);
+    if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* no correction is small for want of a solution */
+      now.status = -1, now.last = left;
   }
   if (now.status < 0)
     return failure_of(&now);

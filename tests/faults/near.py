@@ -114,7 +114,10 @@ NEAR: dict[str, tuple[str, ...]] = {
         )
         for stem in ("discrete_legendre", "ends_by", "explicit_legendre", "energies", "lagrangian", "momentum_maps")
     },
-    "templates/support/gmres": ("runtime/test_indexed_newton.py",),
+    **{
+        f"templates/support/{stem}": ("runtime/test_indexed_waves.py", "runtime/test_indexed_newton.py")
+        for stem in ("gmres", "indexed_waves", "lattice_", "linear_vectors")
+    },
     "templates/support/fmu": ("models/test_fmu.py",),
     "templates/fmu": ("models/test_fmu.py",),
     "templates/support/splitting": ("methods/test_composition.py", "runtime/test_drift.py", "runtime/test_ensemble.py"),

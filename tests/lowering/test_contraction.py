@@ -54,7 +54,7 @@ def test_long_steps_of_an_oscillator_alone_and_in_an_ensemble(method):
 
 
 def test_slow_sweeps_are_not_taken_for_rounding():
-    """Near its limit the iteration of a coupled system stops shrinking for a while, at 1e-10 of it, and fails."""
+    """Near its limit the iteration of a coupled system stops shrinking a while, at 1e-10 of the state, and fails."""
     heavy = LagrangianSystem.from_text(
         name="heavy", coordinates=["x"], lagrangian="x_dot**2*(1 + x**2/100)/2 - x**2/2", parameters={}
     )

@@ -27,6 +27,12 @@ FORMULAS = {
         "- sum(b in B, exp(k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]]))) - q[0]*q[N-1]**3"
         "- sum(i in 1..N-2, m[i]*q[i-1]*q[i+1])",
     ),
+    "lattices": (
+        ["u[NX, NY]", "q[N, 2]"],
+        "sum(i in NX periodic, j in NY, u_dot[i, j]**2/2 - u[i, j]*u[i+2, j])"
+        "+ sum(i in N, q_dot[i, 0]**2 + q_dot[i, 1]**2)"
+        "- sum(i in N periodic, q[i-1, 0]*q[i+1, 0] + q[i, 1]**4)",
+    ),
     "hamiltonian": (
         ["u[NX, NY]", "q[N]"],
         "sum(i in NX periodic, j in NY, p_u[i+1, j]*u[i, j]**2 + p_u[i, j]**2) - sum(i in N, m[i]*p_q[i]**4*q[i])",
@@ -65,7 +71,7 @@ def test_it_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
     check_strict(rendered(name, method), tmp_path)
 
 
-@pytest.mark.parametrize("name", ["bodies", "all forms"])
+@pytest.mark.parametrize("name", ["bodies", "all forms", "lattices"])
 def test_newtons_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
     """The same."""
     check_strict(rendered(name, "svi:4", newton=True), tmp_path)

@@ -1,0 +1,44 @@
+"""Lattices of sums over indices as C: where each stands in the state, and its axes."""
+
+from __future__ import annotations
+
+from math import prod
+from typing import Any
+
+from scvi_codegen.indices import Array
+from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
+
+__all__ = ["roots_of", "waves_context"]
+
+
+def waves_context(program: IndexedProgram) -> dict[str, Any]:
+    """What the template needs of lattices."""
+    before: list[str] = []
+    lines: list[str] = []
+    for array in program.coordinates:
+        sizes = ", ".join(size_text(axis) for axis in array.axes if axis.name)
+        first = " + ".join(before) or "0"
+        lines.append(
+            f"{{.first = {first}, .components = {_components(array)}, .size = {{{sizes}}}, .axes = {_axes(array)}}}"
+        )
+        before.append(product_text(array))
+    return {
+        "lattices": lines,
+        "axes": max(map(_axes, program.coordinates)),
+        "components": sum(map(_components, program.coordinates)),
+        "sizes": list(sizes_text(program, " ".join(lines))),
+    }
+
+
+def roots_of(program: IndexedProgram) -> int:
+    """Of unity: numbers of a coordinate, in which those of every axis find room."""
+    return 2 * max(map(_axes, program.coordinates))
+
+
+def _axes(array: Array) -> int:
+    return sum(bool(axis.name) for axis in array.axes)
+
+
+def _components(array: Array) -> int:
+    return prod(axis.number for axis in array.axes if not axis.name)

@@ -1,0 +1,18 @@
+/* The diagonal of F' preconditions, coordinate by coordinate. Before it: linear_vectors.h. */
+
+enum { SPARE_VECTORS = 0 }; /* of work */
+
+static void precondition(const linear_system *of, const lanes *x, lanes *y)
+{
+  apply_inverses(of, x, y, of->own);
+}
+
+static void find_inverses(linear_system *of)
+{
+  find_own_inverses(of);
+}
+
+static void reconsider(linear_system *of, double left)
+{
+  (void)of, (void)left; /* there are no others */
+}

@@ -1,0 +1,140 @@
+/* What the mean over a lattice of F' preconditions, wave by wave: with the same springs everywhere it is diagonal in
+ * Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9 (1988), 766), and ends are few. Or the diagonal of F' where
+ * that does better. Before it: lattice_answers.h. */
+
+enum { SPARE_VECTORS = 2 }; /* of work */
+#define COUPLED 0.1 /* of its own answer, what is worth waves */
+
+/* The lattices and where their roots are; 0 where one cannot be transformed, or has no room for a comb. */
+static int find_lattices(const linear_system *of, lattice *all)
+{
+  double *next = of->roots;
+  int sound = 1;
+  describe_lattices(of->given, all);
+  for (lattice *one = all; one < all + LATTICES; one++)
+    for (int a = 0; a < one->axes; a++) {
+      const long long size = one->size[a];
+      const roots of_one = {next, next + size};
+      one->of_one[a] = of_one;
+      next += 2 * size;
+      sound &= can_be_transformed(size) && size >= SPACING * COMPONENTS;
+    }
+  return sound;
+}
+
+/* exp(-2 pi i k / size) of all axes. */
+static void find_roots(const linear_system *of, const lattice *all)
+{
+  double *next = of->roots;
+  for (const lattice *one = all; one < all + LATTICES; one++)
+    for (int a = 0; a < one->axes; a++) {
+      const long long size = one->size[a];
+      const section own = share_of(of->run, size);
+      for (long long k = own.first; k < own.end; k++) {
+        const double angle = 6.283185307179586 * (double)k / (double)size;
+        next[k] = cos(angle);
+        next[size + k] = -sin(angle);
+      }
+      next += 2 * size;
+    }
+}
+
+/* Along all axes of a lattice, from x to x; y is scratch. */
+static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
+{
+  long long inner = one->components, outer = places_of(one);
+  for (int a = one->axes - 1; a >= 0; a--) {
+    axis along = {one->first, outer / one->size[a], one->size[a], inner, one->of_one[a]};
+    transform(of->run, &along, x, y, of->n);
+    inner *= one->size[a], outer /= one->size[a];
+  }
+}
+
+/* The coordinates of a lattice that are this thread's, in Fourier space. */
+static section waves_of(const linear_system *of, const lattice *one)
+{
+  section own = share_of(of->run, places_of(one) * one->components);
+  own.first += one->first, own.end += one->first;
+  return own;
+}
+
+/* Inverses, wave by wave, of the mean answers; 0 where these are nearly those of each place alone. */
+static int find_waves(linear_system *of, const lattice *all)
+{
+  find_roots(of, all);
+  find_answers(of, all, of->basis + of->count, of->product);
+  if (largest_part_elsewhere(of, all, of->product) < COUPLED)
+    return 0;
+  wait_for_others(of->run);
+  make_zero(of, of->forces);
+  wait_for_others(of->run);
+  for (const lattice *one = all; one < all + LATTICES; one++) {
+    complex_lanes x = {of->product, of->forces}, y = {of->spare, of->spare + of->count};
+    section own = waves_of(of, one);
+    transform_lattice(of, one, &x, &y);
+    for (; own.first < own.end; own.first++)
+      keep_inverse(of, own.first, at_point(&x.re[own.first], of->n, 0), 1.0 / (double)places_of(one));
+  }
+  wait_for_others(of->run);
+  return 1;
+}
+
+/* What the inverses make of the waves of a lattice; those of the real part are in the first arrays again. */
+static void filter_waves(const linear_system *of, const lattice *one, complex_lanes x, complex_lanes y)
+{
+  const section own = waves_of(of, one);
+  complex_lanes turned, scratch;
+  transform_lattice(of, one, &x, &y);
+  apply_inverses(of, x.re, x.re, own);
+  apply_inverses(of, x.im, x.im, own);
+  wait_for_others(of->run);
+  turned.re = x.im, turned.im = x.re; /* backwards: with real and imaginary parts exchanged */
+  scratch.re = y.im, scratch.im = y.re;
+  transform_lattice(of, one, &turned, &scratch);
+}
+
+static void precondition(const linear_system *of, const lanes *x, lanes *y)
+{
+  lattice all[LATTICES];
+  if (!of->by_waves) {
+    apply_inverses(of, x, y, of->own);
+    return;
+  }
+  find_lattices(of, all);
+  scale(of, y, 1.0, x);
+  make_zero(of, of->forces);
+  wait_for_others(of->run);
+  for (const lattice *one = all; one < all + LATTICES; one++) {
+    const complex_lanes both = {y, of->forces}, scratch = {of->spare, of->spare + of->count};
+    filter_waves(of, one, both, scratch);
+  }
+}
+
+/* At the first of the points that a step is sought from waves, where places are coupled. */
+static void find_inverses(linear_system *of)
+{
+  lattice all[LATTICES];
+  if (of->tried == 0)
+    of->by_waves = find_lattices(of, all);
+  if (of->by_waves) {
+    find_lattices(of, all);
+    of->by_waves = find_waves(of, all);
+  }
+  if (!of->by_waves)
+    find_own_inverses(of);
+}
+
+/* After a cycle that left such a part: where waves did not suffice the diagonal is given one, then the better stays. */
+static void reconsider(linear_system *of, double left)
+{
+  if (of->tried == 0 && of->by_waves) {
+    of->tried = 1, of->left = left;
+    of->by_waves = 0;
+    find_inverses(of);
+  } else if (of->tried == 1) {
+    of->tried = 2;
+    of->by_waves = of->left < left;
+    if (of->by_waves)
+      find_inverses(of);
+  }
+}

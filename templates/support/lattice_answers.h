@@ -1,0 +1,118 @@
+/* How a lattice answers where one place is moved, in the mean over places. Those of a comb are moved at a time, so far
+ * apart that no two answers meet, and none goes around. Before it: lattice_transform.h, describe_lattices; FARTHEST,
+ * how far an answer goes on an axis, and COMPONENTS, of all lattices. */
+
+enum { SPACING = 2 * FARTHEST + 1 };
+
+/* On each axis places from the first on, so many, so far apart. */
+typedef struct {
+  const lattice *one;
+  long long first[AXES], apart[AXES], count[AXES], component, all;
+} comb;
+
+/* That of a component, the so-manieth of all. */
+static comb comb_of(const lattice *one, long long component, long long turn)
+{
+  comb of = {.one = one, .component = component, .all = 1};
+  for (int a = 0; a < one->axes; a++) {
+    const int last = a + 1 == one->axes;
+    of.first[a] = FARTHEST + (last ? SPACING * turn : 0);
+    of.apart[a] = last ? SPACING * COMPONENTS : SPACING;
+    of.count[a] = (one->size[a] - FARTHEST - 1 - of.first[a] + of.apart[a]) / of.apart[a];
+    of.all *= of.count[a];
+  }
+  return of;
+}
+
+/* Around tooth k of a comb a coordinate, the so-manieth of a box; and where that of the first place would stand. */
+static long long beside_tooth(const comb *of, long long k, long long turn, long long *beside_first)
+{
+  long long place = 0, around = 0, apart = of->one->components;
+  for (int a = of->one->axes - 1; a >= 0; a--) {
+    const long long size = of->one->size[a], offset = turn % SPACING - FARTHEST;
+    place += apart * (of->first[a] + k % of->count[a] * of->apart[a] + offset);
+    around += apart * ((offset + size) % size);
+    apart *= size, k /= of->count[a], turn /= SPACING;
+  }
+  *beside_first = of->one->first + of->component + around;
+  return of->one->first + of->component + place;
+}
+
+/* How many coordinates an answer may reach; the tooth itself is in the middle of the box. */
+static long long box_of(const lattice *one)
+{
+  long long size = 1;
+  for (int a = 0; a < one->axes; a++)
+    size *= SPACING;
+  return size;
+}
+
+/* 1 at the teeth, which are not many. */
+static void move_teeth(const linear_system *of, const comb *teeth, lanes *x)
+{
+  const long long middle = box_of(teeth->one) / 2;
+  for (long long k = 0; k < teeth->all; k++) {
+    long long unused;
+    const long long i = beside_tooth(teeth, k, middle, &unused);
+    for (int g = 0; g < GROUPS; g++)
+      x[g * of->n + i] = lanes_of(1.0);
+  }
+}
+
+/* The mean answer, h^2 F' / m, to the first place of the lattice alone. */
+static void find_mean(const linear_system *of, const comb *teeth, const lanes *answer, lanes *mean)
+{
+  for (long long b = box_of(teeth->one) - 1; b >= 0; b--) {
+    long long beside = 0;
+    double sum = 0.0;
+    for (long long k = 0; k < teeth->all; k++)
+      sum += slope_of(of, answer, beside_tooth(teeth, k, b, &beside));
+    for (int g = 0; g < GROUPS; g++)
+      mean[g * of->n + beside] = lanes_of(sum / (double)teeth->all);
+  }
+}
+
+/* The mean answers of all lattices in `mean`; x is overwritten. */
+static void find_answers(linear_system *of, const lattice *all, lanes *x, lanes *mean)
+{
+  const section own = share_of(of->run, COMPONENTS);
+  make_zero(of, x);
+  make_zero(of, mean);
+  wait_for_others(of->run);
+  for (int asked = 1; asked >= 0; asked--) {
+    long long turn = 0;
+    for (const lattice *one = all; one < all + LATTICES; one++)
+      for (long long component = 0; component < one->components; component++, turn++) {
+        const comb teeth = comb_of(one, component, turn);
+        if (turn < own.first || turn >= own.end)
+          continue;
+        if (asked)
+          move_teeth(of, &teeth, x);
+        else
+          find_mean(of, &teeth, of->forces, mean);
+      }
+    if (asked)
+      products(of->run, of->given, of->X, x, of->forces, of->n); /* which waits for others first */
+  }
+  wait_for_others(of->run);
+}
+
+/* What answers elsewhere, as a part of what does at the place that is moved: the largest of all components. */
+static double largest_part_elsewhere(const linear_system *of, const lattice *all, const lanes *mean)
+{
+  double largest = 0.0;
+  long long turn = 0;
+  for (const lattice *one = all; one < all + LATTICES; one++)
+    for (long long component = 0; component < one->components; component++, turn++) {
+      const comb teeth = comb_of(one, component, turn);
+      const double own = fabs(at_point(&mean[one->first + component], of->n, 0));
+      double sum = -own;
+      for (long long b = 0; b < box_of(one); b++) {
+        long long beside;
+        beside_tooth(&teeth, 0, b, &beside);
+        sum += fabs(at_point(&mean[beside], of->n, 0));
+      }
+      largest = sum > 0.0 ? larger(largest, sum / own) : largest;
+    }
+  return largest;
+}

@@ -1,0 +1,159 @@
+"""What waves precondition: steps on lattices far beyond the limit of sweeps, with few products."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import StepFailedError
+from scvi_codegen.lowering.indexed import lower_indexed
+from scvi_codegen.methods import as_method
+
+RANDOM = np.random.default_rng(1)
+ROUNDING = 2.0**-52
+KINETIC = {1: "sum(i in N, q_dot[i]**2/2)", 2: "sum(i in NX, j in NY, q_dot[i, j]**2/2)"}
+LATTICES = {
+    "ring": "sum(i in N periodic, k*(q[i+1] - q[i])**2/2)",
+    "ring to the fourth": "sum(i in N periodic, k*(q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)",
+    "chain": "sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2) - sum(i in N, cos(q[i]))",
+    "beam": "sum(i in 1..N-2, k*(q[i+1] - 2*q[i] + q[i-1])**2/2)",
+    "plane": "sum(i in NX periodic, j in NY periodic, k*((q[i+1, j] - q[i, j])**2 + 3*(q[i, j+1] - q[i, j])**2)/2)",
+    "held plane": "sum(i in NX periodic, j in 0..NY-2, k*((q[i+1, j] - q[i, j])**2 + (q[i, j+1] - q[i, j])**2)/2)"
+    "+ sum(i in NX, k*(q[i, 0]**2 + q[i, NY-1]**2)/2 + q[i, 1]**4)",
+}
+COUNTS = [("ring to the fourth", 1000, 5), ("chain", 1000, 40), ("beam", 500, 30), ("held plane", (32, 30), 110)]
+"""Sizes, products a step."""
+
+
+@cache
+def stepper_of(name, method="svi:4", solver="newton"):
+    return sc.compile_indexed(lattice(name), method, solver=solver)
+
+
+def lattice(name):
+    potential = LATTICES[name]
+    return sc.IndexedSystem.from_text(
+        name=name,
+        coordinates=["q[NX, NY]" if "NX" in potential else "q[N]"],
+        parameters={"k": 1},
+        lagrangian=f"{KINETIC[2 if 'NX' in potential else 1]} - ({potential})",
+    )
+
+
+def smooth(shape):
+    """Waves of a few dozen places."""
+    return np.cos(sum(np.ix_(*(np.arange(size) / 5 for size in np.atleast_1d(shape)))))
+
+
+def products_of(stepper, q, h, *, steps=1, **given):
+    """How many products steps take, which must converge."""
+    run = stepper.start(q, h=h, **given)
+    report = run._binding.new("report *")
+    assert run._steps(steps, report) == 0
+    return report.products
+
+
+@pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
+@pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
+def test_waves_of_a_linear_ring_are_independent(size, method):
+    """With the right transform of every size, and the right symbol, a product leaves nothing but rounding."""
+    q = RANDOM.normal(size=size)
+    assert products_of(stepper_of("ring", method), q, 1.0, parameters={"k": 1e3}) <= 3
+
+
+@pytest.mark.parametrize("shape", [(12, 35), (11, 26), (64, 48), (4, 62)])
+def test_so_are_those_of_a_plane(shape):
+    q = RANDOM.normal(size=shape)
+    assert products_of(stepper_of("plane"), q, 1.0, parameters={"k": 1e3}) <= 3
+
+
+def test_arrays_have_waves_of_their_own():
+    """Components, and arrays of other axes: all are asked at a time, and none answers for another."""
+    arrays = sc.IndexedSystem.from_text(
+        name="arrays",
+        coordinates=["r[N, 3]", "u[NX, NY]"],
+        lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2/2)) + sum(i in NX, j in NY, u_dot[i, j]**2/2)"
+        "- sum(i in N periodic, 9*(r[i+1, 0] - r[i, 0])**2 + 900*(r[i+2, 1] - r[i, 1])**2 + r[i, 2]**2)"
+        "- sum(i in NX periodic, j in NY periodic, 300*(u[i+1, j] - u[i, j+1])**2)",
+    )
+    stepper = sc.compile_indexed(arrays, "svi:4", solver="newton")
+    start = {"r": RANDOM.normal(size=(60, 3)), "u": RANDOM.normal(size=(20, 33))}
+    assert products_of(stepper, start, 1.0) <= 3
+
+
+@pytest.mark.parametrize(("name", "shape", "most"), COUNTS)
+def test_ends_and_amplitudes_cost_few_products(name, shape, most):
+    """The diagonal alone gives all of these up."""
+    assert products_of(stepper_of(name), smooth(shape), 1.0, steps=3, parameters={"k": 1e4}) <= 3 * most
+
+
+@pytest.mark.parametrize("name", LATTICES)
+@pytest.mark.parametrize("k", [1e2, 1e5])
+def test_steps_are_those_of_the_system_written_out(name, k):
+    """By Newton's iteration with whole matrices; the least lattices are too small to be asked for waves."""
+    for shape in [(2, 7), (7, 12)] if "plane" in name else [4, 34]:
+        sizes = dict(zip(("NX", "NY"), shape, strict=True)) if "plane" in name else {"N": shape}
+        small = sc.expand_sums(lattice(name), sizes)
+        q, v = smooth(shape), smooth(shape)
+        run = stepper_of(name).start(q, velocity=v, h=0.5, parameters={"k": k})
+        run.advance(1)
+        end, momenta = sc.compile_stepper(small, "svi:4", solver="newton").step(
+            q.ravel(), v.ravel(), 0.5, parameters={"k": k}
+        )
+        grain = 64 * ROUNDING * (1.0 + 16 * 0.25 * k) * np.abs(run.q["q"]).max()
+        assert np.abs(run.q["q"].ravel() - end).max() < grain
+        assert np.abs(run.p["q"].ravel() - momenta).max() < 16 * grain
+
+
+@pytest.mark.parametrize("name", ["chain", "beam"])
+def test_no_correction_is_small_for_want_of_a_solution(name):
+    """The size has a factor beyond those that are transformed, and the diagonal says nothing of long waves."""
+    run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
+    with pytest.raises(StepFailedError, match="GMRES"):
+        run.advance(1)
+
+
+def test_no_bit_depends_on_the_number_of_threads():
+    ends = []
+    for threads in (1, 2, 3):
+        run = stepper_of("held plane").start(smooth((64, 60)), h=0.5, parameters={"k": 1e4}, threads=threads)
+        run.advance(2)
+        ends.append((run.q["q"].tobytes(), run.p["q"].tobytes()))
+    assert ends[0] == ends[1] == ends[2]
+
+
+def test_the_diagonal_stays_where_waves_do_not_serve():
+    """Places that differ by a factor of a million, with springs between them that are soft to most."""
+    places = sc.IndexedSystem.from_text(
+        name="places",
+        coordinates=["q[N]"],
+        parameters={"w[N]": 1},
+        lagrangian="sum(i in N, q_dot[i]**2/2 - w[i]*q[i]**2/2) - sum(i in N periodic, 2*(q[i+1] - q[i])**2)",
+    )
+    stepper, w = sc.compile_indexed(places, "svi:4", solver="newton"), 10.0 ** RANDOM.uniform(0, 6, size=400)
+    assert products_of(stepper, RANDOM.normal(size=400), 1.0, parameters={"w": w}) <= 120
+
+
+@pytest.mark.parametrize(
+    ("term", "reach"),
+    [
+        ("sum(i in N periodic, (u[i+1, 0] - u[i, 0])**2)", 1),
+        ("sum(i in 2..N-4, u[i-2, 0]*u[i+3, 0])", 5),
+        ("sum(i in N, (u[i, 0] - u[i, 1])**2)", 0),
+        ("sum(i in N, u[i, 0]*u[0, 0])", 0),
+        ("sum(b in B, w[b]*u[0, 0]*u[1, 0])", 0),
+        ("sum(i < j in N, u[i, 0]*u[j, 0])", 0),
+        ("sum(b in B, u[bonds[b, 0], 0]*u[bonds[b, 1], 0])", 0),
+        ("sum(i in N periodic, u[i, 0]*u[i+1, 0]) - sum(b in B, u[bonds[b, 0], 0]*u[bonds[b, 1], 0])", 0),
+    ],
+)
+def test_which_systems_have_waves(term, reach):
+    system = sc.IndexedSystem.from_text(
+        name="some",
+        coordinates=["u[N, 2]"],
+        parameters={"w[B]": 1},
+        tables=["bonds[B, 2]"],
+        lagrangian=f"sum(i in N, sum(a in 2, u_dot[i, a]**2/2)) - {term}",
+    )
+    assert lower_indexed(system, as_method("svi:2"), "some", newton=True).reach == reach
