@@ -11,12 +11,13 @@ import numbers
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from inspect import signature
+from inspect import Parameter, signature
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from scvi_codegen.errors import ArgumentError, ScviCodegenError
+from scvi_codegen.keywords import keyword_meant
 
 __all__ = [
     "CANVAS",
@@ -105,15 +106,22 @@ def takes(error: type[ScviCodegenError] = ArgumentError, /, **kinds: Kind) -> Ca
     >>> greet(3)
     Traceback (most recent call last):
     scvi_codegen.errors.ArgumentError: name must be text, not 3
+
+    A keyword that the function does not have is refused, too, with what it may have been meant to say.
     """
 
     def decorate(function: Called) -> Called:
         parameters = signature(function).parameters
         names = tuple(parameters)
+        known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
+        open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
         optional = {name for name in names if parameters[name].default is None}
 
         @functools.wraps(function)
         def checked(*given: Any, **named: Any) -> Any:
+            if not (open_ended or named.keys() <= known.keys()):
+                name = next(name for name in named if name not in known)
+                raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_meant(name, known)}")
             pairs: Iterable[tuple[str, Any]] = (*zip(names, given, strict=False), *named.items())
             for name, value in pairs:
                 if name in kinds and not (value is None and name in optional):

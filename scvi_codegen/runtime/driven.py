@@ -19,7 +19,7 @@ from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.inputs import Array, TakesInputs, check_left_to_inputs
+from scvi_codegen.runtime.inputs import Array, TakesInputs, check_left_to_inputs, no_input
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -84,7 +84,7 @@ def checked_inputs(
         raise StateError("what moves in transformed time has no inputs: integrate(..., t_end=...) leads to a time")
     for name in given:
         if name not in names:
-            raise StateError(f"{name!r} is no input of this system, which has {', '.join(names) or 'none'}")
+            raise no_input(name, names)
     if missing := [name for name in names if name not in given]:
         raise StateError(f"the input {missing[0]} is not given: inputs={{'{missing[0]}': (t, values)}}")
     return {name: input_of(name, value, trajectories) for name, value in given.items()}

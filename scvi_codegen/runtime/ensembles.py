@@ -24,6 +24,7 @@ __all__ = ["Ensembles"]
 class Ensembles(ConstrainedStates):
     """Integrations of many states, each on its own, over all cores."""
 
+    @takes(StateError, progress=FUNCTION)
     def integrate_ensemble(
         self,
         q: ArrayLike,

@@ -13,8 +13,14 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.indexed_interface import Numbers
 
-__all__ = ["IndexedMark", "aligned", "held_memory"]
+__all__ = ["MOMENTS", "STATE", "IndexedMark", "aligned", "held_memory"]
 
+CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
+"""Of steps that choose their length."""
+MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", "largest_q", "largest_p", "leaving", *CHOICE)
+"""Of a run, beside its arrays."""
+STATE = ("q", "p", "carry_q", "carry_p")
+"""Arrays of numbers that change from step to step, but for what guesses are made of."""
 ALIGNMENT = 64
 """Bytes: those of the widest vector."""
 

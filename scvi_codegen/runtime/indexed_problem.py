@@ -8,10 +8,10 @@ from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, RunArrays, field_values, number_values
+from scvi_codegen.runtime.inputs import inputs_not_given, no_input
 
 __all__ = ["IndexedProblem"]
 
@@ -22,11 +22,14 @@ class IndexedProblem:
     Attributes:
         interface, binding: of the integrator.
         arrays: what it is made from; its state is that of the start.
+        awaited: inputs that nobody gave: no step is made before.
         struct: of C.
     """
 
-    def __init__(self, interface: IndexedInterface, binding: Binding, arrays: RunArrays) -> None:
-        self.interface, self.binding, self.arrays = interface, binding, arrays
+    def __init__(
+        self, interface: IndexedInterface, binding: Binding, arrays: RunArrays, awaited: tuple[str, ...] = ()
+    ) -> None:
+        self.interface, self.binding, self.arrays, self.awaited = interface, binding, arrays, awaited
         self.struct = binding.new("problem *")
         for k, name in enumerate(interface.sizes):
             self.struct.size[k] = arrays.sizes[name]
@@ -57,12 +60,13 @@ class IndexedProblem:
         Raises:
             StateError: for names, shapes and numbers that do not fit.
         """
+        missing = inputs_not_given(self.interface, given)
         if not isinstance(given, Mapping):
             given = dict(zip(self.interface.parameters, given, strict=True))
         known = self.parameters | dict(given)
         fields = field_values(self.interface, known, self.arrays.sizes)
         numbers = number_values(self.interface, known)
-        return type(self)(self.interface, self.binding, replace(self.arrays, numbers=numbers, fields=fields))
+        return self._with(replace(self.arrays, numbers=numbers, fields=fields), missing)
 
     def held(self, inputs: Mapping[str, float]) -> Self:
         """The same with inputs held at numbers.
@@ -73,9 +77,14 @@ class IndexedProblem:
         values: dict[str, float] = {}
         for name, value in inputs.items():
             if name not in self.interface.inputs:
-                known = ", ".join(self.interface.inputs) or "none"
-                raise StateError(f"{name!r} is no input of this system, which has {known}")
+                raise no_input(name, self.interface.inputs)
             values |= {f"{name}_0": checked_number(value, f"the input {name}")}
             values |= {f"{name}_{part}": 0.0 for part in "123t"}
         numbers = number_values(self.interface, self._numbers | values)
-        return type(self)(self.interface, self.binding, replace(self.arrays, numbers=numbers))
+        missing = tuple(name for name in self.awaited if name not in inputs)
+        return self._with(replace(self.arrays, numbers=numbers), missing)
+
+    def _with(self, arrays: RunArrays, missing: tuple[str, ...]) -> Self:
+        """The same with other numbers, of which these inputs are not yet some."""
+        awaited = tuple(name for name in self.awaited if name in missing)
+        return type(self)(self.interface, self.binding, arrays, awaited)

@@ -20,8 +20,9 @@ from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_arrays, read_state
 from scvi_codegen.runtime.indexed_maps import momentum_of
-from scvi_codegen.runtime.indexed_memory import IndexedMark, aligned, held_memory
+from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE, IndexedMark, aligned, held_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
+from scvi_codegen.runtime.inputs import missing_input
 from scvi_codegen.runtime.portions import SLICE_SECONDS
 
 __all__ = ["IndexedRun"]
@@ -38,12 +39,6 @@ ADVICE_BY_SOLVER = {
     "newton": ADVICE | {"not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"},
     "rattle": ADVICE | {"not converged": "constraints turn too far in a step to be met at its end: try a smaller h"},
 }
-CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
-"""Of steps that choose their length."""
-MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", "largest_q", "largest_p", "leaving", *CHOICE)
-"""Of a run, beside its arrays."""
-STATE = ("q", "p", "carry_q", "carry_p")
-"""Arrays of numbers that change from step to step, but for what guesses are made of."""
 
 
 class IndexedRun:
@@ -376,6 +371,8 @@ class IndexedRun:
         """
         steps, done, portion = checked_count(steps, "steps", least=0), 0, 1
         report = self._binding.new("report *")
+        if steps and self.problem.awaited:
+            raise missing_input(self.problem.awaited[0])
         while done < steps and not self.arrived and not (stop and stop()):
             size, began = min(portion, steps - done), time.perf_counter()
             status = self._steps(size, report)

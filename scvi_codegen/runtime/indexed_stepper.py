@@ -28,7 +28,7 @@ from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, Ru
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
-from scvi_codegen.runtime.inputs import check_inputs_given, check_left_to_inputs
+from scvi_codegen.runtime.inputs import check_inputs_given, check_left_to_inputs, inputs_not_given
 
 __all__ = ["IndexedStepper"]
 
@@ -81,6 +81,7 @@ class IndexedStepper:
             )
         return Binding(load(source, flags=self.flags), self.interface.prefix)
 
+    @takes(StateError, parameters=MAPPING, tables=MAPPING)
     def start(
         self,
         q: ArrayLike | Mapping[str, ArrayLike],
@@ -106,7 +107,7 @@ class IndexedStepper:
         arrays, moving = self._given(q, p, velocity, parameters, tables)
         length = 0.0 if h is None else checked_step(h)
         run = IndexedRun(
-            IndexedProblem(self.interface, binding, arrays),
+            IndexedProblem(self.interface, binding, arrays, inputs_not_given(self.interface, parameters)),
             arrays.state,
             moving,
             h=length,

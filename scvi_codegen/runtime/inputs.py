@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
 
@@ -25,6 +25,7 @@ __all__ = [
     "columns_of_inputs",
     "inputs_not_given",
     "missing_input",
+    "no_input",
     "parameter_index",
 ]
 
@@ -126,6 +127,16 @@ def missing_input(name: str) -> StateError:
     return StateError(
         f"the input {name} is not given: stepper.drive(..., inputs={{'{name}': (t, values)}}) follows data, "
         f"run.hold({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
+    )
+
+
+def no_input(name: str, inputs: Collection[str]) -> StateError:
+    """How it is said that a system does not have an input of this name."""
+    if inputs:
+        return StateError(f"{name!r} is no input of this system, which has {', '.join(inputs)}{closest(name, inputs)}")
+    return StateError(
+        f"{name!r} is no input of this system, which has none: its definition declares them, inputs=['{name}'], beside "
+        f"formulas with {name} in them"
     )
 
 

@@ -21,6 +21,7 @@ from scvi_codegen.runtime.inputs import (
     checked_vector,
     inputs_not_given,
     missing_input,
+    no_input,
     parameter_index,
 )
 from scvi_codegen.runtime.integrator import Integrator
@@ -184,7 +185,7 @@ class Memory:
         values = self._parameters.copy()
         for name, value in inputs.items():
             if name not in self._inputs:
-                raise StateError(f"{name!r} is no input of this system, which has {', '.join(self._inputs) or 'none'}")
+                raise no_input(name, self._inputs)
             values[self._inputs[name]] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
         self._go_on_with(values)
         if self._awaited:

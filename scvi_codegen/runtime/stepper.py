@@ -122,6 +122,7 @@ class Stepper(Ensembles):
             raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
         return _said(Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress))
 
+    @takes(StateError)
     def start(
         self,
         q: ArrayLike,

@@ -21,6 +21,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors version
+    keywords
     counts indices kinds
     tables files
     formulas display ir

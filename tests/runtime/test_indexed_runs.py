@@ -226,6 +226,13 @@ class TestInputs:
         stepper = sc.compile_indexed(driven, "svi:6")
         with pytest.raises(StateError, match="the input F is not given"):
             stepper.integrate(Q, h=0.1, steps=1)
+        run = stepper.start(Q, h=0.1)
+        with pytest.raises(StateError, match="the input F is not given"):
+            run.advance(1)
+        assert run.steps == 0
+        run.change(parameters={"F_0": 0.0})
+        run.advance(1)
+        assert run.steps == 1
         with pytest.raises(StateError, match="is given from t = 0 to 5"):
             stepper.drive(Q, inputs=DATA, h=0.1, t_end=6.0)
 

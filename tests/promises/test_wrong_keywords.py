@@ -1,0 +1,103 @@
+"""Keywords that a function does not have: an error that says what was meant, or where it belongs."""
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen.errors import ArgumentError, StateError
+from scvi_codegen.keywords import ELSEWHERE, WORDS, keyword_meant
+from scvi_codegen.runtime.stepper import Stepper
+
+PUSHED = sc.LagrangianSystem.from_text(
+    name="pushed pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "u"}, inputs=["u"]
+)
+DATA = {"u": ([0.0, 1.0], [0.0, 1.0])}
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    return sc.compile_stepper(PUSHED, "svi:2", flags=QUICK_FLAGS)
+
+
+@pytest.fixture(scope="module")
+def chain():
+    system = sc.IndexedSystem.from_text(
+        name="pushed chain",
+        coordinates=["q[N]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2)",
+        forces={"q[0]": "u"},
+        inputs=["u"],
+    )
+    return sc.compile_indexed(system, "svi:2")
+
+
+@pytest.mark.parametrize("name", ["integrate", "start", "integrate_ensemble"])
+def test_inputs_go_to_drive(name, stepper):
+    with pytest.raises(ArgumentError, match=rf"{name}\(\) takes no 'inputs': a system with inputs runs by \.drive\("):
+        getattr(stepper, name)([0.2], [0.0], h=0.1, inputs=DATA)
+    assert stepper.drive([0.2], [0.0], h=0.1, steps=3, inputs=DATA).t[-1] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("name", ["integrate", "start"])
+def test_so_do_those_of_sums(name, chain):
+    with pytest.raises(ArgumentError, match=r"takes no 'inputs': a system with inputs runs by \.drive\("):
+        getattr(chain, name)(np.zeros(3), h=0.1, inputs=DATA)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [
+        ({"dt": 0.1}, "'dt'; did you mean 'h'?"),
+        ({"n_steps": 10}, "'n_steps'; did you mean 'steps'?"),
+        ({"velocty": [0.0]}, "'velocty'; did you mean 'velocity'?"),
+        ({"v0": [0.0]}, "'v0'; did you mean 'velocity'?"),
+        ({"method": "svi:4"}, "'method': the method is said where it is compiled"),
+        ({"colour": "red"}, "'colour': it takes q, p, velocity, h, steps, t_end"),
+    ],
+    ids=str,
+)
+def test_words_of_other_programs(wrong, meant, stepper):
+    with pytest.raises(TypeError) as caught:
+        stepper.integrate([0.2], **wrong)
+    assert str(caught.value).startswith(f"Stepper.integrate() takes no {meant}")
+
+
+@pytest.mark.parametrize(
+    ("function", "wrong", "meant"),
+    [
+        (sc.compile_stepper, {"h": 0.1}, "takes no 'h': steps of h are taken by a stepper"),
+        (sc.compile_stepper, {"degree": 8}, "takes no 'degree': it goes with the name of the method, 'svi:8'"),
+        (sc.verify, {"velocity": [0.0]}, "takes no 'velocity': it takes momenta, p = stepper.momentum(q, velocity)"),
+        (sc.LagrangianSystem.from_text, {"L": "x"}, "takes no 'L'; did you mean 'lagrangian'?"),
+    ],
+    ids=lambda each: getattr(each, "__name__", None) or str(each),
+)
+def test_functions_say_what_was_meant(function, wrong, meant):
+    with pytest.raises(ArgumentError) as caught:
+        function(**wrong)
+    assert meant in str(caught.value)
+
+
+def test_no_word_hides_a_keyword():
+    """What a function has is never said to be another, and every place that is named is one."""
+    assert keyword_meant("q", ["y0"]) == "; did you mean 'y0'?"
+    assert keyword_meant("n", ["mass"]).startswith(": their number goes to run.advance(n)")
+    assert not {word for word, others in WORDS.items() if word in others.split()}
+    for name in ("drive", "drive_ensemble", "integrate", "momentum"):
+        assert hasattr(Stepper, name)
+        assert any(f".{name}" in place for place in ELSEWHERE.values())
+
+
+def test_an_input_that_is_none_is_said_how_to_declare(stepper, chain):
+    free = sc.compile_stepper(
+        sc.LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2"),
+        "svi:2",
+        flags=QUICK_FLAGS,
+    )
+    with pytest.raises(StateError, match=r"'u' is no input of this system, which has none: .* inputs=\['u'\]"):
+        free.drive([0.2], [0.0], h=0.1, steps=3, inputs=DATA)
+    with pytest.raises(StateError, match=r"'u1' is no input of this system, which has u; did you mean 'u'\?"):
+        stepper.drive([0.2], [0.0], h=0.1, steps=3, inputs={"u1": DATA["u"]})
+    with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
+        chain.start(np.zeros(3), h=0.1).hold(w=1.0)
