@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.advice.known_digits import Known
+from scvi_codegen.cli.conservation import Balance
 from scvi_codegen.cli.ensembles import EnsembleOutcome
 from scvi_codegen.cli.recording import RecordedOutcome
 from scvi_codegen.cli.running import RunOutcome
@@ -22,7 +23,9 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"]
 
 
-def run_numbers(model: Model, outcome: RunOutcome, known: Known | None) -> dict[str, Any]:
+def run_numbers(
+    model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None
+) -> dict[str, Any]:
     """Of one run in memory."""
     run, trajectory = outcome.run, outcome.trajectory
     t, q, p = outcome.end
@@ -35,6 +38,8 @@ def run_numbers(model: Model, outcome: RunOutcome, known: Known | None) -> dict[
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,
         **_conserved(trajectory),
+        "work": None if balance is None else balance.work,
+        "energy_balance": None if balance is None else balance.error,
         "step_error": trajectory.step_error,
         "step_error_t": trajectory.step_error_t,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p)},

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scvi_codegen.advice.known_digits import Known, known_digits
-from scvi_codegen.cli.conservation import energy_report, momentum_report
+from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration, in_known_digits
@@ -197,7 +197,7 @@ def _by_time(model: Model) -> bool:
     return model.ends_at_time or bool(model.system.inputs)
 
 
-def summary(model: Model, outcome: RunOutcome, known: Known | None) -> str:
+def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None) -> str:
     """The run in a few lines; little if not one step was made."""
     run, trajectory, method = outcome.run, outcome.trajectory, model.method
     order = "no order claimed" if method.order is None else f"order {method.order}"
@@ -210,7 +210,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None) -> str:
     if run.steps:
         lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
-            lines += conserved(model, trajectory)
+            lines += conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
     return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
 
@@ -248,10 +248,10 @@ def _speed(outcome: RunOutcome, every: int) -> str:
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"
 
 
-def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory) -> Iterator[str]:
+def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: Balance | None = None) -> Iterator[str]:
     """A line for each quantity that should have been conserved: how well it was."""
     try:
-        yield energy_report(model.system, trajectory)
+        yield energy_report(model.system, trajectory, balance)
     except StateError as error:
         yield f"energy: {error}"
     yield from momentum_report(trajectory)

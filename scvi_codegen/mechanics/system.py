@@ -147,6 +147,12 @@ class MechanicalSystem(ABC):
             return "constraints move, and do work"
         return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.depends_on_time else ""
 
+    @property
+    def balances_energy(self) -> bool:
+        """Whether forces or damping change the energy, and nothing else: by their work."""
+        acted = bool(self.forces) or self.damping != 0
+        return acted and not (self.formula.has(self.time) or self._constraints_work())
+
     def _constraints_work(self) -> bool:
         """Whether the motions that constraints allow do not include rest: time in them, or A v + b = 0 with b."""
         at_rest = dict.fromkeys(self.velocities, sympy.S.Zero)

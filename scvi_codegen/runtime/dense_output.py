@@ -29,6 +29,7 @@ from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.memory import Memory
 
 __all__ = [
+    "ON_GRID",
     "checked_times",
     "grid_tolerance",
     "lengths_at",
@@ -91,11 +92,11 @@ def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal:
     return q, p
 
 
-def whole_steps(spans: Array, h: Array) -> NDArray[np.int64]:
-    """Steps of h that fit into spans; one that only rounding makes too long fits."""
+def whole_steps(spans: Array, h: Array, slack: float = 0.0) -> NDArray[np.int64]:
+    """Steps of h that fit into spans; one that only rounding makes too long fits, or a part of it, the slack."""
     ratio = spans / h
     nearest = np.rint(ratio)
-    fits = np.abs(ratio - nearest) <= ROUNDINGS * np.finfo(float).eps * np.maximum(1.0, nearest)
+    fits = np.abs(ratio - nearest) <= slack + ROUNDINGS * np.finfo(float).eps * np.maximum(1.0, nearest)
     return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
 
 

@@ -12,9 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.dense_output import whole_steps
+from scvi_codegen.runtime.dense_output import ON_GRID, whole_steps
 from scvi_codegen.runtime.kept_states import Array, KeptStates
-from scvi_codegen.runtime.times import WHOLE
 
 __all__ = ["refuse_strays", "retaken", "steps_between"]
 
@@ -54,8 +53,8 @@ def steps_between(length: float, span: float) -> int:
     """How many steps of a length; 1 for a last one that an event or the end cut short."""
     if np.isnan(length):
         raise StateError("this is known of whole steps: integrate without t_eval, and with every=1")
-    count = int(whole_steps(np.array([span]), np.array([length]))[0])
-    if count > 1 and abs(span - count * length) > WHOLE * abs(length):
+    count = int(whole_steps(np.array([span]), np.array([length]), slack=ON_GRID)[0])
+    if count > 1 and abs(span - count * length) > ON_GRID * abs(length):
         raise StateError("this is known of whole steps: keep all states (every=1)")
     return max(1, count)
 

@@ -11,6 +11,7 @@ import click
 from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.cli.advising import advised_model, controlled_model
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.cli.conservation import energy_balance
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
 from scvi_codegen.cli.numbers import ensemble_numbers, failure_text, recorded_numbers, run_numbers
@@ -224,7 +225,8 @@ def _run_one(
 ) -> None:
     outcome = integrate_model(model, solver=solver, options=options)
     known = known_at_end(model, outcome)
-    tell(summary(model, outcome, known), **run_numbers(model, outcome, known))
+    balance = energy_balance(model.system, outcome.trajectory, outcome.run.steps)
+    tell(summary(model, outcome, known, balance), **run_numbers(model, outcome, known, balance))
     written = _write_outputs(outcome, output, plot)
     tell(written=written)
     if outcome.failure is not None:
