@@ -354,7 +354,15 @@ def describe(
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,
         energy_parameter=system.clock.energy.name if system.clock else "",
+        solver=_solver_of(program),
     )
+
+
+def _solver_of(program: Program) -> str:
+    """What solves the equations of its steps first."""
+    if program.splitting:
+        return "explicit"
+    return "rattle" if program.rattle else "fixed-point" if program.sweep else "newton"
 
 
 def c_identifier(name: str) -> str:

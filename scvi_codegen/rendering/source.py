@@ -124,6 +124,8 @@ class Interface:
         energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
         monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
         conserves_energy: whether the motion does; not known of folders of version 0.1.
+        solver: of the stage equations, as of ``compile_stepper``, Newton's iteration behind it or not; not known of
+            folders of version 0.1.
     """
 
     prefix: str
@@ -148,6 +150,7 @@ class Interface:
     constraints: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     conserves_energy: bool = False
+    solver: str = ""
 
     @property
     def dimension(self) -> int:

@@ -19,6 +19,7 @@ from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.nearby_driven import NearbyDrivenMotions
 from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.standing import holds
 from scvi_codegen.runtime.trajectory import Trajectory, relative_changes
 
 if TYPE_CHECKING:
@@ -42,6 +43,9 @@ class DrivenTrajectory(NearbyDrivenMotions):
     """
 
     pieces: tuple[Trajectory, ...]
+
+    def __repr__(self) -> str:
+        return holds(self, f", breakpoints between: {len(self.pieces) - 1}")
 
     @property
     def t(self) -> Array:

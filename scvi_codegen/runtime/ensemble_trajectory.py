@@ -68,6 +68,10 @@ class EnsembleTrajectory:
     def __len__(self) -> int:
         return len(self.status)
 
+    def __repr__(self) -> str:
+        states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
+        return f"<EnsembleTrajectory of {self.stepper.title}; {states}>"
+
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(k,) which trajectories reached the end."""

@@ -24,6 +24,7 @@ from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE, IndexedMark, ali
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.inputs import missing_input
 from scvi_codegen.runtime.portions import SLICE_SECONDS
+from scvi_codegen.runtime.standing import stands
 
 __all__ = ["IndexedRun"]
 
@@ -78,7 +79,8 @@ class IndexedRun:
         self._start(q, moving, h, t)
 
     def __repr__(self) -> str:
-        return f"<IndexedRun of {self.interface.title}: {self.sizes}, t = {self.t:g} after {self.steps} steps>"
+        sizes = "".join(f", {name} = {size}" for name, size in self.sizes.items())
+        return stands(f"{self.interface.title}{sizes}", self.interface.solver, self, awaited=self.problem.awaited)
 
     @property
     def interface(self) -> IndexedInterface:

@@ -13,6 +13,7 @@ from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.portions import record
+from scvi_codegen.runtime.standing import stands
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Run"]
@@ -20,6 +21,11 @@ __all__ = ["Run"]
 
 class Run(Memory):
     """An integration under way: :class:`Memory`, and the recording of its states."""
+
+    def __repr__(self) -> str:
+        interface = self.stepper.interface
+        tau = bool(interface.energy_parameter)
+        return stands(interface.title, interface.solver, self, tau=tau, awaited=self._awaited)
 
     def __reduce__(self) -> tuple[Any, ...]:
         known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))

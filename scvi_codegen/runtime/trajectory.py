@@ -26,6 +26,7 @@ from scvi_codegen.runtime.exchanges import exchanged_until
 from scvi_codegen.runtime.kept_states import Array
 from scvi_codegen.runtime.nearby import NearbyMotions
 from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.standing import holds, lengths_of
 
 if TYPE_CHECKING:
     import pandas
@@ -71,6 +72,9 @@ class Trajectory(NearbyMotions):
     rejected: int = 0
     step_error: float = np.nan
     step_error_t: float = np.nan
+
+    def __repr__(self) -> str:
+        return holds(self, lengths_of(self.h, self.goal, tau=self.tau is not None))
 
     @classmethod
     def before(cls, failure: StepFailedError) -> Self:

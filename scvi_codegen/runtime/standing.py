@@ -1,0 +1,65 @@
+"""Runs and their results in a line, as ``repr`` shows them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.integrator import Integrator
+
+__all__ = ["holds", "lengths_of", "stands"]
+
+
+class Standing(Protocol):
+    """What is asked of a run."""
+
+    goal: Goal | None
+
+    @property
+    def t(self) -> float: ...
+    @property
+    def h(self) -> float: ...
+    @property
+    def steps(self) -> int: ...
+
+
+class Kept(Protocol):
+    """What is asked of the states of a run."""
+
+    @property
+    def stepper(self) -> Integrator: ...
+    @property
+    def t(self) -> Array: ...
+    @property
+    def steps(self) -> int: ...
+
+
+def stands(title: str, solver: str, run: Standing, *, tau: bool = False, awaited: tuple[str, ...] = ()) -> str:
+    """``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``.
+
+    Args:
+        title: system and method.
+        solver: of the stage equations, nothing where it is not known.
+        run: where it stands.
+        tau: whether its steps are of transformed time.
+        awaited: inputs that the next step waits for.
+    """
+    goal = "" if run.goal is None else f" on the way to {run.goal.t_end:g}"
+    solved = f", solver {solver}" if solver else ""
+    waits = f", waits for {', '.join(awaited)}" if awaited else ""
+    steps = f"{run.steps} steps{lengths_of(run.h, run.goal, tau=tau)}"
+    return f"<{type(run).__name__} of {title}; t = {run.t:g} after {steps}{goal}{solved}{waits}>"
+
+
+def holds(result: Kept, lengths: str) -> str:
+    """``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` is what follows "steps"."""
+    span = f"{len(result.t)} states from t = {result.t[0]:g} to {result.t[-1]:g}"
+    return f"<{type(result).__name__} of {result.stepper.title}; {span}, {result.steps} steps{lengths}>"
+
+
+def lengths_of(h: float, goal: Goal | None, *, tau: bool) -> str:
+    """Of the steps of a run."""
+    if goal is None:
+        return f" of {h:g}{' in tau' * tau}"
+    return f" of {goal.tau:g} in tau" if goal.tau else " of their own lengths"

@@ -1,0 +1,76 @@
+"""Runs and their results say in a line what they are: system, method, where they stand, by which steps."""
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+
+PUSHED = sc.LagrangianSystem.from_text(
+    name="pushed", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", forces={"q": "u"}, inputs=["u"]
+)
+FREE = sc.LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2 - q**4/4")
+OF_FREE = "of free: Galerkin spectral variational integrator, degree 2, gauss-legendre:2"
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    return sc.compile_stepper(FREE, "svi:2", flags=QUICK_FLAGS)
+
+
+def test_a_run_and_what_it_kept(stepper):
+    run = stepper.start([1.0], [0.0], h=0.5)
+    kept = run.record(4)
+    assert repr(run) == f"<Run {OF_FREE}; t = 2 after 4 steps of 0.5, solver fixed-point>"
+    assert repr(kept) == f"<Trajectory {OF_FREE}; 5 states from t = 0 to 2, 4 steps of 0.5>"
+    many = stepper.integrate_ensemble([[1.0], [2.0]], [[0.0], [0.0]], h=0.1, steps=3)
+    assert repr(many) == f"<EnsembleTrajectory {OF_FREE}; 4 states of each of 2 trajectories, 2 of them ok>"
+
+
+def test_steps_that_choose_their_length(stepper):
+    run = stepper.start([1.0], [0.0], t_end=2.0)
+    run.advance(1)
+    assert repr(run).endswith("after 1 steps of their own lengths on the way to 2, solver fixed-point>")
+    kept = stepper.integrate([1.0], [0.0], t_end=2.0)
+    assert repr(kept).endswith(f"{len(kept.t)} states from t = 0 to 2, {kept.steps} steps of their own lengths>")
+
+
+def test_steps_of_tau():
+    moon = sc.LagrangianSystem.from_text(
+        name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
+    )
+    slow = sc.compile_stepper(sc.reparametrise(moon, "distance"), "svi:2", flags=QUICK_FLAGS)
+    assert "3 steps of 0.1 in tau" in repr(slow.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=3))
+    assert "0 steps of 0.1 in tau, solver" in repr(slow.start([1.0, 0.0], [0.0, 1.1], h=0.1))
+
+
+@pytest.mark.parametrize(
+    ("method", "solver"), [("stoermer-verlet", "explicit"), ("gauss:2", "fixed-point"), ("svi:3", "newton")]
+)
+def test_the_solver_is_named(method, solver):
+    chosen = {"solver": "newton"} if solver == "newton" else {}
+    run = sc.compile_stepper(FREE, method, flags=QUICK_FLAGS, **chosen).start([1.0], [0.0], h=0.1)
+    assert f"solver {solver}>" in repr(run)
+
+
+def test_inputs_that_are_missing():
+    stepper = sc.compile_stepper(PUSHED, "svi:2", flags=QUICK_FLAGS)
+    run = stepper.start([1.0], [0.0], h=0.1)
+    assert repr(run).endswith("waits for u>")
+    run.hold(u=0.0)
+    assert "waits" not in repr(run)
+    driven = stepper.drive([1.0], [0.0], h=0.1, steps=10, inputs={"u": ([0.0, 0.5, 2.0], [0.0, 1.0, 0.0])})
+    assert repr(driven).endswith("11 states from t = 0 to 1, 10 steps, breakpoints between: 1>")
+
+
+def test_runs_of_sums():
+    chain = sc.IndexedSystem.from_text(
+        name="chain",
+        coordinates=["q[N]"],
+        lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
+        forces={"q[0]": "u"},
+        inputs=["u"],
+    )
+    run = sc.compile_indexed(chain, "svi:2").start(np.zeros(5), h=0.1)
+    assert "degree 2, gauss-legendre:2, N = 5; t = 0 after 0 steps of 0.1, solver" in repr(run)
+    assert repr(run).endswith("waits for u>")
