@@ -245,6 +245,17 @@ class TestPromises:
         trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.01, steps=500)
         assert "energy" in broken_promise(sc.problem("kepler").system, trajectory, 1e-4)
 
+    @pytest.mark.parametrize(
+        "given", [{"forces": {"q": "-q_dot/2"}}, {"damping": "1/2"}], ids=lambda each: next(iter(each))
+    )
+    def test_an_energy_that_forces_change_does_not(self, given):
+        text = {"name": "damped", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
+        damped = sc.LagrangianSystem.from_text(**text, **given)
+        trajectory = sc.compile_stepper(damped, "svi:8").integrate([1.0], [0.0], h=0.1, steps=100)
+        assert abs(np.ptp(trajectory.energy())) > 0.1
+        assert broken_promise(damped, trajectory, 1e-9) == ""
+        assert "energy" in broken_promise(sc.LagrangianSystem.from_text(**text), trajectory, 1e-9)
+
     def test_it_is_withdrawn_aloud(self, monkeypatch):
         for module in ("cli.commands.run", "advice.motion"):
             monkeypatch.setattr(f"scvi_codegen.{module}.broken_promise", lambda *_: "the tolerance is not kept")
