@@ -26,6 +26,7 @@ from scvi_codegen.errors import (
     RecordingError,
     ScviCodegenError,
     StepFailedError,
+    closest,
 )
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native.waiting import told_to
@@ -86,6 +87,15 @@ class Commands(click.Group):
             return None
         command: click.Command = getattr(import_module(f"{self.folder}.{cmd_name}"), cmd_name)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the words name; one that is misspelt is told the nearest."""
+        if args and args[0] not in self.about and not args[0].startswith("-"):
+            hint = closest(args[0], self.about)
+            ctx.fail(f"there is no command '{args[0]}'{hint} Known: {', '.join(sorted(self.about))}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The part of the overview that lists the commands."""

@@ -29,6 +29,8 @@ __all__ = ["refuse", "run_sums"]
 
 MOST_SHOWN = 4
 """Entries of an array at the end."""
+INSTEAD = {"advise": "give --tolerance", "solver": "leave it out; compile_indexed(..., solver=...) takes one"}
+"""Of options that sums over indices do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +50,8 @@ def refuse(what: dict[str, object]) -> None:
     """Refuse options, by name, that sums over indices do not have."""
     for name, value in what.items():
         if value not in (None, False):
-            raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices")
+            instead = INSTEAD.get(name, "leave it out, or write the system out (expand_sums)")
+            raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices: {instead}")
 
 
 def run_sums(

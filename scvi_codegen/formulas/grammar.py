@@ -315,7 +315,8 @@ class Parser:
         value = self.symbols.get(name, CONSTANTS.get(name))
         if value is None:
             known = ", ".join([*self.symbols, *CONSTANTS])
-            self.refuse(f"unknown name '{name}'{closest(name, self.symbols)} Known here: {known}", column)
+            declared = f"a constant is declared: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
+            self.refuse(f"unknown name '{name}'{closest(name, self.symbols)} Known here: {known}; {declared}", column)
         return value
 
     def call(self, name: str, column: int) -> Expr:

@@ -46,7 +46,8 @@ def forces_by_coordinate(
     forces = {given_name(key): value for key, value in given.items()}
     for name in forces:
         if name not in names:
-            raise SystemDefinitionError(f"there is a force on '{name}', which is no coordinate{closest(name, names)}")
+            hint = f"{closest(name, names)} Coordinates: {', '.join(names)}"
+            raise SystemDefinitionError(f"there is a force on '{name}', which is no coordinate{hint}")
     found = tuple(read(forces[name]) if name in forces else sympy.S.Zero for name in names)
     return found if any(f != 0 for f in found) else ()
 

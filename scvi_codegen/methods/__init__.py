@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from inspect import Parameter, signature
-from typing import Any
+from typing import Any, Final
 
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
@@ -55,6 +55,15 @@ __all__ = [
     "specification_of",
 ]
 
+CALLED: Final = {
+    "stoermer-verlet": "verlet leapfrog velocity-verlet stormer-verlet",
+    "gauss": "gauss-legendre",
+    "gauss:1": "implicit-midpoint midpoint",
+    "explicit-euler": "euler",
+    "radau-iia": "radau",
+    "composition": "yoshida",
+}
+"""By the name, what a method is called elsewhere."""
 METHODS: dict[str, Callable[..., Method]] = {
     "svi": SVI,
     "scvi": SCVI,
@@ -144,7 +153,9 @@ def size_of(name: str) -> str | None:
 
 def _check_name(name: object) -> None:
     if name not in METHODS:
-        raise MethodError(f"there is no method {name!r}{closest(str(name), METHODS)} Known: {', '.join(METHODS)}")
+        known = [each for each, words in CALLED.items() if name in words.split()]
+        hint = f"; did you mean {known[0]!r}?" if known else closest(str(name), METHODS)
+        raise MethodError(f"there is no method {name!r}{hint} Known: {', '.join(METHODS)}")
 
 
 def _listed(arguments: Sequence[str]) -> str:

@@ -266,7 +266,8 @@ def _check_complete(document: Document) -> None:
             if choice.isdisjoint(document.get(name, {})):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
     if missing:
-        raise ModelFileError(f"there is no {', no '.join(missing)}")
+        rest = "; from rest it is q_dot = [0.0, ..], or --velocity 0,.." if "p or q_dot in [initial]" in missing else ""
+        raise ModelFileError(f"there is no {', no '.join(missing)}{rest}")
 
 
 def _check_used(document: Document, parameters: Section) -> None:

@@ -12,6 +12,7 @@ from scvi_codegen.errors import StateError
 
 __all__ = ["checked_number", "checked_step", "empty_array", "real_array"]
 
+LONGEST_SHOWN = 60
 REAL_KINDS = "iufO"
 """Not complex numbers, which lose half of themselves when they are converted, nor dates, text and truth values."""
 
@@ -36,12 +37,21 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
         if given.dtype.kind == "O" and any(entry is None for entry in given.flat):
             raise StateError(f"{name} must be real numbers, not None")
         if given.dtype.kind not in REAL_KINDS and given.size:
-            raise StateError(f"{name} must be real numbers, not {given.dtype.name}")
+            raise StateError(f"{name} must be real numbers, not {_shown(value, given.dtype)}")
         return np.array(given, dtype=np.float64, order="C", subok=False)
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, StateError):
             raise
-        raise StateError(f"{name} must be real numbers: {error}") from error
+        raise StateError(f"{name} must be real numbers, not {_shown(value)}: {error}") from error
+
+
+def _shown(value: Any, kind: np.dtype[Any] | None = None) -> str:
+    """A value, or the beginning of it, with the kind of its entries; of text that it is to be left without quotes."""
+    said = repr(value)
+    said = said if len(said) <= LONGEST_SHOWN else f"{said[:LONGEST_SHOWN]} .."
+    if kind is None:
+        return said
+    return f"text: {said}, write it without quotes" if kind.kind in "US" else f"{kind.name}: {said}"
 
 
 def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -59,7 +69,7 @@ def checked_number(value: Any, name: str) -> float:
         raise StateError(f"{name} must be a real number, not {value!r}")
     number = value if array is None else float(array)
     if not math.isfinite(number):
-        raise StateError(f"{name} is {number}")
+        raise StateError(f"{name} is {number}: a finite number is wanted")
     return float(number)
 
 
@@ -67,5 +77,5 @@ def checked_step(h: float) -> float:
     """A finite step other than 0."""
     number = checked_number(h, "the step h")
     if number == 0.0:
-        raise StateError("the step h is 0")
+        raise StateError("the step h is 0: it must be positive, or negative to go back")
     return number

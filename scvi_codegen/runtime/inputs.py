@@ -58,7 +58,7 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
         raise StateError(f"{name} must have shape ({interface.dimension},) for ({names}), not {array.shape}")
     if not np.isfinite(array).all():
         worst = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}")
+        raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}: a finite number is wanted")
     return array
 
 
@@ -152,5 +152,7 @@ def parameter_index(interface: Interface, name: str) -> int:
         return names.index(name)
     folded = {parameter.lower(): parameter for parameter in names}
     near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
+    if not names:
+        raise StateError(f"there is no parameter {name!r}: {interface.system} has none; its definition declares them")
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise StateError(f"there is no parameter {name!r} among {', '.join(names) or 'none'}{hint}")
+    raise StateError(f"there is no parameter {name!r} among {', '.join(names)}{hint}")

@@ -142,7 +142,7 @@ class TestHelp:
         assert {item.value for item in found if item.type == "plain"} == offered
 
     def test_a_mistyped_command_is_a_usage_error(self):
-        assert "No such command" in error_of("rum", "kepler")
+        assert "there is no command" in error_of("rum", "kepler")
 
 
 class TestChoices:

@@ -1,0 +1,114 @@
+"""Mistakes of the first hour, in Python and on the command line: each error says which, what was given, what to do."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.errors import ScviCodegenError
+
+TEXT = {"name": "swing", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
+MODEL = """\
+[system]
+name = "swing"
+coordinates = ["q"]
+lagrangian = "q_dot**2/2 + cos(q)"
+
+[initial]
+q = [1.0]
+q_dot = [0.0]
+
+[run]
+step = 0.1
+span = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    return sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT), "svi:2", flags=QUICK_FLAGS)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"q": [1.0]}, "give p or velocity, one of them, beside q"),
+        ({"q": [1.0, 2.0], "p": [0.0]}, "q must have shape (1,) for (q), not (2,)"),
+        ({"q": [1.0], "velocity": [0.0, 0.0]}, "velocity must have shape (1,) for (q), not (2,)"),
+        ({"q": ["1.0"], "p": [0.0]}, "q must be real numbers, not text: ['1.0'], write it without quotes"),
+        ({"q": {"q": 1.0}, "p": [0.0]}, "q must be real numbers, not {'q': 1.0}"),
+        ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: a finite number is wanted"),
+        ({"q": [1.0], "p": [0.0], "h": 0.0}, "the step h is 0: it must be positive, or negative to go back"),
+        ({"q": [1.0], "p": [0.0], "h": math.nan}, "the step h is nan: a finite number is wanted"),
+        ({"q": [1.0], "p": [0.0], "h": "0.1"}, "the step h must be real numbers, not text: '0.1', write it without"),
+        ({"q": [1.0], "p": [0.0], "steps": -3}, "steps must be at least 0, not -3"),
+        ({"q": [1.0], "p": [0.0], "parameters": {"g": 9.8}}, "no parameter 'g': swing has none; its definition"),
+    ],
+    ids=lambda part: part if isinstance(part, str) else None,
+)
+def test_of_a_run(given, said, stepper):
+    with pytest.raises(ScviCodegenError) as caught:
+        stepper.integrate(**{"h": 0.1, "steps": 3} | given)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            {"lagrangian": "q_dot**2/2 + k*cos(q)"},
+            "unknown name 'k'. Known here: q, q_dot, t, pi; a constant is declared",
+        ),
+        ({"forces": {"x": "1"}}, "there is a force on 'x', which is no coordinate. Coordinates: q"),
+    ],
+    ids=["a constant", "a force"],
+)
+def test_of_a_system(given, said):
+    with pytest.raises(ScviCodegenError) as caught:
+        sc.LagrangianSystem.from_text(**TEXT | given)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("verlet", "stoermer-verlet"), ("leapfrog", "stoermer-verlet"), ("midpoint", "gauss:1"), ("svl:4", "svi")],
+)
+def test_of_a_method(name, meant, stepper):
+    with pytest.raises(ScviCodegenError, match=f"did you mean '{meant}'"):
+        sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT), name)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words", "said"),
+    [
+        (
+            "q_dot = [0.0]",
+            "",
+            "",
+            "there is no p or q_dot in [initial]; from rest it is q_dot = [0.0, ..], or --velocity",
+        ),
+        ("q = [1.0]", 'q = ["1.0"]', "", "[initial] q, q, must be a number, not '1.0'"),
+        ("lagrangian", "lagrangain", "", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
+        ("", "", "--step 0", "the step is 0: it must be positive, or negative to go back"),
+        ("", "", "--method verlet", "did you mean 'stoermer-verlet'?"),
+        ("", "", "-o nowhere/run.npz", "there is no folder 'nowhere'"),
+    ],
+)
+def test_of_a_file_and_of_the_command(old, new, words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("swing.toml").write_text(MODEL.replace(old, new, 1))
+    result = CliRunner().invoke(main, ["run", "swing.toml", *words.split()])
+    assert result.exit_code == 2, result.output
+    assert said in result.stderr
+
+
+def test_of_the_name_of_a_command():
+    result = CliRunner().invoke(main, ["runn", "kepler"])
+    assert result.exit_code == 2
+    assert "there is no command 'runn'; did you mean 'run'? Known: bench," in result.stderr
