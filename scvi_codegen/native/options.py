@@ -11,17 +11,20 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 
-__all__ = ["STATUS", "SolverOptions", "checked_options", "step_failure"]
+__all__ = ["STATUS", "VANISHED", "SolverOptions", "checked_options", "step_failure"]
 
 STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed", 6: "no memory"}
 NEEDED = 6
 """Newton's iteration is needed, and is not there (:mod:`scvi_codegen.native.binding`), or had no memory."""
 
-
+VANISHED = (
+    "the motion ends there (a collision, a singularity), its forces are not smooth, or from rest at the origin they "
+    "grow as a power of t beyond the method's degree: take a higher one"
+)
 ADVICE = {
     "not converged": "try a smaller step, solver='newton' where the system is stiff, or more iterations",
     "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
-    "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
+    "vanished": VANISHED,
     "strayed": "the equations of the step were solved by what is no motion: take a shorter step, or give t_end",
     "no memory": "Newton's iteration found none: the machine's is used up",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",

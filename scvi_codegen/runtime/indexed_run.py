@@ -15,7 +15,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.native.options import SolverOptions, step_failure
+from scvi_codegen.native.options import VANISHED, SolverOptions, step_failure
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_arrays, read_state
@@ -33,7 +33,7 @@ ADVICE = {
     "or solver='newton' where the fast motions are at rest: stiff bonds, short waves on a lattice",
     "not finite": "the Lagrangian is undefined there, or the step is far too large",
     "singular": "constraints contradict each other there, or say the same",
-    "vanished": "the motion ends there (a collision, a singularity), or its forces are not smooth",
+    "vanished": VANISHED,
 }
 ADVICE_BY_SOLVER = {
     "fixed-point": ADVICE,

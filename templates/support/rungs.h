@@ -8,6 +8,7 @@ enum {
 };
 
 #define USED_PART REAL(0.5) /* of the error allowed, what a longer step may be expected to use */
+#define FEW_POWERS REAL(4.5) /* of an octave, in the error of a curve of two coefficients that bend it, or one */
 #define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
 #define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
 #define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
@@ -24,11 +25,14 @@ typedef struct {
   real decay; /* from a coefficient of a curve to the next, where its error is just allowed */
 } error_limits;
 
+/* Where the highest coefficient is the second that bends a curve, an error is its fourth power: the one below is all
+ * that bends it, as little as the step is short. Of more, the least decay is taken, as if a step might bend all. */
 static error_limits limits_of(real tolerance)
 {
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
+  const real power = (real)OCTAVE * MATH(log2)(GROWTH);
   const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
-      MATH(exp2)(MATH(log2)(most) / ((real)OCTAVE * MATH(log2)(GROWTH) - 2))};
+      MATH(exp2)(MATH(log2)(most) / (power > FEW_POWERS ? power - 2 : power))};
   return limits;
 }
 

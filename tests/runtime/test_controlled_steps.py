@@ -9,6 +9,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from mpmath import mp
+from scipy.special import ellipj
 
 import scvi_codegen as sc
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, StepFailedError
@@ -325,6 +326,27 @@ def test_a_first_step_is_found_where_a_velocity_is_zero(method):
     known = sc.compile_stepper(crane, method, solver="newton").integrate(**start)
     assert found.steps < 200
     assert np.abs(found.q[-1] - known.q[-1]).max() < 1e-13
+
+
+@pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
+def test_of_degree_two_what_bends_a_curve_tells_its_error(tolerance):
+    """From rest the force does not change at first: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
+    pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
+    run = sc.compile_stepper(pendulum, "svi:2").integrate([1.0], [0.0], t_end=2.0, tolerance=tolerance)
+    k = math.sin(0.5)
+    _, cn, dn, _ = ellipj(run.t, k * k)
+    errors = np.abs(run.q[:, 0] - 2 * np.arcsin(k * cn / dn))
+    assert errors[1] <= tolerance
+    assert errors.max() < (len(run) - 1) * tolerance
+
+
+def test_forces_that_set_out_beyond_the_degree_are_said():
+    """Every step from rest at the origin is as wrong, beside where it leads, however short."""
+    ramp = sc.LagrangianSystem.from_text(name="ramp", coordinates=["x"], lagrangian="x_dot**2/2 + x*(1 - cos(t))")
+    with pytest.raises(StepFailedError, match="from rest at the origin they grow as a power of t beyond the method's"):
+        sc.compile_stepper(ramp, "svi:2").integrate([0.0], [0.0], t_end=2.0)
+    run = sc.compile_stepper(ramp, "svi:4").integrate([0.0], [0.0], t_end=2.0)
+    assert run.q[-1, 0] == pytest.approx(1.0 + math.cos(2.0), rel=1e-13)
 
 
 def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
