@@ -15,10 +15,9 @@ from dataclasses import replace
 from functools import cached_property
 
 from scvi_codegen.compiler import c_identifier
-from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.kinds import TEXT, TEXTS, takes
-from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate, with_control
+from scvi_codegen.lowering.indexed import check_solver, lower_indexed, one_coordinate, with_control
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods import as_method
@@ -32,9 +31,6 @@ from scvi_codegen.runtime.indexed_interface import IndexedInterface
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 
 __all__ = ["compile_indexed", "generate_indexed"]
-
-
-SOLVERS = ("fixed-point", "newton")
 
 
 @takes(system=INDEXED, flags=TEXTS, prefix=TEXT, solver=TEXT)
@@ -78,8 +74,7 @@ class _IndexedTexts:
     """The texts of one integrator; equations are derived when one of them is first made."""
 
     def __init__(self, system: IndexedSystem, method: Method, prefix: str | None, solver: str) -> None:
-        if solver not in SOLVERS:
-            raise MethodError(f"the solver of sums over indices is {' or '.join(SOLVERS)}, not {solver!r}")
+        check_solver(solver)
         self.system, self.method, self.solver = system, method, solver
         self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
 

@@ -244,7 +244,8 @@ SOLVER_OPTION = _option(
     type=click.Choice(["auto", "fixed-point", "newton", "explicit"]),
     default="auto",
     show_default=True,
-    help="Of the stage equations; auto: explicit or fixed point where there is one, Newton where that fails.",
+    help="Of the stage equations; auto: explicit or fixed point where there is one, Newton where that fails; "
+    "of sums over indices what the model says.",
 )
 
 

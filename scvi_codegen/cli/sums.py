@@ -25,7 +25,7 @@ from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory, check_npz
 
-__all__ = ["refuse", "run_sums"]
+__all__ = ["refuse", "run_sums", "solved_by"]
 
 MOST_SHOWN = 4
 """Entries of an array at the end."""
@@ -52,6 +52,11 @@ def refuse(what: dict[str, object]) -> None:
         if value not in (None, False):
             instead = INSTEAD.get(name, "leave it out, or write the system out (expand_sums)")
             raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices: {instead}")
+
+
+def solved_by(solver: str, model: IndexedModel) -> IndexedModel:
+    """The model with the solver of the command line in place of its own, unless that leaves it the choice."""
+    return model if solver == "auto" else replace(model, solver=solver)
 
 
 def run_sums(

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from sympy import Add, S, Symbol
 
-from scvi_codegen.errors import MethodError
+from scvi_codegen.errors import MethodError, ScviCodegenError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.indexed_forces import IndexedForce
@@ -34,7 +34,16 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 
-__all__ = ["lower_indexed", "one_coordinate", "with_control"]
+__all__ = ["SOLVERS", "check_solver", "lower_indexed", "one_coordinate", "with_control"]
+
+SOLVERS = ("fixed-point", "newton")
+"""Of the equations of a step: sweeps, and what takes their place."""
+
+
+def check_solver(solver: object, error: type[ScviCodegenError] = MethodError) -> None:
+    """Refuse what is none of :data:`SOLVERS`."""
+    if solver not in SOLVERS:
+        raise error(f"the solver of sums over indices is {' or '.join(SOLVERS)}, not {solver!r}")
 
 
 def one_coordinate(system: IndexedSystem) -> MechanicalSystem:

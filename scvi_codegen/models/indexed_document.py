@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.model_document import method_section
 from scvi_codegen.models.sections import Section
 
 __all__ = ["MODEL_FILE", "model_texts"]
@@ -24,7 +25,7 @@ def model_texts(model: IndexedModel) -> dict[str, str]:
     import tomli_w  # here, because reading does not need it
 
     files = _Files()
-    document = dict(model.document)
+    document = {**model.document, "method": {**method_section(model.method), "solver": model.solver}}
     for section, known in (("parameters", model.parameters), ("tables", model.tables)):
         if section in document:
             document[section] = files.section(section, document[section], known)

@@ -27,6 +27,7 @@
 
     [method]
     method = "svi:4"
+    # solver = "newton"                                 # for stiff systems; left out: "fixed-point", sweeps
 
     [run]
     step = 0.1                                          # or tolerance = 1e-9 (0, and without both: round-off): steps
@@ -50,7 +51,7 @@ from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.indexed import parse_array
 from scvi_codegen.indices import Array
-from scvi_codegen.lowering.indexed import one_coordinate
+from scvi_codegen.lowering.indexed import SOLVERS, one_coordinate
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.array_values import is_filled, read_array
@@ -106,7 +107,8 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
     """
     for layer in (document, given):
         _check_known(layer)
-    specification = chosen_method(document, given)
+    specification = {key: value for key, value in chosen_method(document, given).items() if key != "solver"}
+    solver = {"solver": SOLVERS[0], **document.get("method", {}), **given.get("method", {})}["solver"]
     parameters = _declared(document.get("parameters", {}), given.get("parameters", {}))
     document = {**laid_over(document, given), "parameters": parameters}
     tables = {key: in_section("[tables]", partial(parse_array, key)) for key in document.get("tables", {})}
@@ -130,6 +132,7 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
     return IndexedModel(
         system=system,
         method=method,
+        solver=solver,
         q=groups["q"],
         p=groups["p"] or None,
         velocity=groups["q_dot"] or None,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.kinds import check_kind
+from scvi_codegen.lowering.indexed import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import check_controlled, check_one_of, check_step, real, steps_in
@@ -30,6 +31,7 @@ class IndexedModel:
     Attributes:
         system: what moves.
         method: how its motion is discretised.
+        solver: of the equations of a step, as of :func:`~scvi_codegen.compile_indexed`.
         q: initial positions by the name of their array; their shapes are the sizes.
         p, velocity: initial momenta or velocities by the same names, one of both; or neither: 0.
         h: step, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given.
@@ -49,6 +51,7 @@ class IndexedModel:
     system: IndexedSystem
     method: Method
     q: Mapping[str, Any]
+    solver: str = SOLVERS[0]
     h: float | None = None
     tolerance: float | None = None
     p: Mapping[str, Any] | None = None
@@ -63,6 +66,7 @@ class IndexedModel:
 
     def __post_init__(self) -> None:
         check_kind(INDEXED, self.system, "system", ModelFileError)
+        check_solver(self.solver, ModelFileError)
         if self.p is not None and self.velocity is not None:
             raise ModelFileError("give p or velocity (q_dot), not both")
         check_one_of("h (step)", self.h, "tolerance", self.tolerance)
@@ -109,7 +113,7 @@ class IndexedModel:
         """Compiled for runs of any size; raises as :func:`~scvi_codegen.compile_indexed`."""
         from scvi_codegen.indexed_compiler import compile_indexed  # here: reading a model does not wait for it
 
-        return compile_indexed(self.system, self.method)
+        return compile_indexed(self.system, self.method, solver=self.solver)
 
     def start(
         self,

@@ -35,11 +35,11 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
 
     Raises:
         PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
-        MethodError: for a method without sweeps.
+        MethodError: for a method without sweeps, and a solver that it does not have.
         StateError: where arrays do not fit.
     """
     target = Path(folder)
-    source, interface = generate_indexed(model.system, model.method, prefix=prefix_of(target))
+    source, interface = generate_indexed(model.system, model.method, solver=model.solver, prefix=prefix_of(target))
     problem = read_arrays(interface, model.q, model.parameters, model.tables)
     arrays = {"q": _flat(problem.state)}
     moving = "p" if model.velocity is None else "velocity"
@@ -74,7 +74,7 @@ def load_sums(folder: str | os.PathLike[str], model: IndexedModel) -> IndexedSte
     """
     target = Path(folder)
     prefix = prefix_of(target)
-    _, interface = generate_indexed(model.system, model.method, prefix=prefix)
+    _, interface = generate_indexed(model.system, model.method, solver=model.solver, prefix=prefix)
     return IndexedStepper(source_in(target, prefix), interface)
 
 

@@ -6,12 +6,13 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import Model
 
 if TYPE_CHECKING:
     from scvi_codegen.models.input_tables import InputTable
 
-__all__ = ["document_of", "motion_of"]
+__all__ = ["document_of", "method_section", "motion_of"]
 
 SHORT_VECTOR = 4
 TEXT_WIDTH = 100
@@ -53,13 +54,16 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     """The sections beside the system."""
     vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
     initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
-    specification = model.method.specification()
-    method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification.items()}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
     step = {"tolerance": model.tolerance} if model.h is None else {"step": model.h}
     controller = {"controller": "reversible"} if model.monitor else {}
     run = {**step, **controller, **length, "every": model.every}
-    return {"initial": {"t": model.t, **initial}, "method": method, "run": run}
+    return {"initial": {"t": model.t, **initial}, "method": method_section(model.method), "run": run}
+
+
+def method_section(method: Method) -> dict[str, Any]:
+    """``[method]``."""
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in method.specification().items()}
 
 
 def _wrapped(formula: str) -> str:

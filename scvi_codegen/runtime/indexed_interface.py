@@ -69,6 +69,11 @@ class IndexedInterface:
     energy_parameter = ""
     """That of transformed time, which sums over indices do not have."""
 
+    @property
+    def integrator(self) -> str:
+        """What a saved run is of, in words: one of another solver has other memory."""
+        return f"{self.title}, {self.solver}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunArrays:

@@ -309,8 +309,8 @@ class IndexedRun:
         saved |= {f"field {name}": array for name, array in arrays.fields.items()}
         saved |= {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
-        file, title = io.BytesIO(), np.array(self.interface.title)
-        np.savez(file, title=title, parameters=arrays.numbers, moments=moments, iterations=self.iterations, **saved)
+        file, kind = io.BytesIO(), np.array(self.interface.integrator)
+        np.savez(file, integrator=kind, parameters=arrays.numbers, moments=moments, iterations=self.iterations, **saved)
         return file.getvalue()
 
     @classmethod
@@ -330,8 +330,8 @@ class IndexedRun:
         """
         try:
             found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
-            if str(found["title"]) != interface.title:
-                raise StateError(f"this is a run of '{found['title']}', not of '{interface.title}'")
+            if str(found["integrator"]) != interface.integrator:
+                raise StateError(f"this is a run of '{found['integrator']}', not of '{interface.integrator}'")
             moments = dict(zip(MOMENTS, found["moments"].tolist(), strict=True))
             arrays = read_arrays(
                 interface,

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from scvi_codegen import SVI, load_indexed_model
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.models.indexed_package import load_sums
 from scvi_codegen.native.compilers import find_compiler
 
 RING = """
@@ -38,6 +40,8 @@ step = 0.1
 steps = 20
 every = 5
 """
+
+NEWTON = ("--solver", "newton")
 
 
 @pytest.fixture
@@ -105,6 +109,8 @@ def test_options(ring: str) -> None:
         (("run", "--size", "N=1.5"), "is a whole number, not 1.5"),
         (("run", "--parameter", "x=1"), "has no parameter 'x'"),
         (("run", "--method", "scvi:4"), "no sweeps over positions"),
+        (("run", "--solver", "explicit"), "is fixed-point or newton, not 'explicit'"),
+        (("generate", "-o", "folder", "--method", "stoermer-verlet", *NEWTON), "leave out solver='newton'"),
         (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not for sums over indices"),
         (("derive", "--html", "page.html"), "--html is not for sums over indices"),
     ],
@@ -165,6 +171,32 @@ def test_generate(ring: str) -> None:
     Path("ring_svi/main.c").write_text("mine")
     assert "was edited" in invoke("generate", ring, "-o", "ring_svi").output
     assert invoke("generate", ring, "-o", "ring_svi", "--force").exit_code == 0
+
+
+def test_newton(ring: str) -> None:
+    """By the option or by the model; a folder keeps it, whatever its model said before."""
+    by_option, sweeps = (json.loads(invoke("run", ring, "--json", *words).stdout) for words in (NEWTON, ()))
+    Path("stiff.toml").write_text(RING.replace('"svi:4"', '"svi:4"\nsolver = "newton"'))
+    by_model, swept = (
+        json.loads(invoke("run", "stiff.toml", "--json", "--solver", solver).stdout)
+        for solver in ("auto", "fixed-point")
+    )
+    assert (by_model["final"], by_model["iterations"]) == (by_option["final"], by_option["iterations"])
+    assert (swept["final"], swept["iterations"]) == (sweeps["final"], sweeps["iterations"])
+    assert by_model["iterations"] != swept["iterations"]
+    assert invoke("generate", ring, "-o", "ring_newton", *NEWTON, "--degree", "2").exit_code == 0
+    model = load_indexed_model("ring_newton/model.toml")
+    assert (model.solver, model.method.name) == ("newton", SVI(2).name)
+    run = model.start(load_sums("ring_newton", model))
+    assert run.interface.solver == "newton"
+    run.advance(20)
+    expected = json.loads(invoke("run", ring, "--json", *NEWTON, "--degree", "2").stdout)
+    assert (run.q["q"].tolist(), run.iterations) == (expected["final"]["q"]["q"], expected["iterations"])
+    subprocess.run(["make", "-s", "run"], cwd="ring_newton", check=True, capture_output=True)
+    assert np.loadtxt("ring_newton/end.txt")[:8] == pytest.approx(run.q["q"], abs=1e-14)
+    result = invoke("verify", "ring_newton")
+    assert result.exit_code == 0, result.output
+    assert "are those it was generated with" in invoke("verify", "ring_newton", "--solver", "fixed-point").output
 
 
 def test_a_folder_is_verified_as_it_stands(ring: str, tmp_path: Path) -> None:

@@ -70,6 +70,40 @@ def test_what_a_file_says(net: Path) -> None:
     assert np.array_equal(own.q["r"], other.q["r"])
 
 
+def test_the_solver(net: Path) -> None:
+    """The run is that of Newton's iteration to the bit, not of sweeps; the solver stays where the method changes."""
+    net.write_text(net.read_text().replace('"svi:2"', '"svi:2"\nsolver = "newton"'))
+    model = sc.load_indexed_model(net)
+    run = {"h": 0.1, "steps": 4, "tables": model.tables, "parameters": model.parameters}
+    newton, sweeps = (
+        sc.compile_indexed(model.system, "svi:2", solver=solver).integrate(model.q, **run)
+        for solver in ("newton", "fixed-point")
+    )
+    own, other = (
+        sc.load_indexed_model(net, {"method": given}).integrate() for given in ({}, {"solver": "fixed-point"})
+    )
+    assert np.array_equal(own.q["r"], newton.q["r"])
+    assert np.array_equal(other.q["r"], sweeps.q["r"])
+    assert (own.iterations, other.iterations) == (newton.iterations, sweeps.iterations)
+    assert own.iterations != other.iterations
+    assert sc.load_indexed_model(net, {"method": {"method": "gauss:2"}}).solver == "newton"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[parameters]", '[forces]\n"r[i, a]" = "-r_dot[i, a]"\n\n[parameters]'),
+        ('"svi:2"', '"stoermer-verlet"'),
+    ],
+)
+def test_what_has_no_newton(net: Path, old: str, new: str) -> None:
+    """As without a file."""
+    net.write_text(net.read_text().replace(old, new, 1))
+    model = sc.load_indexed_model(net, {"method": {"solver": "newton"}})
+    with pytest.raises(sc.MethodError, match="leave out solver='newton'"):
+        model.start()
+
+
 @pytest.mark.parametrize(
     ("value", "expected"),
     [
@@ -100,6 +134,8 @@ def test_an_index_means_one_thing() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ('"svi:2"', '"svi:2"\nsolver = "krylov"', "solver of sums over indices is fixed-point or newton, not 'krylov'"),
+        ('"svi:2"', '"svi:2"\nsolver = 2', "is fixed-point or newton, not 2"),
         ("N = 3", "M = 3", r"unknown size 'M' in \[sizes\]"),
         ("N = 3", "N = 0", "N"),
         ("N = 3", "", "nothing says how large N is"),

@@ -80,6 +80,20 @@ def test_steps_choose_their_length_with_it():
     assert np.abs(ends[0] - ends[1]).max() < 1e-7
 
 
+def test_saved_runs_go_on_with_it_alone():
+    own, other = (sc.compile_indexed(field(1.0), "svi:4", solver=solver) for solver in ("newton", "fixed-point"))
+    run = own.start(np.sin(np.arange(8.0)), h=0.1)
+    run.advance(3)
+    saved = run.save()
+    again = own.restore(saved)
+    for each in (run, again):
+        each.advance(3)
+    assert (run.q["q"] == again.q["q"]).all()
+    assert run.iterations == again.iterations
+    with pytest.raises(sc.StateError, match=r"a run of '.*, newton', not of '.*, fixed-point'"):
+        other.restore(saved)
+
+
 def test_a_step_that_comes_to_no_rest_fails():
     system = sc.IndexedSystem.from_text(
         name="long waves",

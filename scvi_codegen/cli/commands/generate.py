@@ -8,7 +8,7 @@ import click
 
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import reporting, tell
-from scvi_codegen.cli.sums import refuse
+from scvi_codegen.cli.sums import refuse, solved_by
 from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import generate_sums
@@ -79,15 +79,8 @@ def generate(
     if platforms and not fmu:
         raise click.UsageError("--platform is for --fmu: the C of a folder is for any machine")
     if isinstance(model, IndexedModel):
-        refuse(
-            {
-                "embedded": embedded,
-                "single_file": single_file,
-                "fmu": fmu,
-                "solver": None if solver == "auto" else solver,
-            }
-        )
-        folder, python = generate_sums(model, output, force=force), ""
+        refuse({"embedded": embedded, "single_file": single_file, "fmu": fmu})
+        folder, python = generate_sums(solved_by(solver, model), output, force=force), ""
     elif fmu:
         folder, python = generate_fmu(model, output, solver=solver, platforms=platforms, force=force), ""
     else:

@@ -17,7 +17,7 @@ from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_w
 from scvi_codegen.cli.numbers import ensemble_numbers, failure_text, recorded_numbers, run_numbers
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
-from scvi_codegen.cli.sums import refuse, run_sums
+from scvi_codegen.cli.sums import refuse, run_sums, solved_by
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
@@ -155,7 +155,8 @@ def run(
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
     if isinstance(model, IndexedModel):
-        refuse({"ensemble": ensemble, "advise": advise, "solver": None if solver == "auto" else solver})
+        refuse({"ensemble": ensemble, "advise": advise})
+        model = solved_by(solver, model)
         run_sums(model if tolerance is None else controlled_model(model, tolerance), output, plot, options, threads)
         return
     if threads is not None:

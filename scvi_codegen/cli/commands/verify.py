@@ -11,7 +11,7 @@ import click
 from scvi_codegen import verification
 from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, note, reporting, tell
-from scvi_codegen.cli.sums import refuse
+from scvi_codegen.cli.sums import solved_by
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import load_sums
@@ -73,8 +73,8 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
     if not folder.is_dir():
         model = read_model(name, choices)
         if isinstance(model, IndexedModel):
-            refuse({"solver": None if solver == "auto" else solver})
-            return _certificate_of_sums(model, None)
+            model = solved_by(solver, model)
+            return _certificate_of_sums(model, model.stepper())
         return _certificate(model, model.stepper(solver=solver), solver)
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
@@ -101,7 +101,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
     )
 
 
-def _certificate_of_sums(model: IndexedModel, stepper: IndexedStepper | None) -> Certificate:
+def _certificate_of_sums(model: IndexedModel, stepper: IndexedStepper) -> Certificate:
     return verify_indexed(
         model.system,
         model.method,
