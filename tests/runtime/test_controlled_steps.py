@@ -340,6 +340,15 @@ def test_of_degree_two_what_bends_a_curve_tells_its_error(tolerance):
     assert errors.max() < (len(run) - 1) * tolerance
 
 
+def test_forces_that_set_out_beyond_the_degree_are_said():
+    """Every step from rest at the origin is as wrong, beside where it leads, however short."""
+    ramp = sc.LagrangianSystem.from_text(name="ramp", coordinates=["x"], lagrangian="x_dot**2/2 + x*(1 - cos(t))")
+    with pytest.raises(StepFailedError, match="from rest at the origin they grow as a power of t beyond the method's"):
+        sc.compile_stepper(ramp, "svi:2").integrate([0.0], [0.0], t_end=2.0)
+    run = sc.compile_stepper(ramp, "svi:8").integrate([0.0], [0.0], t_end=2.0)
+    assert run.q[-1, 0] == pytest.approx(1.0 + math.cos(2.0), rel=1e-13)
+
+
 def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
     stepper = sc.compile_stepper(sc.problem("cart-pole").system, sc.SCVI(2))
     start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
