@@ -22,10 +22,12 @@ from scvi_codegen.runtime.accuracy import unwarned
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Known", "known_digits"]
+__all__ = ["SECOND_RUN", "Known", "known_digits"]
 
 Array = NDArray[np.float64]
 
+SECOND_RUN = 10_000
+"""Steps that a second run may take beside four times those of the first."""
 SAMPLES, NEAR = 1024, 0.01
 """States that are compared, and the part of their size up to which two motions are near each other."""
 QUARTERS, DECADES = 4, 0.5

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scvi_codegen.advice.known_digits import Known, known_digits
+from scvi_codegen.advice.known_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
@@ -41,8 +41,6 @@ __all__ = [
 
 PORTION_SECONDS = 0.2
 SHOWN_COORDINATES = 6
-SECOND_RUN = 10_000
-"""Steps that the run which tells the known digits may always take; and four times as many as the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,7 +262,7 @@ def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) ->
         yield "worst step: its error is not known, nothing tells it here"
     else:
         too_long = error > TOLERABLE_ERROR
-        yield f"worst step: relative error about {error:.1e}, {begun}{': too long' * too_long}"
+        yield f"worst step: relative error estimated at {error:.1e}, {begun}{': too long' * too_long}"
         if too_long:
             warn(
                 f"the step {begun} is too long: the relative error of its end is about {error:.1e}; take a shorter "

@@ -24,7 +24,7 @@ class Standing(Protocol):
     def steps(self) -> int: ...
 
 
-class Kept(Protocol):
+class StandingStates(Protocol):
     """What is asked of the states of a run."""
 
     @property
@@ -52,7 +52,7 @@ def stands(title: str, solver: str, run: Standing, *, tau: bool = False, awaited
     return f"<{type(run).__name__} of {title}; t = {run.t:g} after {steps}{goal}{solved}{waits}>"
 
 
-def holds(result: Kept, lengths: str) -> str:
+def holds(result: StandingStates, lengths: str) -> str:
     """``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` is what follows "steps"."""
     span = f"{len(result.t)} states from t = {result.t[0]:g} to {result.t[-1]:g}"
     return f"<{type(result).__name__} of {result.stepper.title}; {span}, {result.steps} steps{lengths}>"

@@ -240,6 +240,23 @@ class TestPromises:
         assert "alone has a relative error" in broken_promise(system, trajectory, trajectory.step_error / 20.0)
         assert broken_promise(system, trajectory, 1e-3) == ""
 
+    @pytest.mark.parametrize(
+        ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
+    )
+    def test_an_estimate_that_is_too_large_does_not(self, name, method):
+        """Where a force passes through zero on a step, its highest coefficient is taken for more than it is."""
+        problem, tolerance = sc.problem(name), 1e-9
+        stepper = sc.compile_stepper(problem.system, method)
+        p = stepper.momentum(problem.q, problem.velocity) if problem.p is None else problem.p
+        advice = sc.advise(problem.system, method, problem.q, p, 20.0, tolerance)
+        found = stepper.integrate(problem.q, p, h=advice.h, steps=advice.steps)
+        assert found.step_error > 100 * tolerance
+        assert broken_promise(problem.system, found, tolerance) == ""
+        best = sc.compile_stepper(problem.system, "svi:8").integrate(problem.q, p, t_end=20.0)
+        error = np.linalg.norm(found.q[-1] - best.q[-1]) / np.linalg.norm(best.q[-1])
+        assert error < tolerance
+        assert "and a second run ends" in broken_promise(problem.system, found, error / 5)
+
     def test_an_energy_that_is_not_conserved_breaks_it(self):
         euler = sc.compile_stepper(sc.problem("kepler").system, sc.ExplicitEuler())
         trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.01, steps=500)

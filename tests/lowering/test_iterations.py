@@ -90,7 +90,7 @@ def test_factors_of_newtons_matrix_serve_the_next_step_where_steps_are_short():
     assert run._memory.guess == 2
 
 
-@pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 154)), ("tangle/scvi", (22, 74))])
+@pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 154)), ("tangle/scvi", (23, 87))])
 def test_steps_that_choose_their_length_are_guessed_by_the_one_before(name, expected):
     """By Newton's iteration, where it was as long: steps, and iterations of all."""
     given = case(name)

@@ -239,7 +239,7 @@ def _run_one(
         raise CommandFailure(f"{outcome.broken}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         tell(f"wrote {path}")
-    broken = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised)
+    broken = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised, known)
     tell(broken=broken or None)
     if broken:
         raise CommandFailure(broken, FAILURE)
