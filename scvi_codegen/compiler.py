@@ -33,9 +33,9 @@ from functools import cache, partial
 from sympy import Expr
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.given.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
-from scvi_codegen.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.lowering.density import density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower

@@ -15,8 +15,8 @@ from dataclasses import replace
 from functools import cached_property
 
 from scvi_codegen.compiler import c_identifier
+from scvi_codegen.given.kinds import TEXT, TEXTS, takes
 from scvi_codegen.ir.indexed import IndexedProgram
-from scvi_codegen.kinds import TEXT, TEXTS, takes
 from scvi_codegen.lowering.indexed import check_solver, lower_indexed, one_coordinate, with_control
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem

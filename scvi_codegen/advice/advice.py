@@ -22,7 +22,7 @@ from scvi_codegen.advice.pilot import STEEP, Pilot, launch
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.kinds import SWITCH, TEXT, takes
+from scvi_codegen.given.kinds import SWITCH, TEXT, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification

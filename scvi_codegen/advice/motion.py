@@ -15,7 +15,7 @@ from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.kinds import SWITCH, of, takes
+from scvi_codegen.given.kinds import SWITCH, of, takes
 from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method, default_method

@@ -26,7 +26,7 @@ from scvi_codegen.display.cards import card, listed, plain
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.kinds import SWITCH, takes
+from scvi_codegen.given.kinds import SWITCH, takes
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
-from scvi_codegen.kinds import MAPPING, NUMBERS, Kind, of, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import MAPPING, NUMBERS, Kind, of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.precision import Number, Vector, mp
 

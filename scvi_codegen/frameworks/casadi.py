@@ -6,7 +6,7 @@ from typing import Any
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import Flow, imported
-from scvi_codegen.kinds import SWITCH, of, takes
+from scvi_codegen.given.kinds import SWITCH, of, takes
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.stepper import Stepper

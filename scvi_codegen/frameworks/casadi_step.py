@@ -12,13 +12,13 @@ from itertools import accumulate, pairwise
 from math import comb
 from typing import Any
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ArgumentError, MethodError
 from scvi_codegen.formulas.inputs import PARTS
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.frameworks.casadi_ends import Ends, numeric, own_parameters, read
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.kinds import SWITCH, TEXTS, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import SWITCH, TEXTS, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MissingLibraryError, StateError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.inputs import check_inputs_given, parameter_index
 from scvi_codegen.runtime.stepper import Stepper

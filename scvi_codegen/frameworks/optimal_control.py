@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ControlError, MethodError, StateError
 from scvi_codegen.frameworks.casadi_ends import own_parameters
 from scvi_codegen.frameworks.control_task import Conditions, Task, check_known, interval
 from scvi_codegen.frameworks.controlled import ControlledMotion
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.kinds import MAPPING, TEXT, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import MAPPING, TEXT, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method

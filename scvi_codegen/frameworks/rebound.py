@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.kinds import of, takes
+from scvi_codegen.given.kinds import of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.native.arguments import checked_number, real_array
 

@@ -12,11 +12,11 @@ from dataclasses import replace
 import sympy
 from sympy import Expr
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.symbols import DOT, symbol
-from scvi_codegen.kinds import takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import takes
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

@@ -12,7 +12,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, check_names, symbol
-from scvi_codegen.kinds import MAPPING, NAMES, of, takes
+from scvi_codegen.given.kinds import MAPPING, NAMES, of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 __all__ = ["change_coordinates"]

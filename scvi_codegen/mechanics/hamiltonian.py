@@ -21,7 +21,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.given.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate

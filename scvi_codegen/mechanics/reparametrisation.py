@@ -26,7 +26,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.kinds import takes
+from scvi_codegen.given.kinds import takes
 from scvi_codegen.mechanics.constraints import velocities_held
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

@@ -34,7 +34,7 @@ from scvi_codegen.formulas.inputs import inputs_by_name
 from scvi_codegen.formulas.parts import identity
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.kinds import of
+from scvi_codegen.given.kinds import of
 from scvi_codegen.mechanics.damping import check_damping
 
 __all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
@@ -278,4 +278,4 @@ def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[st
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem (an IndexedSystem goes to compile_indexed)", MechanicalSystem)
-"""For :func:`~scvi_codegen.kinds.takes`."""
+"""For :func:`~scvi_codegen.given.kinds.takes`."""

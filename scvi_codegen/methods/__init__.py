@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from inspect import Parameter, signature
 from typing import Any, Final
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.composition import Composition

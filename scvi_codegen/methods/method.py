@@ -15,10 +15,10 @@ from functools import partial
 
 import sympy
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.mechanics.constraints import velocities_held
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

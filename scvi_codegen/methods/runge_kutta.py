@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
-from scvi_codegen.kinds import NUMBERS, check_kind, of, takes
+from scvi_codegen.given.kinds import NUMBERS, check_kind, of, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import position_system
 from scvi_codegen.methods.exactness import Exactness

@@ -21,7 +21,7 @@ from typing import Any
 
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
-from scvi_codegen.kinds import NUMBERS, check_kind
+from scvi_codegen.given.kinds import NUMBERS, check_kind
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.exactness import Exactness

@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, closest
 from scvi_codegen.files.toml_text import read_toml
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.models.csv_tables import parse_table
 from scvi_codegen.models.model import Model, real
 

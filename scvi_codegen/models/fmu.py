@@ -25,7 +25,7 @@ from scvi_codegen.compiler import generate_source
 from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.formulas.inputs import PARTS
-from scvi_codegen.kinds import PATH, SWITCH, TEXT, TEXTS, takes
+from scvi_codegen.given.kinds import PATH, SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.models.fmu_description import build_description, model_description
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import MODEL, example_of, model_text, prefix_of

@@ -47,9 +47,9 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.indexed import parse_array
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.indices import Array
 from scvi_codegen.lowering.indexed import SOLVERS, one_coordinate
 from scvi_codegen.mechanics.indexed.system import IndexedSystem

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.kinds import check_kind
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.lowering.indexed import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.given.kinds import PATH, SWITCH, of, takes
 from scvi_codegen.indexed_compiler import generate_indexed
-from scvi_codegen.kinds import PATH, SWITCH, of, takes
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.indexed_document import model_texts
 from scvi_codegen.models.indexed_model import IndexedModel

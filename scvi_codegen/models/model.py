@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.inputs import input_parameters
-from scvi_codegen.kinds import check_kind
+from scvi_codegen.given.counts import LARGEST_COUNT, checked_count
+from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI

@@ -68,7 +68,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
-from scvi_codegen.kinds import PATH, of, takes
+from scvi_codegen.given.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import with_monitor

@@ -23,7 +23,7 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
-from scvi_codegen.kinds import PATH, SWITCH, TEXT, Kind, takes
+from scvi_codegen.given.kinds import PATH, SWITCH, TEXT, Kind, takes
 from scvi_codegen.models.folders import CERTIFICATE_FILE, FORMAT, INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.runtime.stepper import Stepper

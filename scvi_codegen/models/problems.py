@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.kinds import TEXT, takes
+from scvi_codegen.given.kinds import TEXT, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.systems import (
     cart_pole,

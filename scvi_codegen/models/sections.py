@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
-from scvi_codegen.kinds import FORMULA
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import FORMULA
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
 from scvi_codegen.models.meant import meant_by
 from scvi_codegen.models.model import DEFAULT_METHOD, real

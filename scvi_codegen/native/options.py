@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 

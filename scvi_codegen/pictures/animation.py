@@ -13,7 +13,7 @@ import numpy as np
 
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.kinds import FUNCTION, PATH, REAL, takes
+from scvi_codegen.given.kinds import FUNCTION, PATH, REAL, takes
 from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
 from scvi_codegen.pictures.motion import MOTION, Array, DrawnMotion
 from scvi_codegen.pictures.shapes import MovingPoints, shape_of

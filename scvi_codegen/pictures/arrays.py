@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, closest
-from scvi_codegen.kinds import CANVAS, PATH, TEXT, Kind, takes
+from scvi_codegen.given.kinds import CANVAS, PATH, TEXT, Kind, takes
 from scvi_codegen.pictures.canvas import color, panel, plain
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import CANVAS, PATH, takes
+from scvi_codegen.given.kinds import CANVAS, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel
 from scvi_codegen.pictures.motion import HISTORIES, MOTION, Array, DrawnMotion, EnergyHistory, several
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import Kind
+from scvi_codegen.given.kinds import Kind
 
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface

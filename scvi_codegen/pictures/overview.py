@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from scvi_codegen.kinds import PATH, takes
+from scvi_codegen.given.kinds import PATH, takes
 from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.pictures.canvas import COLORS, check_plot_path, new_figure, plain, save, style
 from scvi_codegen.pictures.conserved import draw_energy_error

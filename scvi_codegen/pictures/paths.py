@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scvi_codegen.kinds import CANVAS, NAMES, PATH, takes
+from scvi_codegen.given.kinds import CANVAS, NAMES, PATH, takes
 from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.motion import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several

@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import CANVAS, NAMES, PATH, takes
+from scvi_codegen.given.kinds import CANVAS, NAMES, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.motion import MOTIONS, Array, DrawnMotion, Motions, column, several
 

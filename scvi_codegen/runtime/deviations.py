@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.inputs import Array
 

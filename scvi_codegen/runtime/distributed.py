@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds

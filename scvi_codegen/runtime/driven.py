@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.dense_output import checked_times

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled import to_dataset
-from scvi_codegen.kinds import MAPPING, PATH, takes
+from scvi_codegen.given.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.dense_output import checked_times, within
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs

@@ -19,8 +19,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step, empty_array
 from scvi_codegen.native.binding import Binding

@@ -12,8 +12,8 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.dense_output import times_of_run

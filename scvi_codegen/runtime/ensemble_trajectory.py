@@ -15,7 +15,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled import Labelled, checked_units, to_dataset
-from scvi_codegen.kinds import MAPPING, PATH, takes
+from scvi_codegen.given.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator

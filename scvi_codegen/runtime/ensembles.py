@@ -8,7 +8,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import FUNCTION, MAPPING, takes
+from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import warn_of_lost_energies
 from scvi_codegen.runtime.constrained_states import ConstrainedStates

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import EventError
+from scvi_codegen.given.counts import checked_count
 
 if TYPE_CHECKING:
     from sympy import Expr

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
-from scvi_codegen.kinds import MAPPING, NAMES, SWITCH, of, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
 from scvi_codegen.runtime.driven import checked_inputs

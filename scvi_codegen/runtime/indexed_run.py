@@ -11,8 +11,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import VANISHED, SolverOptions, step_failure

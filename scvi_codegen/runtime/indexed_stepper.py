@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.kinds import FUNCTION, MAPPING, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load

@@ -8,8 +8,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.constraints import check_reachable

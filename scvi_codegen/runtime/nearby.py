@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import SWITCH, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import SWITCH, takes
 from scvi_codegen.runtime.deviations import Deviations
 from scvi_codegen.runtime.gradients import Gradient, carried, pulled_back, sensitivity
 from scvi_codegen.runtime.hessians import hessian_product

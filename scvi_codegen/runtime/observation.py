@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.clock import part_of_step
 from scvi_codegen.runtime.dense_output import lengths_at, states_and_steps_at, times_of_run

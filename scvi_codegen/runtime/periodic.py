@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedError, closest
-from scvi_codegen.kinds import NAMES, SWITCH, of, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_parameters, checked_vector

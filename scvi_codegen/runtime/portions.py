@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.counts import checked_count
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings

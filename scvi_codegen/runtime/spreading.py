@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.deviations import Deviations

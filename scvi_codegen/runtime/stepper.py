@@ -13,9 +13,9 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import StateError
-from scvi_codegen.kinds import FUNCTION, MAPPING, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy

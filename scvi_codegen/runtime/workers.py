@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
-from scvi_codegen.counts import checked_count
+from scvi_codegen.given.counts import checked_count
 
 __all__ = ["PROGRESS_SECONDS", "Heed", "run_each"]
 

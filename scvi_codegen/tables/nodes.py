@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from typing import Any, TypeAlias, TypeVar
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import MethodError, closest
-from scvi_codegen.kinds import WHOLE, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import WHOLE, takes
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
 
 __all__ = [

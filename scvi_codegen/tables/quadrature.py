@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.kinds import TEXT, WHOLE, takes
+from scvi_codegen.given.kinds import TEXT, WHOLE, takes
 from scvi_codegen.tables.nodes import (
     ascending_points,
     chebyshev_gauss_points,

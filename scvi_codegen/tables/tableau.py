@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import Any
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.kinds import WHOLE, takes
+from scvi_codegen.given.kinds import WHOLE, takes
 from scvi_codegen.tables.basis import cardinal_integrals, transpose
 from scvi_codegen.tables.nodes import (
     chebyshev_gauss_points,

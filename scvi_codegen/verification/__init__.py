@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.kinds import TEXT, TEXTS, of, takes
+from scvi_codegen.given.kinds import TEXT, TEXTS, of, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import sympy
 
-from scvi_codegen.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.given.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.tables.quadrature import gauss_legendre
 

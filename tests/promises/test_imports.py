@@ -21,8 +21,7 @@ PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
     errors version
-    keywords
-    counts indices kinds
+    given indices
     tables files
     formulas display ir
     mechanics rendering

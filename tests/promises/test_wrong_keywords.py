@@ -6,7 +6,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ArgumentError, StateError
-from scvi_codegen.keywords import ELSEWHERE, WORDS, keyword_meant
+from scvi_codegen.given.keywords import ELSEWHERE, WORDS, keyword_meant
 from scvi_codegen.runtime.stepper import Stepper
 
 PUSHED = sc.LagrangianSystem.from_text(

@@ -12,7 +12,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ScviCodegenError
-from scvi_codegen.kinds import TEXT, takes
+from scvi_codegen.given.kinds import TEXT, takes
 
 WRONG = (object(), b"bytes", 1j)
 """No argument of any public function may be one of these."""

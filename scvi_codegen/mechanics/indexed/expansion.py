@@ -19,8 +19,8 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.formulas.symbols import DOT, number, symbol
+from scvi_codegen.given.kinds import MAPPING, takes
 from scvi_codegen.indices import Access, Array, Loop, Place
-from scvi_codegen.kinds import MAPPING, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

@@ -16,7 +16,7 @@ from sympy import Add, Expr, Integer, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.symbols import DOT, symbol
-from scvi_codegen.kinds import takes
+from scvi_codegen.given.kinds import takes
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.like_terms import LikeTerms, like_terms
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem

@@ -26,8 +26,8 @@ from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
+from scvi_codegen.given.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.indices import Access, Array, Loop, Size
-from scvi_codegen.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, velocity_slots
 
@@ -394,4 +394,4 @@ def _friction(
 
 
 INDEXED = of("an IndexedSystem", IndexedSystem)
-"""For :func:`~scvi_codegen.kinds.takes`."""
+"""For :func:`~scvi_codegen.given.kinds.takes`."""

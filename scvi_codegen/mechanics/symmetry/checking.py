@@ -11,7 +11,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.kinds import FORMULAS, TEXT, takes
+from scvi_codegen.given.kinds import FORMULAS, TEXT, takes
 from scvi_codegen.mechanics.constraints import with_reactions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.ansatz import combined, gauge_columns, polynomial_in

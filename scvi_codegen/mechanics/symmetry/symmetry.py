@@ -32,7 +32,7 @@ from scvi_codegen.display.cards import Html, card
 from scvi_codegen.display.mathml import mathml
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.kinds import several, takes
+from scvi_codegen.given.kinds import several, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.rolled import rolled
 from scvi_codegen.mechanics.symmetry.ansatz import (
@@ -129,7 +129,7 @@ class Symmetry:
 
 
 SYMMETRIES = several("a list of symmetries", Symmetry)
-"""For :func:`~scvi_codegen.kinds.takes`."""
+"""For :func:`~scvi_codegen.given.kinds.takes`."""
 
 
 @takes(system=SYSTEM)

@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled import checked_units
-from scvi_codegen.kinds import MAPPING, PATH, takes
+from scvi_codegen.given.kinds import MAPPING, PATH, takes
 from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
 from scvi_codegen.runtime.portions import first_length

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.counts import checked_count
 from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
-from scvi_codegen.kinds import FUNCTION, PATH, REAL, TEXT, of, takes
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.given.kinds import FUNCTION, PATH, REAL, TEXT, of, takes
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest

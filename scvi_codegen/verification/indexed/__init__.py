@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
+from scvi_codegen.given.kinds import MAPPING, of, takes
 from scvi_codegen.indexed_compiler import compile_indexed
-from scvi_codegen.kinds import MAPPING, of, takes
 from scvi_codegen.lowering.indexed import one_coordinate
 from scvi_codegen.mechanics.indexed.expansion import expand_sums
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem

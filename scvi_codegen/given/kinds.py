@@ -1,7 +1,7 @@
 """What kinds of things public functions take: the wrong kind is refused by name, before anything is done.
 
 Numbers and arrays, which may come as whatever converts to them, are checked where they are converted
-(:mod:`scvi_codegen.native.arguments`, :mod:`scvi_codegen.counts`).
+(:mod:`scvi_codegen.native.arguments`, :mod:`scvi_codegen.given.counts`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from scvi_codegen.errors import ArgumentError, ScviCodegenError
-from scvi_codegen.keywords import keyword_meant
+from scvi_codegen.given.keywords import keyword_meant
 
 __all__ = [
     "CANVAS",
