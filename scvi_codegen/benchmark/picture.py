@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 __all__ = ["draw_curves", "plot_curves", "save_figure"]
 
 COLUMNS = 3
+PANEL, LINE = (4.6, 3.8), 0.25
+"""Inches: of a panel; the height of a line of the legend."""
+MOST_ABREAST = 4
+"""Names of methods on such a line; on one of a single panel there is room for two."""
 
 
 def plot_curves(results: Sequence[CaseResult], path: str | os.PathLike[str]) -> None:
@@ -54,9 +58,11 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
 
     columns = min(COLUMNS, len(results))
     lines = -(-len(results) // columns)
-    figure = Figure(figsize=(4.6 * columns, 3.8 * lines + 0.6), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
     methods = list(dict.fromkeys(method for result in results for method in result.methods()))
+    abreast = min(2 * columns, MOST_ABREAST)
+    width, height = (PANEL[0] * columns, PANEL[1] * lines + LINE * -(-len(methods) // abreast))
+    figure = Figure(figsize=(width, height), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
     colors = {method: COLORS[number % len(COLORS)] for number, method in enumerate(methods)}
     handles: dict[str, Artist] = {}
     for panel, result in zip(panels, results, strict=False):
@@ -66,7 +72,7 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
         _label_times(panel)
     for panel in panels[len(results) :]:
         panel.set_visible(False)
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=min(4, len(handles)))
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=abreast)
     return figure
 
 

@@ -442,6 +442,21 @@ class TestCommand:
         assert "time of a trajectory, ms" in text
         assert text.count("heyoka fast_math") == 1
 
+    @pytest.mark.parametrize("panels", [1, 2, 4])
+    def test_all_names_are_in_the_picture(self, panels):
+        names = "scvi-codegen controlled, scvi-codegen fixed, scvi-codegen transformed, heyoka, heyoka fast_math, "
+        names += "heyoka.lagrangian, rebound IAS15"
+        pytest.importorskip("matplotlib")
+        from scvi_codegen.benchmark.picture import draw_curves
+
+        found = TestReport.result
+        many = [replace(each, method=name) for name in names.split(", ") for each in found.measurements]
+        figure = draw_curves([replace(found, measurements=many)] * panels)
+        figure.draw_without_rendering()
+        legend, whole = figure.legends[0].get_window_extent(), figure.bbox
+        assert whole.x0 <= legend.x0 < legend.x1 <= whole.x1
+        assert whole.y0 <= legend.y0 < legend.y1 <= whole.y1
+
 
 class TestDrift:
     def test_the_slope_of_a_line(self):
