@@ -344,6 +344,10 @@ print("interrupted" if done.interrupted else "not interrupted", [path.name for p
 """
 
 
+JUST_STARTING = 2
+"""Lines that a process which was just starting may come to say of that, until it is ended."""
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals for process groups")
 def test_ctrl_c_ends_everything_at_once_and_keeps_what_was_written(tmp_path):
     path = f"import sys; sys.path[:0] = {sys.path!r}\n"
@@ -360,7 +364,8 @@ def test_ctrl_c_ends_everything_at_once_and_keeps_what_was_written(tmp_path):
     interrupt_group(child)
     output, errors = child.communicate(timeout=300.0)  # by itself it would take twice as long
     assert output == "interrupted ['table-9.txt']\n"
-    assert errors.count("Traceback") == errors.count("in spawn_main")  # of a process that was just starting
+    told = errors.split("Traceback (most recent call last):\n")[1:]
+    assert [text for text in told if not ("in spawn_main" in text or text.count("\n") <= JUST_STARTING)] == []
     assert (tmp_path / "made" / "table-9.txt").is_file()
 
 
