@@ -29,7 +29,7 @@ __all__ = ["refuse", "run_sums", "solved_by"]
 
 MOST_SHOWN = 4
 """Entries of an array at the end."""
-INSTEAD = {"advise": "give --tolerance", "solver": "leave it out; compile_indexed(..., solver=...) takes one"}
+INSTEAD = {"advise": "give --tolerance"}
 """Of options that sums over indices do not have."""
 
 

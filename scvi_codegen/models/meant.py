@@ -6,33 +6,10 @@ from collections.abc import Iterable
 from typing import Final
 
 from scvi_codegen.errors import closest
+from scvi_codegen.given.words import meanings, same_here
 
 __all__ = ["meant_by"]
 
-WORDS: Final = {
-    "step": "h dt delta_t timestep time_step stepsize step_size",
-    "span": "T t_end t_span t_max tmax tend t_final tf duration length time",
-    "steps": "n nsteps n_steps num_steps nt",
-    "tolerance": "tol rtol atol eps epsilon accuracy",
-    "every": "save_every stride output_every skip",
-    "q": "x q0 x0 position positions",
-    "q_dot": "v velocity velocities qdot dq v0",
-    "p": "p0 momentum momenta",
-    "t": "t0 time start",
-    "lagrangian": "l",
-    "hamiltonian": "h",
-    "coordinates": "q variables coords x positions",
-    "momenta": "p",
-    "degree": "n s order stages degrees",
-    "quadrature": "points k",
-    "method": "solver integrator scheme name type kind",
-    "parameters": "params param constants",
-    "forces": "force",
-    "initial": "init start state y0 initial_conditions",
-    "run": "integrate integration simulation settings solve",
-    "system": "model problem",
-}
-"""By the key, what it is called elsewhere."""
 KEYS: Final = {
     "run": "step span steps tolerance every controller",
     "initial": "q q_dot p t",
@@ -54,10 +31,9 @@ def meant_by(key: str, names: Iterable[str]) -> str:
         names: those known in its place.
     """
     known = list(names)
-    meant = [name for name, words in WORDS.items() if {key, key.lower()} & {*words.split()}]
-    if here := [name for name in meant if name in known]:
-        return f"; did you mean '{here[0]}'?"
+    if here := same_here(key, known):
+        return here
     if (hint := closest(key, known)) != ".":
         return hint
-    places = [PLACES[name] for name in ([key] if key in PLACES else meant) if name in PLACES]
+    places = [PLACES[name] for name in ([key] if key in PLACES else meanings(key)) if name in PLACES]
     return f"; {places[0]}." if places else "."

@@ -20,6 +20,7 @@ from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array, TakesInputs, check_left_to_inputs, no_input
+from scvi_codegen.runtime.standing import Standing
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
@@ -225,15 +226,9 @@ def stretches(
         yield None
 
 
-class Driven(Protocol):
+class Driven(Standing, Protocol):
     """What is asked of a run whose inputs are data."""
 
-    goal: Goal | None
-
-    @property
-    def t(self) -> float: ...
-    @property
-    def h(self) -> float: ...
     def change(self, *, parameters: Array, h: float | None = None, goal: Goal | None = None) -> None:
         """Go on with others."""
 

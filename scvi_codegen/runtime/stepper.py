@@ -109,10 +109,7 @@ class Stepper(Ensembles):
         )
         if clocked and t_end is not None:
             return _said(observed_until(run, t_end, steps, every, t_eval, progress))
-        if run.goal is None and steps is None:
-            raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
-        if run.goal is not None and steps is not None:
-            raise StateError(f"steps that choose their length go to t_end={t_end}: leave out steps={steps}")
+        _check_number(run, steps)
         if t_eval is None:
             found = run.record(steps, every=every, progress=progress)
             if run.leaving:
@@ -232,6 +229,14 @@ class Stepper(Ensembles):
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
         return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+
+
+def _check_number(run: Run, steps: int | None) -> None:
+    """Refuse steps of h without their number, and one of steps that choose their length."""
+    if run.goal is None and steps is None:
+        raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
+    if run.goal is not None and steps is not None:
+        raise StateError(f"steps that choose their length go to t_end={run.goal.t_end:g}: leave out steps={steps}")
 
 
 def _said(trajectory: Trajectory) -> Trajectory:
