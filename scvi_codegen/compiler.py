@@ -187,7 +187,8 @@ class _Texts:
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
-        return render_derivatives(derivatives_of(self.system, stages, found, second=second))
+        with waiting_for(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
+            return render_derivatives(derivatives_of(self.system, stages, found, second=second))
 
     def changes(self, count: int) -> Source | None:
         """With small changes beside each of many trajectories, where their equations are sums of forces, too."""

@@ -1,7 +1,11 @@
-"""Work that may take long says what it is, once it has."""
+"""Announcement of derivations and compilations that take longer than a second.
+
+They are announced on stderr where that is a terminal, and always by the logger ``scvi_codegen`` at level INFO.
+"""
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -10,7 +14,8 @@ from contextvars import ContextVar
 
 __all__ = ["tell", "told_to", "waiting_for"]
 
-PATIENCE_SECONDS = 2.0
+PATIENCE_SECONDS = 1.0
+LOGGER = logging.getLogger("scvi_codegen")
 
 
 def _print(what: str) -> None:
@@ -35,8 +40,14 @@ def tell(what: str) -> None:
 
 @contextmanager
 def waiting_for(what: str) -> Iterator[None]:
-    """Say what is being done if it takes longer than two seconds."""
-    timer = threading.Timer(PATIENCE_SECONDS, _listener.get() or _tell_the_terminal, [what])
+    """Announce what is being done if it takes longer than a second."""
+    listener = _listener.get() or _tell_the_terminal
+
+    def announce() -> None:
+        LOGGER.info(what)
+        listener(what)
+
+    timer = threading.Timer(PATIENCE_SECONDS, announce)
     timer.daemon = True
     timer.start()
     try:

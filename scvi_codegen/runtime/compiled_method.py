@@ -111,12 +111,34 @@ class CompiledMethod:
             self._with_changes[count] = self._changes(count)
         return self._with_changes[count]
 
-    def prepare(self) -> None:
-        """Compile now what is otherwise compiled when a step first needs it: Newton's iteration behind sweeps.
+    def prepare(
+        self,
+        *,
+        adaptive: bool = True,
+        tangent: bool = False,
+        second: bool = False,
+        ensemble: bool = False,
+        events: EventLike | Sequence[EventLike] | None = None,
+    ) -> None:
+        """Compile now what later calls would compile when they first need it: a run then never waits for a compiler.
 
-        For loops that must not wait a second for it.
+        Newton's iteration behind fixed-point iterations is always compiled, where the method has it. What the method
+        lacks is skipped.
+
+        Args:
+            adaptive: the variant with adaptive step size, for ``t_end=``.
+            tangent: derivatives of steps, for ``jacobian``, ``tangent``, ``sensitivity``, ``pullback`` and the like.
+            second: second derivatives, for ``hessian_product``.
+            ensemble: the variant for many trajectories at once.
+            events: the formulas that later calls pass as ``events=``, all those of one call together.
         """
-        self.binding.borrow_fallback()
+        for each in (self,) if events is None else (self, self.with_events(events)):
+            each.binding.borrow_fallback()
+            if adaptive and each._controlled() is not None:
+                each.controlled().binding.borrow_fallback()
+        sources = (tangent and self.derivatives, second and self.second_derivatives, ensemble and self.ensemble)
+        for source in filter(None, sources):
+            building.load(source, flags=self.flags)
 
     @property
     def tangent(self) -> Binding:

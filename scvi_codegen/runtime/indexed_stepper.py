@@ -81,6 +81,12 @@ class IndexedStepper:
             )
         return Binding(load(source, flags=self.flags), self.interface.prefix)
 
+    def prepare(self, *, adaptive: bool = True) -> None:
+        """Compile now what the first run would compile; with ``adaptive`` also the variant that ``t_end=`` needs."""
+        variants = (self.source, self._controlled_text() if adaptive else None)
+        for source in filter(None, variants):
+            load(source, flags=self.flags)
+
     @takes(StateError, parameters=MAPPING, tables=MAPPING)
     def start(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import signal
 import subprocess
@@ -144,9 +145,11 @@ def told(monkeypatch, seconds: float, patience: float) -> list[str]:
     return said
 
 
-def test_work_that_takes_long_is_spoken_of_and_other_is_not(monkeypatch):
+def test_work_that_takes_long_is_spoken_of_and_other_is_not(monkeypatch, caplog):
+    caplog.set_level(logging.INFO, "scvi_codegen")
     assert told(monkeypatch, 0.3, 0.05) == ["deriving"]
     assert told(monkeypatch, 0.0, 0.5) == []
+    assert caplog.messages == ["deriving"]
 
 
 class Terminal(io.StringIO):

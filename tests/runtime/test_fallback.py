@@ -11,6 +11,8 @@ import pytest
 
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.errors import StepFailedError
+from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
@@ -128,3 +130,28 @@ def test_a_run_that_fails_stands_before_the_step(start):
     with pytest.raises(StepFailedError):
         run.advance(1)
     assert run.save() == before
+
+
+def test_prepare_compiles_all_that_later_calls_need(tmp_path, monkeypatch):
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path))
+    swing, flags = problem("planar-pendulum").system, ("-O0",)
+    stepper, state = compile_stepper(swing, "svi:2", flags=flags), ([1.0], [0.0])
+    lattice = IndexedSystem.from_text(
+        name="chain", coordinates=["q[N]"], lagrangian="sum(a in N, q_dot[a]**2/2 - q[a]**2/2)"
+    )
+    chain = compile_indexed(lattice, "svi:2", flags=flags)
+    stepper.prepare(tangent=True, second=True, ensemble=True, events=["q", "q_dot"])
+    chain.prepare()
+    compile_stepper(problem("kepler").system, "stoermer-verlet", flags=flags).prepare()  # nothing to borrow
+    built: list[str] = []
+    monkeypatch.setattr(building, "_publish", lambda *given: built.append(given[0].prefix))
+    for events in (None, ["q", "q_dot"]):
+        stepper.integrate(*state, h=0.1, steps=3, events=events)
+        stepper.integrate(*state, t_end=0.3, tolerance=1e-6, events=events)
+    stepper.binding.borrow_fallback()
+    stepper.jacobian(*state, h=0.1)
+    assert stepper.curvature
+    stepper.integrate_ensemble([[1.0], [0.5]], [[0.0], [0.0]], h=0.1, steps=3)
+    chain.integrate([1.0, 0.5], [0.0, 0.0], h=0.1, steps=3)
+    chain.integrate([1.0, 0.5], [0.0, 0.0], t_end=0.3, tolerance=1e-6)
+    assert built == []
