@@ -33,6 +33,7 @@ from scvi_codegen.lowering.families import has_action, lowered_family
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.sites import sites_of
+from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
 from scvi_codegen.mechanics.exchanges import exchanges
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
@@ -146,9 +147,13 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     """
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
     held = any(block.name == END_VELOCITY for block in stages.blocks)
-    if isinstance(shape, Velocities) and len({*shape.blocks}) + held > 1 and _moves(stages, shape):
-        degree, (first, tops) = len(shape.blocks) - 1 + held, (0, _highest_of(shape, held))
-        bends = [(0, degree), (0, (degree + 1) // 2)]
+    if isinstance(shape, Velocities) and _moves(stages, shape):
+        tables, last = velocity_tables(shape), len(shape.blocks) - 1 + held
+        degree = last if held or tables is None else resolved_degree(tables)
+        if degree == 0:
+            return None
+        first, tops = 0, _highest_of(shape, None if held else degree)
+        bends = [(0, last), (0, (last + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
         power = 2 * degree
     elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):
@@ -163,12 +168,11 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     return StageCurve(highest=highest, next=below, bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
 
 
-def _highest_of(shape: Velocities, held: bool) -> list[Vector]:
+def _highest_of(shape: Velocities, degree: int | None) -> list[Vector]:
     """The highest coefficient of the accelerations that velocities tell, and the one below; 0 beside a known end."""
-    degree = len(shape.blocks) - 1
-    if held:
+    if degree is None:
         line = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one)
-        return [tuple((4 * degree + 2) * x for x in line), (mp.zero,) * len(line)]
+        return [tuple((4 * len(shape.blocks) - 2) * x for x in line), (mp.zero,) * len(line)]
     lines = {k: legendre_functional(shape.blocks, k) for k in (degree, degree - 1)}
     return [tuple(max(4 * k - 2, 0) * x for x in line) for k, line in lines.items()]
 

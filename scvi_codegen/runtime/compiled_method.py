@@ -246,7 +246,8 @@ class CompiledMethod:
         if source is None:
             raise MethodError(
                 f"{self.interface.method} has no steps that choose their length for this system: they need a curve "
-                "of velocities or forces at two points or more, which tells the error of a step; give h and steps"
+                "of forces at two points or more, or of velocities that forces change along a step, which tells the "
+                "error of a step; give h and steps"
             )
         if source == self._plain:
             return self

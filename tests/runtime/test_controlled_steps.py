@@ -267,6 +267,57 @@ def test_methods_without_a_polynomial_curve_say_so(method):
         stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
 
 
+MASSES = {
+    "relativistic": ({"coordinates": ["x"], "lagrangian": "-sqrt(1 - x_dot**2) - x**4/4"}, sc.LagrangianSystem),
+    "coupled": (
+        {"coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2 + x_dot*y_dot - x**4 - y**2*x**2"},
+        sc.LagrangianSystem,
+    ),
+    "of momenta": (
+        {"coordinates": ["x"], "momenta": ["p"], "hamiltonian": "sqrt(1 + p**2*(1 + x**2)) + x**4/4"},
+        sc.HamiltonianSystem,
+    ),
+    "of arrays": (
+        {
+            "coordinates": ["x[N]"],
+            "momenta": ["p[N]"],
+            "hamiltonian": "sum(a in N, sqrt(1 + p[a]**2*(1 + x[a]**2)) + x[a]**4/4)",
+        },
+        sc.IndexedSystem,
+    ),
+}
+
+
+@pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(2, "gauss-lobatto:2")])
+@pytest.mark.parametrize(
+    ("name", "solver"),
+    [(name, solver) for name in MASSES for solver in ("auto", "newton")[: 2 - (name == "of arrays")]],
+)
+def test_velocities_that_forces_leave_alike_at_both_points_tell_no_error(name, solver, method):
+    """The momenta of a Lobatto IIIA-IIIB pair of two stages are the same at both, whatever the forces are."""
+    text, kind = MASSES[name]
+    system = kind.from_text(name="quartic", **text)
+    if kind is sc.IndexedSystem:
+        stepper, start = sc.compile_indexed(system, method), ({"x": [0.5]}, {"x": [0.3]})
+    else:
+        stepper = sc.compile_stepper(system, method, solver=solver)
+        start = ([0.5] * system.dimension, [0.3] * system.dimension)
+    with pytest.raises(MethodError, match="tells the error of a step"):
+        stepper.integrate(*start, t_end=2.0, tolerance=1e-6)
+    assert math.isnan(stepper.integrate(*start, h=0.1, steps=2).step_error)
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+def test_of_three_points_at_both_ends_the_error_is_that_of_the_slope_of_momenta(solver):
+    """The highest coefficient of the velocities is 0 in every step."""
+    system = sc.LagrangianSystem.from_text(name="quartic", **MASSES["relativistic"][0])
+    stepper = sc.compile_stepper(system, sc.SVI(3, "gauss-lobatto:3"), solver=solver)
+    run = stepper.integrate([0.5], velocity=[0.3], t_end=2.0, tolerance=1e-6)
+    exact = sc.compile_stepper(system, sc.SVI(10)).integrate([0.5], velocity=[0.3], t_end=2.0)
+    assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-5 < np.abs(run.q[-1] - run.q[0]).max()
+    assert 1e-8 < run.step_error < 1e-5
+
+
 @pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, "gauss-legendre:9")])
 def test_newtons_iteration_has_them(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")

@@ -24,7 +24,7 @@ from scvi_codegen.ir.sweeps import CoupledSweep
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
-from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, velocity_tables
+from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, resolved_degree, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.basis import transpose
@@ -49,7 +49,7 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
     if lanes > MOST_LANES:
         return None
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
-    guess = guess_tables(tables.blocks, lanes)
+    guess = guess_tables(tables.blocks, lanes, degree=resolved_degree(tables))
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     followed = () if tables.projection else _followed(system)
     given = "L_q, L_v, their slopes F_q, F_v and L_vq" if followed else "L_q, L_v"

@@ -13,7 +13,7 @@ from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
 from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
-from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
+from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
 
 __all__ = ["hamiltonian_sweep"]
@@ -41,7 +41,7 @@ def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
         momentum_weights=pad_vector(momentum_weights, lanes),
         end_position=pad_vector(over(tables.end_position, position_weights), lanes),
         end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
-        guess=guess_tables(tables.blocks, lanes),
+        guess=guess_tables(tables.blocks, lanes, degree=resolved_degree(tables)),
         kernel=system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
         integrands=integrand_kernel(system, "integrand_lanes", of),

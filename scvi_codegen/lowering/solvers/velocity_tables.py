@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import Shape
-from scvi_codegen.tables.basis import matrix_product, transpose
+from scvi_codegen.tables.basis import legendre_functional, matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["VelocityTables", "tableau_tables", "velocity_tables"]
+__all__ = ["VelocityTables", "resolved_degree", "tableau_tables", "velocity_tables"]
 
 CONSISTENT = 1e-12
 
@@ -51,6 +51,19 @@ def velocity_tables(shape: Shape | None) -> VelocityTables | None:
     if shape.variational:
         return _variational_tables(shape)
     return tableau_tables(shape.abscissae, shape.position, shape.weights)
+
+
+def resolved_degree(tables: VelocityTables) -> int:
+    """The highest degree of the momenta along a step that forces reach: the Legendre coefficients above it are 0.
+
+    The momenta of a Lobatto IIIA-IIIB pair of s stages have degree s - 2. A coefficient that vanishes whatever the
+    forces are tells nothing of the error of the step.
+    """
+    for degree in range(len(tables.blocks) - 1, 0, -1):
+        (line,) = matrix_product((legendre_functional(tables.blocks, degree),), tables.momentum)
+        if max(map(abs, line)) > CONSISTENT:
+            return degree
+    return 0
 
 
 def tableau_tables(abscissae: Vector, A: Matrix, b: Vector) -> VelocityTables:
