@@ -299,7 +299,7 @@ CONTROL = """By steps that choose their length, each with a relative error of `t
 static ${prefix}_run run;
 ${prefix}_start(&run, t, 0.0, q0, p0);
 int status = ${prefix}_advance_to(&run, t_end, tolerance, most_steps, most_steps, parameters, NULL, &t, q, p,
-    &iterations, &report, workspace); /* there, if run.t == t_end: the state is in run.q and run.p */
+    &iterations, &report, workspace); /* there, if run.t == t_end and run.t_low == 0: the state is in run.q and run.p */
 ```
 """
 
@@ -310,7 +310,7 @@ DENSITY = """By steps of `tau` in a time with dt = g dtau, g = ${monitor}, the s
 static ${prefix}_run run;
 ${prefix}_start(&run, t, 0.0, q0, p0);
 int status = ${prefix}_advance_to(&run, t_end, tau, most_steps, most_steps, parameters, NULL, &t, q, p,
-    &iterations, &report, workspace); /* there, if run.t == t_end: the state is in run.q and run.p */
+    &iterations, &report, workspace); /* there, if run.t == t_end and run.t_low == 0: the state is in run.q and run.p */
 ```
 """
 

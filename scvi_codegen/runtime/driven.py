@@ -253,12 +253,13 @@ def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> li
     negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in ends_on_the_way(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])
-        if whole := int(np.floor((end - now[0]) / h + NEGLIGIBLE_STEP)):
+        if whole := int(np.floor(((end - now[0]) - now[1]) / h + NEGLIGIBLE_STEP)):
             found.append(Stretch(whole, h, now, middle))
             now = later(now, h, whole)
-        if forward * (end - now[0]) > negligible:
-            found.append(Stretch(1, end - now[0], now, middle))
-            now = later(now, end - now[0], 1)
+        rest = (end - now[0]) - now[1]
+        if forward * rest > negligible:
+            found.append(Stretch(1, rest, now, middle))
+            now = later(now, rest, 1)
     return found
 
 

@@ -300,7 +300,7 @@ class IndexedRun:
     @property
     def arrived(self) -> bool:
         """Whether the goal is reached."""
-        return self.goal is not None and self.t == self.goal.t_end
+        return self.goal is not None and self.t == self.goal.t_end and self._run.t_low == 0.0
 
     def save(self) -> bytes:
         """All of it, arrays and tables, for :meth:`IndexedStepper.restore`: a file of NumPy's (.npz)."""

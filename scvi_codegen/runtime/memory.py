@@ -155,6 +155,10 @@ class Memory:
         """Time, as carried along: the sum of all steps, rounded."""
         return _time(self._memory)
 
+    def left_to(self, end: float) -> float:
+        """Return the time from here to ``end``, counted with the low word of the run's time."""
+        return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
+
     def change(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
         """Go on with other parameters, another step, another goal; what is not given stays.
 
@@ -273,7 +277,7 @@ class Memory:
     @property
     def arrived(self) -> bool:
         """Whether the run stands at its goal."""
-        return self.goal is not None and self.t == self.goal.t_end
+        return self.goal is not None and self.left_to(self.goal.t_end) == 0.0
 
     @property
     def rejected(self) -> int:

@@ -105,7 +105,7 @@ class Observation:
             part, failure = Trajectory.before(error), error
         if self.end is not None and (part.t[-1] - self.end) * self.run.h >= 0.0:
             self.run.rewind(before)
-            part, failure = self._arrived(part), None
+            part, failure = self._arrived(part, before), None
         if self.search is not None:
             reached = self.search.search(part, first=self.run.steps - len(part) + 1 + self.arrived)
             if self.search.ended:
@@ -122,12 +122,16 @@ class Observation:
         _, _, tau = self._inside(part, float(last["t"]))
         return self._closed(part, part.lengths, last["t"], last["q"], last["p"], tau)
 
-    def _arrived(self, part: Trajectory) -> Trajectory:
+    def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
         """The part up to the end, by a last step of such a length; the run stands before that step."""
         assert self.end is not None
         self.arrived = True
         whole = int(np.count_nonzero((self.end - part.t) * self.run.h >= 0.0)) - 1
         part = record(self.run, whole)
+        while self.run.left_to(self.end) * self.run.h < 0.0:  # rounded times tie: it is the step before
+            self.run.rewind(before)
+            whole -= 1
+            part = record(self.run, whole)
         q, p, tau = self._inside(part, self.end)
         lengths = part.lengths.copy()
         if tau is not None:
@@ -135,11 +139,14 @@ class Observation:
         return self._closed(part, lengths, self.end, q, p, tau)
 
     def _inside(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
-        """The state at a time in the step that follows a part, and its tau; of plain time the last state."""
-        if part.tau is None or t == part.t[-1]:
+        """The state at a time in the step that follows a part, and its tau; of plain time the last state.
+
+        Systems in transformed time do not depend on t, so that it is counted from the last state.
+        """
+        if part.tau is None or (left := self.run.left_to(t)) == 0.0:
             return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
         run = self.run
-        q, p, x = part_of_step(run.stepper, run.t, run.h, t, part.q[-1], part.p[-1], run.parameters, run.options)
+        q, p, x = part_of_step(run.stepper, 0.0, run.h, left, part.q[-1], part.p[-1], run.parameters, run.options)
         return q, p, float(part.tau[-1]) + x * run.h
 
     def _closed(self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None) -> Trajectory:

@@ -11,13 +11,13 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   const step_data step = {run->t, 0, now.at.q, now.at.p, now.at.carry_q, now.at.carry_p, parameters, workspace, 1,
       NULL};
   begin_trials(run, &now, tolerance, &standard);
-  run->direction = t_end < run->t ? -1 : 1;
+  run->direction = (t_end - run->t) - run->t_low < 0 ? -1 : 1;
   options = options ? options : &standard;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   memcpy(&now.step, &step, sizeof step);
   load_state(run, &now.at);
-  while (report->steps < steps && now.at.t != t_end) {
+  while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
     const long long before = report->iterations;
     const int status = find_step(run, &now, options, report);
     if (status != OK) {
@@ -27,7 +27,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
     take_step(run, &now);
     run->iterations += report->iterations - before;
     report->steps++;
-    if (run->step % every == 0 || now.at.t == t_end) {
+    if (run->step % every == 0 || has_arrived(now.at.t, now.at.t_low, t_end)) {
       const long long stored = report->stored++;
       t[stored] = now.at.t;
       memcpy(q + stored * M, now.at.q, sizeof(real) * M);

@@ -21,7 +21,7 @@ static void begin_trials(run_memory *run, trial *now, real tau, solver_options *
 {
   (void)standard;
   now->tau = tau;
-  now->turned = (real)run->direction * (now->t_end - run->t) < 0;
+  now->turned = (real)run->direction * ((now->t_end - run->t) - run->t_low) < 0;
 }
 
 /* The density in the middle of the next step, if it is a whole one: where the run turns, of the last one. */

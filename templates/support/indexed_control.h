@@ -23,8 +23,8 @@ static int take_trials(run_memory *run, const travel *way, solver_report *report
       .given = way->given, .n = NAME(coordinates)(way->given), .t_end = way->t_end, .at = {run->t, run->t_low}};
   const solver_options *options = way->options ? way->options : &standard;
   begin_trials(run, &now, way->tolerance, &standard);
-  run->direction = way->t_end < run->t ? -1 : 1;
-  while (report->steps < way->steps && run->t != way->t_end) {
+  run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
+  while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
     const int status = find_step(run, &now, options, report);
     if (status != OK)
       return status;

@@ -46,7 +46,7 @@ real NAME(next_breakpoint)(const run_memory *run, real t_end, real h, input_data
 
 long long NAME(next_steps)(run_memory *run, real t_end, real h, input_data *inputs, real *parameters)
 {
-  const real left = NAME(next_breakpoint)(run, t_end, h, inputs, parameters) - run->t;
+  const real left = NAME(next_breakpoint)(run, t_end, h, inputs, parameters) - run->t - run->t_low;
   const real whole = MATH(floor)(left / h + (real)NO_STEP), length = whole >= 1 ? h : left;
   const real shorter = run->step > 0 ? MATH(fmin)(MATH(fabs)(h), MATH(fabs)(run->h)) : 0;
   if (!(left / h > 0) || MATH(fabs)(left) <= (real)NO_STEP * shorter)

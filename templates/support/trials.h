@@ -84,6 +84,6 @@ static void begin_trials(run_memory *run, trial *now, real tolerance, solver_opt
 {
   now->limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR);
   standard->tolerance = larger(REAL_EPSILON, ITERATION_PART * tolerance);
-  if ((real)run->direction * (now->t_end - run->t) < 0)
+  if ((real)run->direction * ((now->t_end - run->t) - run->t_low) < 0)
     run->guess = 0;
 }

@@ -409,3 +409,55 @@ def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
         stepper.integrate(*start, h=0.816, steps=2)
     assert failure.value.status == "strayed"
     assert 0.0 < stepper.integrate(*start, h=0.01, steps=2).step_error < 1e-3
+
+
+FAR = [1e14, 1e15]
+
+
+@pytest.fixture(scope="module")
+def far_away():
+    """Ways in which an oscillator moves by 2 units of time from a time on."""
+    text = {"name": "oscillator", "coordinates": ["q"], "lagrangian": "q_dot**2/2 - q**2/2"}
+    system = sc.LagrangianSystem.from_text(**text)
+    pushed = sc.LagrangianSystem.from_text(**text, forces={"q": "u"}, inputs=["u"])
+    summed = sc.IndexedSystem.from_text(
+        name="oscillators", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
+    )
+    adaptive, monitored, clocked, driven, indexed = (
+        sc.compile_stepper(system, "gauss:4"),
+        sc.compile_stepper(system, "svi:3", monitor="1/(1 + q**2)"),
+        sc.compile_stepper(sc.reparametrise(system, "1/(1 + q**2)"), "svi:3"),
+        sc.compile_stepper(pushed, "svi:3"),
+        sc.compile_indexed(summed, "svi:3"),
+    )
+
+    def inputs(t):
+        return {"u": ([t - 5.0, t + 1.0, t + 5.0], [0.0, 0.0, 0.0])}
+
+    return {
+        "adaptive": lambda t, end: adaptive.integrate([1.0], [0.0], t=t, t_end=end),
+        "monitored": lambda t, end: monitored.integrate([1.0], [0.0], t=t, t_end=end, h=0.02),
+        "clocked": lambda t, end: clocked.integrate([1.0], [0.0], t=t, t_end=end, h=np.copysign(0.02, end - t)),
+        "driven": lambda t, end: driven.drive(
+            [1.0], [0.0], inputs=inputs(t), t=t, t_end=end, h=np.copysign(0.07, end - t)
+        ),
+        "driven, adaptive": lambda t, end: driven.drive([1.0], [0.0], inputs=inputs(t), t=t, t_end=end),
+        "indexed": lambda t, end: indexed.integrate([1.0], [0.0], t=t, t_end=end),
+    }
+
+
+WAYS = ["adaptive", "monitored", "clocked", "driven", "driven, adaptive", "indexed"]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("span", [2.0, -2.0])
+def test_runs_end_at_t_end_counted_with_the_low_word_of_time(far_away, way, span):
+    """At t = 1e15 an ulp is 1/8, longer than a step: time alone is t_end some steps too early."""
+    near = far_away[way](0.0, span)
+    for t in FAR:
+        run = far_away[way](t, t + span)
+        q, there = (x.q["q"] if way == "indexed" else x.q for x in (run, near))
+        assert run.t[-1] == t + span
+        assert run.steps == near.steps
+        assert abs(q[-1, 0] - there[-1, 0]) < 1e-13
+        assert abs(q[-1, 0] - math.cos(span)) < 1e-10
