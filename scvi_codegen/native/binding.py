@@ -27,16 +27,29 @@ class Binding:
         prefix: of its names.
         workspace: doubles that a call needs.
         fallback: compiles the library that lends Newton's iteration, if it is borrowed.
+        origin: an object that can be pickled and the name of its attribute that is this binding.
     """
 
     def __init__(
-        self, library: Library, prefix: str, workspace: int = 0, *, fallback: Callable[[], Library] | None = None
+        self,
+        library: Library,
+        prefix: str,
+        workspace: int = 0,
+        *,
+        fallback: Callable[[], Library] | None = None,
+        origin: tuple[object, str] | None = None,
     ) -> None:
+        self._origin = origin
         self._ffi, self._lib, self._prefix, self._workspace = library.ffi, library.lib, prefix, workspace
         self.null = library.ffi.NULL
         self._fallback = fallback if self._has("borrow_fallback") else None
         self._lacks_fallback = self._fallback is not None
         self._lender: Self | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._origin is None:
+            raise TypeError("a binding is pickled with the stepper that it is of")
+        return getattr, self._origin
 
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
         """``<prefix>_<name>``, of this memory if one is given; releases the GIL while it runs."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -146,16 +147,22 @@ def field_values(
         shape = array.shape(sizes)
         if values.shape not in ((), shape):
             raise StateError(f"'{array.name}' has the shape {values.shape}; {array} is {_text(shape)} here")
-        found[array.name] = np.ascontiguousarray(np.broadcast_to(values, shape))
+        found[array.name] = _kept(np.ascontiguousarray(np.broadcast_to(values, shape)))
     return found
 
 
 def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | None) -> dict[str, Places]:
-    """The tables by name."""
+    """The tables by name: read-only copies, so that no index changes after it was checked."""
     _check_named(given or {}, [table.name for table in interface.tables], "tables", whole=True)
     found = {}
     for table in interface.tables:
-        values = np.asarray((given or {})[table.name])
+        try:
+            values = np.asarray((given or {})[table.name])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise StateError(
+                f"the table '{table.name}' is no array: its rows must have {table.axes[1].number} whole numbers each "
+                f"({error})"
+            ) from error
         if values.size and values.dtype.kind not in "iu":
             raise StateError(f"the table '{table.name}' must be whole numbers, not {values.dtype.name}")
         if values.ndim == 1 and table.axes[1].number == 1:
@@ -164,8 +171,14 @@ def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | No
             raise StateError(f"the table '{table.name}' has the shape {values.shape}, not that of {table}")
         if values.size and not 0 <= values.min() <= values.max() < 2**31:
             raise StateError(f"the table '{table.name}' has places from {values.min()} to {values.max()}")
-        found[table.name] = np.ascontiguousarray(values, dtype=np.int32)
+        found[table.name] = _kept(np.array(values, dtype=np.int32, order="C"))
     return found
+
+
+def _kept(array: NDArray[Any]) -> NDArray[Any]:
+    """The array, read-only from here on: the C code keeps a pointer to it."""
+    array.flags.writeable = False
+    return array
 
 
 def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[str]) -> dict[str, int]:

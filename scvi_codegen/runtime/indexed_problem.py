@@ -40,6 +40,9 @@ class IndexedProblem:
         for k, value in enumerate(arrays.numbers):
             self.struct.parameters[k] = value
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.interface, self.binding, self.arrays, self.awaited)
+
     @property
     def count(self) -> int:
         """Of coordinates."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import time
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -18,11 +16,13 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import VANISHED, SolverOptions, step_failure
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_arrays, read_state
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_state
 from scvi_codegen.runtime.indexed_maps import momentum_of
 from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE, IndexedMark, aligned, held_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
+from scvi_codegen.runtime.indexed_saving import read_saved, restore_memory, saved_arrays, saved_bytes, telling_of_damage
 from scvi_codegen.runtime.inputs import missing_input
+from scvi_codegen.runtime.one_thread import OneThread, alone
 from scvi_codegen.runtime.portions import SLICE_SECONDS
 from scvi_codegen.runtime.standing import stands
 
@@ -42,7 +42,7 @@ ADVICE_BY_SOLVER = {
 }
 
 
-class IndexedRun:
+class IndexedRun(OneThread):
     """The memory of a run; made by :meth:`IndexedStepper.start`.
 
     Args:
@@ -73,6 +73,7 @@ class IndexedRun:
         options: SolverOptions | None = None,
         threads: int = 1,
     ) -> None:
+        super().__init__()
         self.problem, self.goal, self.iterations, self.threads = problem, goal, 0, threads
         self._binding, self.options = problem.binding, options
         self._options = self._binding.options(options)
@@ -122,6 +123,7 @@ class IndexedRun:
             what = f"coordinate {place} of {len(inverse)}"
             raise StateError(f"{what} has no positive mass: every one needs a kinetic energy")
 
+    @alone
     def change(
         self,
         *,
@@ -154,10 +156,12 @@ class IndexedRun:
                 self.problem = former
                 raise
 
+    @alone
     def hold(self, **inputs: float) -> None:
         """Go on with inputs held at numbers: between the samples of a controller."""
         self._take(self.problem.held(inputs))
 
+    @alone
     def apart(self, h: float, goal: Goal | None = None) -> IndexedRun:
         """A run of its own from the present state, to the last bit, by other steps."""
         beside: dict[str, Any] = {"goal": goal, "options": self.options, "threads": self.threads}
@@ -174,12 +178,14 @@ class IndexedRun:
         moments = {name: getattr(self._run, name) for name in MOMENTS}
         return IndexedMark(kept, moments, self.iterations)
 
+    @alone
     def stand_at(self, other: IndexedRun) -> None:
         """The state and the time of another run of the same problem; no step more, and the next without a guess."""
         for name in STATE:
             self._numbers[name][:] = other._numbers[name]
         self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
 
+    @alone
     def rewind(self, mark: IndexedMark) -> None:
         """Back to a state; the next step begins without a guess."""
         for name, values in mark.arrays.items():
@@ -269,6 +275,7 @@ class IndexedRun:
         return np.array([momentum_of(q[each.array], p[each.array], each) for each in self.interface.maps])
 
     @property
+    @alone
     def multipliers(self) -> tuple[Numbers, ...]:
         """The lambda with which G^T lambda keep the state on its constraints: of each as written, over its loops.
 
@@ -278,6 +285,7 @@ class IndexedRun:
         return multipliers(self)
 
     @property
+    @alone
     def constraint_values(self) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
         """How far the state is off: g, and its rate g_q v + g_t, as the multipliers; raises as these."""
         return constraint_values(self)
@@ -302,16 +310,18 @@ class IndexedRun:
         """Whether the goal is reached."""
         return self.goal is not None and self.t == self.goal.t_end and self._run.t_low == 0.0
 
+    @alone
     def save(self) -> bytes:
         """All of it, arrays and tables, for :meth:`IndexedStepper.restore`: a file of NumPy's (.npz)."""
-        arrays, moments = self.problem.arrays, [float(getattr(self._run, name)) for name in MOMENTS]
-        saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
-        saved |= {f"field {name}": array for name, array in arrays.fields.items()}
-        saved |= {f"state {name}": array for name, array in self.q.items()}
+        saved: dict[str, Any] = {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
-        file, kind = io.BytesIO(), np.array(self.interface.integrator)
-        np.savez(file, integrator=kind, parameters=arrays.numbers, moments=moments, iterations=self.iterations, **saved)
-        return file.getvalue()
+        saved |= {"moments": [float(getattr(self._run, name)) for name in MOMENTS], "iterations": self.iterations}
+        saved |= {"awaited": np.array(self.problem.awaited, dtype=str), "to a goal": self.goal is not None}
+        return saved_bytes(saved, self.problem.arrays, self.interface)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = (self.interface, self._binding, self.save(), self.options, self.goal, self.threads)
+        return type(self).restored, given
 
     @classmethod
     def restored(
@@ -326,34 +336,19 @@ class IndexedRun:
         """The run that :meth:`save` gave.
 
         Raises:
-            StateError: for other bytes, and for a run of another integrator.
+            StateError: for other bytes, and for a run of another integrator, or of the other kind of steps.
         """
-        try:
-            found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
-            if str(found["integrator"]) != interface.integrator:
-                raise StateError(f"this is a run of '{found['integrator']}', not of '{interface.integrator}'")
-            moments = dict(zip(MOMENTS, found["moments"].tolist(), strict=True))
-            arrays = read_arrays(
-                interface,
-                {array.name: found[f"state {array.name}"] for array in interface.coordinates},
-                dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
-                | {field.name: found[f"field {field.name}"] for field in interface.fields},
-                {table.name: found[f"table {table.name}"] for table in interface.tables},
-            )
-            problem = IndexedProblem(interface, binding, arrays)
+        found = read_saved(saved, interface, to_a_goal=goal is not None)
+        with telling_of_damage():
+            awaited = tuple(name for name in interface.inputs if name in found["awaited"].tolist())
+            problem = IndexedProblem(interface, binding, saved_arrays(found, interface), awaited)
             beside: dict[str, Any] = {"goal": goal, "options": options, "threads": threads}
-            run = cls(problem, arrays.state, (None, ""), h=moments["h"], t=moments["t"], **beside)
-            for name, array in run._numbers.items():
-                array[:] = found[f"memory {name}"]
-            for name, value in moments.items():
-                setattr(run._run, name, type(getattr(run._run, name))(value))
-            run.iterations = int(found["iterations"])
-        except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-            if isinstance(error, StateError):
-                raise
-            raise StateError(f"these bytes are no saved run: {error}") from error
+            run = cls(problem, problem.arrays.state, (None, ""), h=0.0, t=0.0, **beside)
+            restore_memory(run._run, run._numbers, found)
+            run.iterations = checked_count(found["iterations"].item(), "iterations", least=0)
         return run
 
+    @alone
     def advance(
         self,
         steps: int,

@@ -68,7 +68,7 @@ class IndexedStepper:
 
     @cached_property
     def _binding(self) -> Binding:
-        return Binding(load(self.source, flags=self.flags), self.interface.prefix)
+        return Binding(load(self.source, flags=self.flags), self.interface.prefix, origin=(self, "_binding"))
 
     @cached_property
     def _controlled(self) -> Binding:
@@ -80,7 +80,7 @@ class IndexedStepper:
                 "of forces at two points or more, or of velocities that forces change along a step, which tells the "
                 "error of a step; give h and steps"
             )
-        return Binding(load(source, flags=self.flags), self.interface.prefix)
+        return Binding(load(source, flags=self.flags), self.interface.prefix, origin=(self, "_controlled"))
 
     def prepare(self, *, adaptive: bool = True) -> None:
         """Compile now what the first run would compile; with ``adaptive`` also the variant that ``t_end=`` needs."""

@@ -25,17 +25,20 @@ from scvi_codegen.runtime.inputs import (
     parameter_index,
 )
 from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.one_thread import OneThread, alone, in_use
 
 __all__ = ["Memory", "fill"]
 
 
 UNHEARD_STEPS = 10**5
 """Between looks at the keyboard."""
+RUNGS, MOST_RUNGS = ("rung", "change", "change_before", "direction"), 2**16
+"""Of steps that choose their length, which choose an entry of tables; far beyond those of all exponents of a double."""
 NEVER = LARGEST_COUNT
 """No step's number: of states that are to be kept."""
 
 
-class Memory:
+class Memory(OneThread):
     """A state, and what makes the next step cheap and the sums exact.
 
     Attributes:
@@ -55,6 +58,7 @@ class Memory:
         goal: Goal | None = None,
         awaited: tuple[str, ...] = (),
     ) -> None:
+        super().__init__()
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
         binding = stepper.binding
         self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
@@ -159,6 +163,7 @@ class Memory:
         """Return the time from here to ``end``, counted with the low word of the run's time."""
         return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
 
+    @alone
     def change(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
         """Go on with other parameters, another step, another goal; what is not given stays.
 
@@ -191,7 +196,12 @@ class Memory:
             if name not in self._inputs:
                 raise no_input(name, self._inputs)
             values[self._inputs[name]] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
-        self._go_on_with(values)
+        if not self._lock.acquire(False):
+            raise in_use()
+        try:
+            self._go_on_with(values)
+        finally:
+            self._lock.release()
         if self._awaited:
             self._awaited = tuple(name for name in self._awaited if name not in inputs)
 
@@ -221,6 +231,7 @@ class Memory:
         """(m,) and (m,) what rounding cut off :attr:`q` and :attr:`p`, added to the next steps."""
         return np.array(list(self._memory.carry_q)), np.array(list(self._memory.carry_p))
 
+    @alone
     def resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
         """How a run made elsewhere goes on here: after ``steps``, at a time, with what rounding cut off it, q and p."""
         self._memory.step = steps
@@ -228,6 +239,7 @@ class Memory:
         for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
             self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
 
+    @alone
     def save(self) -> bytes:
         """All of it, for :meth:`Stepper.restore` on the same kind of machine."""
         return bytes(self.stepper.binding.buffer(self._memory))
@@ -237,6 +249,7 @@ class Memory:
         if self._awaited:
             raise missing_input(self._awaited[0])
 
+    @alone
     def rewind(self, saved: bytes) -> None:
         """Back to when :meth:`save` gave these bytes."""
         self.stepper.binding.buffer(self._memory)[:] = saved
@@ -248,10 +261,15 @@ class Memory:
             StepFailedError: if one fails; the run stands before it.
         """
         left = checked_count(steps, "steps", least=0)
-        while left > 0 and not self.arrived:
-            if status := self._advance(min(left, UNHEARD_STEPS), NEVER, self._dropped):
-                raise step_failure(status, self._report, step=self.steps, h=self.h)
-            left -= UNHEARD_STEPS
+        if not self._lock.acquire(False):  # as ``alone``, at half the cost
+            raise in_use()
+        try:
+            while left > 0 and not self.arrived:
+                if status := self._advance(min(left, UNHEARD_STEPS), NEVER, self._dropped):
+                    raise step_failure(status, self._report, step=self.steps, h=self.h)
+                left -= UNHEARD_STEPS
+        finally:
+            self._lock.release()
 
     def run_to_goal(self) -> None:
         """Advance to the goal and keep nothing but the state there."""
@@ -323,6 +341,7 @@ def _check_memory(memory: Any) -> None:
     """Raise :class:`StateError` for bytes that no run has."""
     numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
     counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
+    rungs = {name: getattr(memory, name) for name in RUNGS if hasattr(memory, name)}
     sound = np.isfinite(numbers).all() and all(0 <= count < 2**53 for count in counts.values())
-    if not sound or memory.guess > 2:
-        raise StateError(f"these bytes are not a saved run: h = {memory.h:g}, {counts}")
+    if not sound or memory.guess > 2 or any(abs(rung) > MOST_RUNGS for rung in rungs.values()):
+        raise StateError(f"these bytes are not a saved run: h = {memory.h:g}, {counts | rungs}")

@@ -12,6 +12,7 @@ from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
+from scvi_codegen.runtime.one_thread import alone
 from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.standing import stands
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -33,6 +34,7 @@ class Run(Memory):
             del known[f"{name}_0"]
         return (_restored, (self.stepper, self.save(), known, self._options, self.goal, self.longest))
 
+    @alone
     def record(
         self, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
     ) -> Trajectory:

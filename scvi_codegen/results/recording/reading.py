@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -64,7 +63,7 @@ class RecordedRun:
         if not self._paths:
             raise RecordingError(f"'{folder}' holds no states, not even the first: record it again")
         self._last = read_chunk(self._paths[-1])
-        self._recent: OrderedDict[int, Piece] = OrderedDict()
+        self._recent: tuple[tuple[int, Piece], ...] = ()
         self.t, self.q, self.p, self.iterations = (LazyArray(self, i) for i in range(len(COLUMNS)))
 
     def __len__(self) -> int:
@@ -145,12 +144,10 @@ class RecordedRun:
         """The states of file ``number``, of the files read last from memory."""
         if number == len(self._paths) - 1:
             return self._last.piece
-        if number not in self._recent:
-            self._recent[number] = read_chunk(self._paths[number]).piece
-            if len(self._recent) > PIECES_IN_MEMORY:
-                self._recent.popitem(last=False)
-        self._recent.move_to_end(number)
-        return self._recent[number]
+        recent = dict(self._recent)  # replaced as a whole, so that threads may read the run
+        piece = recent.pop(number, None) or read_chunk(self._paths[number]).piece
+        self._recent = ((number, piece), *recent.items())[:PIECES_IN_MEMORY]
+        return piece
 
     def rows(self, rows: Any) -> NDArray[np.int64]:
         """Numbers of rows, or one number; IndexError for one that is not there."""

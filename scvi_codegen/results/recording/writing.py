@@ -106,7 +106,7 @@ def record_run(
     recorder = _Recorder(target, manifest, run, *_pace(checkpoint_seconds, checkpoint_steps))
     with recorder.telling_where_it_stands():
         _prepare(target)
-    with _locked(target):
+    with _locked(target), run.alone():
         with recorder.telling_where_it_stands():
             _clear(target)
             recorder.keep(_piece(record(run, 0), 0))

@@ -1,0 +1,126 @@
+"""Saved runs over arrays: bytes that hold all of a run, and the checks of what is read back."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.indexed_interface import IndexedInterface, RunArrays, read_arrays
+from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE
+
+__all__ = ["read_saved", "restore_memory", "saved_arrays", "saved_bytes", "telling_of_damage"]
+
+RANGES = {
+    **dict.fromkeys(("step", "rejected", "leaving"), (0, 2**53)),
+    "guess": (0, 2),
+    "turn": (0, 2),
+    "direction": (-1, 1),
+    **dict.fromkeys(("rung", "change", "change_before"), (-(2**16), 2**16)),
+}
+"""The least and the greatest of each whole number that C takes: some of them choose a part of the memory."""
+FINITE = ("t", "t_low", "h")
+"""Numbers that are finite in every run; estimates of errors may be NaN."""
+COMPUTED = ("inverse_mass", "places", "columns")
+"""Arrays that follow from the problem, and are not read back: places of others would lead out of the memory."""
+CHECKSUM = "checksum"
+
+
+def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: IndexedInterface) -> bytes:
+    """What a run is over and its own arrays by name as a file of NumPy's (.npz), with a checksum of all of them."""
+    saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
+    saved |= {f"field {name}": array for name, array in arrays.fields.items()}
+    saved |= {"integrator": interface.integrator, "parameters": arrays.numbers, **run}
+    found: dict[str, Any] = {name: np.asarray(array) for name, array in saved.items()}
+    file = io.BytesIO()
+    found[CHECKSUM] = _checksum(found)
+    np.savez(file, **found)
+    return file.getvalue()
+
+
+def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) -> dict[str, NDArray[Any]]:
+    """The arrays of :func:`saved_bytes`.
+
+    Raises:
+        StateError: for other bytes, changed ones, and those of another integrator, or of the other kind of steps.
+    """
+    if not isinstance(saved, bytes):
+        raise StateError(f"a saved run is bytes, not {type(saved).__name__}")
+    with telling_of_damage():
+        found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
+        if str(found["integrator"]) != interface.integrator:
+            raise StateError(f"this is a run of '{found['integrator']}', not of '{interface.integrator}'")
+        if str(found.pop(CHECKSUM)) != _checksum(found):
+            raise StateError("these bytes are no saved run: their checksum differs. Save the run again")
+        if bool(found["to a goal"]) == to_a_goal:
+            return found
+    raise StateError(
+        "this is a saved run of fixed steps, which has no t_end: leave it out"
+        if to_a_goal
+        else "this is a saved run whose steps choose their length: give its t_end"
+    )
+
+
+def saved_arrays(found: Mapping[str, NDArray[Any]], interface: IndexedInterface) -> RunArrays:
+    """What the saved run is over, checked as that of a new one."""
+    numbers = dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
+    return read_arrays(
+        interface,
+        {array.name: found[f"state {array.name}"] for array in interface.coordinates},
+        numbers | {field.name: found[f"field {field.name}"] for field in interface.fields},
+        {table.name: found[f"table {table.name}"] for table in interface.tables},
+    )
+
+
+@contextmanager
+def telling_of_damage() -> Iterator[None]:
+    """Turn what damaged bytes raise anywhere below into a :class:`StateError`."""
+    try:
+        yield
+    except StateError:
+        raise
+    except Exception as error:  # of zipfile, zlib, NumPy's parser of headers and conversions: no list of them is whole
+        raise _not_saved(repr(error)) from error
+
+
+def restore_memory(run: Any, arrays: Mapping[str, NDArray[Any]], saved: Mapping[str, NDArray[Any]]) -> None:
+    """Put saved numbers into the C struct of a run and its arrays, after a check of each.
+
+    Raises:
+        StateError: for numbers that no run has.
+    """
+    moments = dict(zip(MOMENTS, np.asarray(saved["moments"], dtype=float).tolist(), strict=True))
+    for name, value in moments.items():
+        if name in RANGES and not (value.is_integer() and RANGES[name][0] <= value <= RANGES[name][1]):
+            raise _not_saved(f"{name} is {value:g}, not a whole number from {RANGES[name][0]} to {RANGES[name][1]}")
+        if name in FINITE and not np.isfinite(value):
+            raise _not_saved(f"{name} is {value:g}")
+        setattr(run, name, int(value) if name in RANGES else value)
+    for name, array in arrays.items():
+        if name in COMPUTED:
+            continue
+        values = saved[f"memory {name}"]
+        if values.shape != array.shape or values.dtype != array.dtype:
+            raise _not_saved(f"{name} has the shape {values.shape}, not {array.shape}")
+        if name in STATE and not np.isfinite(values).all():
+            raise _not_saved(f"{name} is not finite")
+        array[:] = values
+
+
+def _not_saved(reason: object) -> StateError:
+    return StateError(f"these bytes are no saved run: {reason}")
+
+
+def _checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
+    found = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        found.update(array.tobytes() if array.dtype.kind == "U" else array.data)
+    return found.hexdigest()

@@ -1,0 +1,60 @@
+"""A lock that keeps a run to one thread: a second thread that enters is refused, because the C works on one struct."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar, cast
+
+from scvi_codegen.errors import StateError
+
+__all__ = ["OneThread", "alone", "in_use"]
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+
+def in_use() -> StateError:
+    """The error for a second thread."""
+    return StateError(
+        "this run is being used by another thread: a run belongs to one thread at a time. Start a run for each thread "
+        "(stepper.start(...), copy.copy(run)); the stepper itself may be shared"
+    )
+
+
+class OneThread:
+    """Base of runs; callbacks in the thread that holds the lock may enter again."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Hold the run for several calls.
+
+        Raises:
+            StateError: if another thread holds it.
+        """
+        if not self._lock.acquire(blocking=False):
+            raise in_use()
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+
+def alone(method: Called) -> Called:
+    """Hold the run while a method of it works; the method then raises as :meth:`OneThread.alone`."""
+
+    @functools.wraps(method)
+    def held(self: Any, *given: Any, **named: Any) -> Any:
+        lock = self._lock
+        if not lock.acquire(False):
+            raise in_use()
+        try:
+            return method(self, *given, **named)
+        finally:
+            lock.release()
+
+    return cast(Called, held)

@@ -1,0 +1,228 @@
+"""Memory of runs over arrays: nothing that a caller changes later, and no damaged bytes, lead C out of its arrays."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime import indexed_saving
+from scvi_codegen.runtime.indexed_memory import MOMENTS
+
+BONDS = [[0, 1], [1, 2]]
+Q = [1.0, 2.5, 3.0]
+K = np.array([1.0, 2.0])
+
+
+@pytest.fixture(scope="module")
+def chain() -> sc.IndexedStepper:
+    system = sc.IndexedSystem.from_text(
+        name="chain",
+        coordinates=["q[N]"],
+        tables=["bonds[B, 2]"],
+        parameters={"k[B]": 1.0},
+        inputs=["F"],
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(b in B, k[b]*(q[bonds[b, 1]] - q[bonds[b, 0]])**2/2)",
+        forces={"q[0]": "F"},
+    )
+    return sc.compile_indexed(system, "svi:3", flags=QUICK_FLAGS)
+
+
+@pytest.fixture(scope="module")
+def pendulums() -> sc.IndexedStepper:
+    """With constraints, whose memory has places, too."""
+    system = sc.IndexedSystem.from_text(
+        name="pendulums",
+        coordinates=["x[N]", "y[N]"],
+        lagrangian="sum(i in N, x_dot[i]**2/2 + y_dot[i]**2/2 - y[i])",
+        constraints=["x[i]**2 + y[i]**2 - 1 for i in N"],
+    )
+    return sc.compile_indexed(system, "stoermer-verlet", flags=QUICK_FLAGS)
+
+
+def start(stepper: sc.IndexedStepper, **given: Any) -> Any:
+    """A run of either system."""
+    if stepper.interface.constraints:
+        return stepper.start({"x": [0.6, 1.0], "y": [0.8, 0.0]}, **({"h": 0.05} | given))
+    return stepper.start(Q, **({"h": 0.05, "tables": {"bonds": BONDS}, "parameters": {"k": K, "F_0": 0.5}} | given))
+
+
+class TestWhatACallerChangesLater:
+    @pytest.mark.parametrize("value", [10**6, 10**4, -50])
+    @pytest.mark.parametrize("order", ["C", "F"])
+    def test_of_tables_and_fields_nothing_reaches_the_run(self, chain: Any, value: int, order: Any) -> None:
+        table, k = np.array(BONDS, dtype=np.int32, order=order), K.copy()
+        run = start(chain, tables={"bonds": table}, parameters={"k": k, "F_0": 0.5})
+        other = start(chain)
+        table[0, 0], k[0] = value, 1e300
+        for each in (run, other):
+            each.advance(3)
+        assert (run.q["q"] == other.q["q"]).all()
+
+    @pytest.mark.parametrize("callback", ["progress", "observe"])
+    def test_in_a_callback_neither(self, chain: Any, callback: str) -> None:
+        table, k = np.array(BONDS, dtype=np.int32), K.copy()
+
+        def spoil(*_: Any) -> float:
+            table[0], k[0] = (10**6, -50), 1e300
+            return 0.0
+
+        given = {"h": 0.05, "steps": 600}
+        spoiled = {"tables": {"bonds": table}, "parameters": {"k": k, "F_0": 0.5}, callback: spoil}
+        found = chain.integrate(Q, **given, **spoiled)
+        expected = chain.integrate(Q, tables={"bonds": BONDS}, parameters={"k": K, "F_0": 0.5}, **given)
+        assert k[0] == 1e300
+        assert (found.q["q"][-1] == expected.q["q"][-1]).all()
+
+    def test_what_a_run_holds_is_read_only(self, chain: Any) -> None:
+        arrays = start(chain).problem.arrays
+        for array in (arrays.places["bonds"], arrays.fields["k"]):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 0
+
+    @pytest.mark.parametrize("table", [[[0, 1], [1]], [[0, [1]], [1, 2]], [[0, 2**70], [1, 2]], "ab"])
+    def test_a_table_that_is_no_array_is_named(self, chain: Any, table: Any) -> None:
+        with pytest.raises(StateError, match="the table 'bonds'"):
+            start(chain, tables={"bonds": table})
+
+
+class TestPickles:
+    @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda run: pickle.loads(pickle.dumps(run))])
+    @pytest.mark.parametrize("given", [{}, {"h": None, "t_end": 20.0, "tolerance": 1e-6}], ids=["h", "t_end"])
+    def test_a_run_goes_on_as_it_would_have(self, chain: Any, copied: Any, given: Any) -> None:
+        run = start(chain, **given, options=sc.SolverOptions(max_iterations=40), threads=2)
+        run.advance(3)
+        other = copied(run)
+        for name in ("t", "h", "goal", "options", "steps", "iterations", "threads"):
+            assert getattr(other, name) == getattr(run, name), name
+        for each in (run, other):
+            each.advance(5)
+        assert (run.q["q"] == other.q["q"]).all()
+        run.advance(1)  # of its own
+        assert run.steps == 9
+        assert other.steps == 8
+
+    def test_constraints_too(self, pendulums: Any) -> None:
+        run = start(pendulums)
+        run.advance(3)
+        other = copy.copy(run)
+        for each in (run, other):
+            each.advance(5)
+        assert all((run.q[name] == other.q[name]).all() for name in "xy")
+
+    def test_an_input_is_still_awaited(self, chain: Any) -> None:
+        run = start(chain, parameters={"k": K})
+        for other in (copy.copy(run), chain.restore(run.save())):
+            with pytest.raises(StateError, match="the input F is not given"):
+                other.advance(1)
+
+    def test_a_trajectory_keeps_its_states_between(self, chain: Any) -> None:
+        found = chain.integrate(Q, h=0.1, steps=3, tables={"bonds": BONDS}, parameters={"F_0": 0.0})
+        other = pickle.loads(pickle.dumps(found))
+        assert (found.at([0.05])[0]["q"] == other.at([0.05])[0]["q"]).all()
+
+
+def parts(saved: bytes) -> dict[str, Any]:
+    """Arrays of a saved run by name."""
+    return dict(np.load(io.BytesIO(saved)))
+
+
+def put_together(found: dict[str, Any], *, checksum: bool = True) -> bytes:
+    """Bytes of such arrays, whose checksum is right if that is wanted."""
+    if checksum:
+        found = {name: array for name, array in found.items() if name != indexed_saving.CHECKSUM}
+        found[indexed_saving.CHECKSUM] = indexed_saving._checksum(found)
+    file = io.BytesIO()
+    np.savez(file, **found)
+    return file.getvalue()
+
+
+class TestDamage:
+    """Bytes of the whole file, numbers behind a right checksum: refused, or a run that goes on within its arrays."""
+
+    def test_changed_numbers_are_found_by_the_checksum(self, chain: Any) -> None:
+        run = start(chain)
+        run.advance(2)
+        for name, array in parts(run.save()).items():
+            if name == indexed_saving.CHECKSUM:
+                continue
+            spoiled = array + 1 if array.dtype.kind in "if" else ~array if array.dtype.kind == "b" else array + "x"
+            if array.size:
+                with pytest.raises(StateError, match=r"checksum differs|not of"):
+                    chain.restore(put_together(parts(run.save()) | {name: spoiled}, checksum=False))
+
+    @pytest.mark.parametrize("value", [-1.0, 3.0, 0.5, 1e300, -1e300, np.nan, np.inf, 2.0**63, -(2.0**62)])
+    @pytest.mark.parametrize("name", indexed_saving.RANGES)
+    def test_counts_of_no_run(self, chain: Any, name: str, value: float) -> None:
+        run = start(chain, h=None, t_end=2.0)
+        run.advance(3)
+        found = parts(run.save())
+        found["moments"][MOMENTS.index(name)] = value
+        least, most = indexed_saving.RANGES[name]
+        if least <= value <= most and value == int(value):
+            chain.restore(put_together(found), t_end=2.0).advance(3)
+            return
+        with pytest.raises(StateError, match=name):
+            chain.restore(put_together(found), t_end=2.0)
+
+    @pytest.mark.parametrize("which", ["chain", "pendulums"])
+    def test_every_array(self, which: str, request: Any) -> None:
+        stepper = request.getfixturevalue(which)
+        run = start(stepper)
+        run.advance(2)
+        whole, refused = parts(run.save()), 0
+        for name, array in whole.items():
+            shapes = [array.reshape(-1)[:0], np.append(array, array), array.astype("U9"), np.array(10**6)]
+            numbers = [np.full_like(array, value) for value in (-(10**6), 10**6)] if array.dtype.kind in "if" else []
+            numbers += [np.full_like(array, np.nan)] if array.dtype.kind == "f" else []
+            for spoiled in (*shapes, *numbers):
+                try:
+                    other = stepper.restore(put_together(whole | {name: spoiled}))
+                    other.advance(2)
+                except (StateError, sc.StepFailedError):
+                    refused += 1
+        assert refused > 2 * len(whole)
+
+    def test_bytes_at_random(self, chain: Any) -> None:
+        run, random = start(chain), np.random.default_rng(3)
+        whole = run.save()
+        for _ in range(300):
+            spoiled = bytearray(whole)
+            for place in random.integers(0, len(whole), 3):
+                spoiled[place] ^= int(random.integers(1, 256))
+            try:
+                chain.restore(bytes(spoiled)).advance(1)
+            except StateError:
+                continue
+        for spoiled in (b"", b"x", whole[:-1], whole[:100], np.zeros(3).tobytes()):
+            with pytest.raises(StateError, match="no saved run"):
+                chain.restore(spoiled)
+        with pytest.raises(StateError, match="is bytes, not int"):
+            chain.restore(3)
+
+    def test_a_run_of_the_other_kind_of_steps(self, chain: Any) -> None:
+        with pytest.raises(StateError, match="give its t_end"):
+            chain.restore(start(chain, h=None, t_end=2.0).save())
+        with pytest.raises(StateError, match="leave it out"):
+            chain.restore(start(chain).save(), t_end=2.0)
+
+
+def test_rungs_of_no_run_are_refused_of_scalar_runs_too() -> None:
+    system = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
+    stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
+    run = stepper.start([1.0], [0.0], t_end=5.0, tolerance=1e-6)
+    run.advance(3)
+    for name in ("rung", "change", "change_before", "direction"):
+        for value in (-(2**63), 2**63 - 1, 2**20):
+            before = getattr(run._memory, name)
+            setattr(run._memory, name, value)
+            with pytest.raises(StateError, match=f"not a saved run.*{name}"):
+                stepper.restore(run.save(), t_end=5.0, tolerance=1e-6)
+            setattr(run._memory, name, before)
