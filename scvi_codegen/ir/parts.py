@@ -7,14 +7,14 @@ array, ``kept``; the compiler would have spilled most of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
 from scvi_codegen.ir.kernel import Expression, Kernel, Load, Operation, loads, operations
 
-__all__ = ["LARGEST_PART", "Part", "Statement", "kept_numbers", "parts"]
+__all__ = ["LARGEST_PART", "Part", "Statement", "is_cut", "kept_numbers", "parts"]
 
 LARGEST_PART = 1000
 """Operations of one C function."""
@@ -70,6 +70,11 @@ def parts(kernel: Kernel) -> tuple[Part, ...]:
         free.extend(places[index] for index in done)
         cut.append(Part(name=f"{kernel.name}_{n + 1}", statements=tuple(statements)))
     return tuple(cut)
+
+
+def is_cut(kernels: Iterable[Kernel]) -> bool:
+    """Return whether one of the kernels, or a term that its loops evaluate, is several functions."""
+    return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
 
 
 def _pieces(statements: Sequence[Statement]) -> Iterator[tuple[Statement, ...]]:

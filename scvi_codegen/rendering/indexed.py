@@ -7,6 +7,7 @@ from typing import Any
 
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.parts import is_cut
 from scvi_codegen.rendering.control import ladder_text
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
@@ -41,6 +42,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         scalars += [each.kernel for each in program.forces]
     if program.held:
         scalars += [each.kernel for each in (*program.held.conditions, *program.held.bends)]
+    applied = (*program.forces, *program.products, *program.diagonals)
     context = {
         "program": program,
         "prefix": program.prefix,
@@ -48,7 +50,8 @@ def render_indexed(program: IndexedProgram) -> Source:
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
         "most_threads": 1 if program.held else MOST_THREADS,
-        "forces": [_force_text(program, each) for each in (*program.forces, *program.products, *program.diagonals)],
+        "cut": is_cut((*scalars, *(each.kernel for each in applied))),
+        "forces": [_force_text(program, each) for each in applied],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in program.masses],
         "force_names": [each.kernel.name for each in program.forces],

@@ -7,7 +7,7 @@ over the program's tables and the C that does not depend on it. Arithmetic arriv
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, NamedTuple, TypeAlias, cast, get_args
@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.derivatives import Derivatives
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.parts import parts
+from scvi_codegen.ir.parts import is_cut
 from scvi_codegen.ir.program import Program
 from scvi_codegen.ir.sweep import Kept, Sweep
 from scvi_codegen.rendering.control import ladder_text
@@ -191,7 +191,7 @@ def render_ensemble(program: Program) -> Source | None:
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
         "points": len(sweep.guess.abscissae),
-        "cut": _is_cut(sweep.kernels),
+        "cut": is_cut(sweep.kernels),
         "needs_velocities": sweep.kept is Kept.VELOCITIES,
         "hot": "static",
         "sweep": sweep_text(sweep, TRAJECTORIES, fallback="none"),
@@ -207,7 +207,7 @@ def render_events(search: EventSearch) -> Source:
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "kernel": search.kernel,
-        "cut": _is_cut((search.kernel,)),
+        "cut": is_cut((search.kernel,)),
         "inverse_roots": _inverse_roots(scalar_functions(search.kernel)),
     }
     return _render(f"{search.prefix}_events", context, "events")
@@ -268,7 +268,7 @@ def _context(
         "target": target,
         "real": target.scalar,
         "kernels": kernels,
-        "cut": _is_cut((*scalars, *(program.sweep.kernels if program.sweep else ()), *lanes)),
+        "cut": is_cut((*scalars, *(program.sweep.kernels if program.sweep else ()), *lanes)),
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
@@ -289,11 +289,6 @@ def _scalar_kernels(
     own = program.kernels if kernels is None else kernels
     splitting = program.splitting.kernels if program.splitting else ()
     return (*own, *splitting, *((control.density,) if control and control.density else ()))
-
-
-def _is_cut(kernels: Iterable[Kernel]) -> bool:
-    """Whether one of them is several functions."""
-    return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
 
 
 def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]) -> dict[str, object]:
