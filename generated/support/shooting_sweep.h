@@ -48,7 +48,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
   curve_data curve;
   lanes m[M], node[3 * M], action[2 * M], mass[MASS];
   const double h = step->h;
-  double inverse_size[M];
+  double inverse_size[M] = {0.0};
   progress now = before_sweeps();
   int settled = 0, status = first_curve(step, past, *steps, &curve);
   if (status != OK)

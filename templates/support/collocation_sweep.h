@@ -8,7 +8,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
 {
   curve_data curve;
   lanes u[2 * M], force[M], mass[MASS];
-  double inverse_size[M];
+  double inverse_size[M] = {0.0};
   progress now = before_sweeps();
   int status = first_curve(step, past, *steps, &curve);
   if (status != OK)

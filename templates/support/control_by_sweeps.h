@@ -7,7 +7,7 @@
 static inline double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess,
     double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
 {
-  struct guess_tables tables;
+  struct guess_tables tables = {NULL, NULL, NULL};
   int status;
   step->tables = &tables;
   *guess = afresh || !choose_tables(run, &tables) ? 0 : run->guess;

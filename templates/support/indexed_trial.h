@@ -17,7 +17,7 @@ typedef struct {
 /* One trial of the step that the run is at: its curve, and what that leaves unresolved; infinity without one. */
 static void try_step(run_memory *run, trial *now, double least, const solver_options *options, solver_report *report)
 {
-  struct guess_tables tables;
+  struct guess_tables tables = {NULL, NULL, NULL};
   (void)least;
   run->h = next_length(length_of(run->rung), (now->t_end - now->at.t) - now->at.t_low, &now->last);
   report->t = now->at.t;

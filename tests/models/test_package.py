@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import BuildError, PackageError, StateError
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
@@ -132,6 +134,36 @@ def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compil
     states = np.hstack([trajectory.q, trajectory.p])
     assert np.abs(table[:, 1:-1] - states).max() < 1e-8 * np.abs(states).max()
     assert np.abs(table[:, -1]).max() <= 2 * np.abs(trajectory.energy() - trajectory.energy()[0]).max() + 1e-13
+
+
+KINDS = """
+planar-pendulum --method svi:3
+double-pendulum --method radau-iia:2
+charged-particle --method svi:2
+planar-pendulum --method scvi:3
+duffing --method sc:3
+kepler --method stoermer-verlet
+kepler --method svi:4 --embedded double
+fput_ring.toml
+fput_ring.toml --method stoermer-verlet
+shaken_tower.toml
+vortex_pairs.toml
+"""
+
+
+@pytest.mark.parametrize("words", KINDS.strip().splitlines())
+def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
+    """By the Makefile in it, as it stands, with the C compiler of the system."""
+    model, *options = words.split()
+    model = str(Path(__file__).parents[2] / "examples" / model) if model.endswith(".toml") else model
+    folder = tmp_path / "own"
+    said = CliRunner().invoke(main, ["generate", model, *options, "-o", str(folder)])
+    assert said.exit_code == 0, said.output
+    flags = next(line for line in (folder / "Makefile").read_text().splitlines() if line.startswith("CFLAGS = "))
+    assert "-Wall -Wextra" in flags
+    command = ["make", "-s", "-C", str(folder), "own_main", f"CFLAGS={flags.removeprefix('CFLAGS = ')} -Werror"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
 
 
 def test_large_workspaces_are_not_on_the_stack(tmp_path):
