@@ -10,6 +10,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.derivatives import hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
@@ -30,9 +31,9 @@ LAGRANGES_METHOD = Kind("a LagrangesMethod of sympy.physics.mechanics", lambda v
 KANES_METHOD = Kind("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
 BODIES = Kind("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
-REMEDY = (
-    "A variational integrator needs a regular Lagrangian: add the missing kinetic energy, use fewer coordinates "
-    "(independent ones, if there is a constraint), or choose coordinates that are not redundant"
+REQUIRED = "A regular Lagrangian is required: d2L/dv2 must be invertible."
+REDUNDANT = (
+    "Add the missing kinetic energy, or use fewer coordinates: as many as there are independent motions with inertia"
 )
 
 
@@ -334,13 +335,9 @@ def _forces(
 
 def _check_velocities(system: LagrangianSystem) -> None:
     free = system.lagrangian.free_symbols
-    for coordinate, velocity in zip(system.coordinates, system.velocities, strict=True):
-        if velocity not in free:
-            raise SystemDefinitionError(
-                f"velocity '{velocity}' does not occur in the Lagrangian: coordinate '{coordinate}' has no kinetic "
-                f"energy. Add a term such as {velocity}**2/2, or take the coordinate out (a known function of it can "
-                "be a parameter)"
-            )
+    missing = tuple(velocity for velocity in system.velocities if velocity not in free)
+    if missing:
+        raise SystemDefinitionError(_without_kinetic_energy(system, missing, "does not occur in the Lagrangian"))
 
 
 def _check_mass_matrix(system: LagrangianSystem) -> None:
@@ -350,15 +347,45 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
         return
     velocities, block = found
     names = ", ".join(velocity.name for velocity in velocities)
+    if velocities and not block:
+        raise SystemDefinitionError(_without_kinetic_energy(system, velocities, "occurs only linearly in L"))
     subject = f"the mass matrix d2L/dv2 of '{system.name}'"
     if not block:
-        reason = (
-            f"no second derivative by {names} is left (it occurs only linearly)"
-            if velocities
-            else "some velocities occur only in products with too few others"
+        raise SystemDefinitionError(
+            f"{subject} is singular: some velocities occur only in products with too few others. {REQUIRED} Give each "
+            "coordinate a kinetic energy of its own"
         )
-        raise SystemDefinitionError(f"{subject} is singular: {reason}. {REMEDY}")
-    values = " with the default parameters" if any(entry.has(*system.parameters) for entry in block.values()) else ""
+    own = set[Symbol]().union(*(entry.free_symbols for entry in block.values()))
+    used = {parameter: value for parameter, value in system.constants.items() if parameter in own}
+    zero = " and ".join(parameter.name for parameter, value in used.items() if value == 0)
+    values = " with the default parameters" if used else ""
     direction = null_direction(block, velocities)
     motion = f": a motion with ({direction}) has no kinetic energy" if direction else ""
-    raise SystemDefinitionError(f"{subject} in {names} is singular at every point tried{values}{motion}. {REMEDY}")
+    remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
+    raise SystemDefinitionError(
+        f"{subject} in {names} is singular at every point tried{values}{motion}. {REQUIRED} {remedy}"
+    )
+
+
+def _without_kinetic_energy(system: LagrangianSystem, velocities: Sequence[Symbol], how: str) -> str:
+    """The message for coordinates of whose velocities L is at most linear."""
+    names = [velocity.name[: -len(DOT)] for velocity in velocities]
+    if not hessian(system.lagrangian, system.velocities):
+        every = " and ".join(velocity.name for velocity in system.velocities)
+        pairs = (
+            "If coordinates are conjugate to each other (a guiding centre, point vortices), write it as a "
+            "HamiltonianSystem in canonical coordinates and momenta; otherwise add "
+        )
+        return (
+            f"the Lagrangian of '{system.name}' is degenerate: it is at most linear in {every} (no kinetic energy), so "
+            f"its equations of motion are of first order. {REQUIRED} {pairs if system.dimension > 1 else 'Add '}"
+            f"the missing kinetic energy, such as m*{velocities[0]}**2/2"
+        )
+    slope = sympy.expand(system.lagrangian.diff(symbol(names[0])))
+    multiplies = slope.has(*system.coordinates) and not slope.has(symbol(names[0]), *system.velocities)
+    bound = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(slope)}'] in its place"
+    return (
+        f"coordinate '{names[0]}' of '{system.name}' has no kinetic energy: velocity '{velocities[0]}' {how}. "
+        f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{bound if multiplies else ''}; if {names[0]} "
+        "is a known function of time, make it an input or write the function out"
+    )

@@ -136,9 +136,10 @@ class CompiledMethod:
             each.binding.borrow_fallback()
             if adaptive and each._controlled() is not None:
                 each.controlled().binding.borrow_fallback()
-        sources = (tangent and self.derivatives, second and self.second_derivatives, ensemble and self.ensemble)
-        for source in filter(None, sources):
-            building.load(source, flags=self.flags)
+        wanted = ((tangent, self._tangent), (second, self._curvature), (ensemble, self._ensemble))
+        for source in [text() for is_wanted, text in wanted if is_wanted]:
+            if source is not None:
+                building.load(source, flags=self.flags)
 
     @property
     def tangent(self) -> Binding:

@@ -337,7 +337,8 @@ def test_from_sympy_and_from_lagranges_method():
 @pytest.mark.parametrize(
     ("constraints", "said"),
     [
-        (["x**2 + y**2 = l**2", "2*x**2 + 2*y**2 - 2*l**2"], "leave nothing"),
+        (["x**2 + y**2 = l**2", "2*x**2 + 2*y**2 - 2*l**2"], "of 'plane' leave no degree of freedom.*nothing to int"),
+        (["x = l*cos(t)", "y = l*sin(t)"], "2 constraints on 2 coordinates.*fully driven .*by a force or torque"),
         (["x_dot*y_dot + y"], "not linear in the velocity y_dot"),
         (["l - t"], "no coordinate in the constraint"),
         (["x = y = l"], "more than one '='"),
