@@ -12,6 +12,7 @@ from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.frame import tell
 from scvi_codegen.cli.wording import duration
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import check_tolerance
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -30,12 +31,11 @@ def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
     Raises:
         StateError: unless the tolerance is positive and below 1.
     """
-    if not 0.0 < tolerance < 1.0:
-        raise StateError(f"the tolerance must be positive, and below 1, not {tolerance!r}")
+    check_tolerance(tolerance)
     if tolerance < ROUND_OFF:
         click.echo(f"Warning: doubles do not allow {tolerance:g}: steps are as accurate as they do", err=True)
-        tolerance = 0.0
-    return replace(model, h=None, tolerance=tolerance, steps=None, span=model.covered)
+    allowed = tolerance if tolerance >= ROUND_OFF else None
+    return replace(model, h=None, tolerance=allowed, steps=None, span=model.covered)
 
 
 def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:

@@ -94,7 +94,7 @@ def _work(
         inputs = model.all_inputs()
         return driven_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
-        return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance or None, **common)
+        return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)
     work.blocks()
     return work

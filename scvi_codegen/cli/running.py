@@ -16,7 +16,7 @@ from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration, in_known_digits
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.methods.method import is_symplectic
-from scvi_codegen.models.model import Model
+from scvi_codegen.models.model import Model, allowed_error
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, unwarned
 from scvi_codegen.runtime.driven import with_end
@@ -175,9 +175,10 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
 
 def _broken(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
     """What is to be said where the step of tau was chosen by the first steps, and others belie it."""
-    if model.tolerance is None or not model.paced:
+    allowed = allowed_error(model)
+    if allowed is None or not model.paced:
         return None
-    return too_wrong(trajectory.step_error, trajectory.step_error_t, model.tolerance)
+    return too_wrong(trajectory.step_error, trajectory.step_error_t, allowed)
 
 
 def _length(model: Model) -> int:

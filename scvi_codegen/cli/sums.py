@@ -18,6 +18,7 @@ from scvi_codegen.cli.running import worst_step
 from scvi_codegen.cli.wording import counted, duration
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.model import allowed_error
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.arrays import plot_arrays
 from scvi_codegen.runtime.indexed_interface import Numbers
@@ -180,7 +181,7 @@ def _numbers(model: IndexedModel, outcome: SumsOutcome) -> dict[str, Any]:
         "sizes": run.sizes,
         "steps": run.steps,
         "h": model.h,
-        "tolerance": model.tolerance,
+        "tolerance": allowed_error(model),
         "states": len(trajectory.t),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

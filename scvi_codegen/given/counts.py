@@ -1,4 +1,4 @@
-"""The one checker of whole numbers that users give: degrees, points, steps, threads."""
+"""Checks of whole numbers (degrees, points, steps, threads) and of the tolerance of adaptive steps."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from typing import Any
 
 from scvi_codegen.errors import ScviCodegenError, StateError
 
-__all__ = ["LARGEST_COUNT", "checked_count"]
+__all__ = ["LARGEST_COUNT", "check_tolerance", "checked_count"]
 
 LARGEST_COUNT = 2**53 - 1
 """Up to here a binary64 holds every whole number."""
+
+
+def check_tolerance(value: float, error: type[ScviCodegenError] = StateError) -> None:
+    """Refuse a tolerance of adaptive steps that is not positive and below 1."""
+    if not 0.0 < value < 1.0:
+        raise error(
+            f"the tolerance must be positive and below 1 (relative error of each step), not {value:g}: leave it out "
+            "for round-off"
+        )
 
 
 def checked_count(

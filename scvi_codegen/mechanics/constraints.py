@@ -69,8 +69,8 @@ def check_constraints(system: MechanicalSystem) -> None:
             f"{len(names)} constraints on {system.dimension} coordinates of '{system.name}' leave no degree of "
             "freedom: the constraints alone determine the motion (a fully driven or overconstrained mechanism), and "
             "there is nothing to integrate. Fewer independent constraints than coordinates are required. Leave out "
-            "redundant constraints; of a driven joint, replace the prescribed motion by a force or torque (an input can "
-            "carry it)"
+            "redundant constraints; of a driven joint, replace the prescribed motion by a force or torque (an input "
+            "can carry it)"
         )
     if dependent := _dependent(system):
         raise SystemDefinitionError(

@@ -30,7 +30,7 @@
     # solver = "newton"                                 # for stiff systems; left out: "fixed-point", sweeps
 
     [run]
-    step = 0.1                                          # or tolerance = 1e-9 (0, and without both: round-off): steps
+    step = 0.1                                          # or tolerance = 1e-9 (without both: round-off): steps
     span = 100.0                                        # that choose their length; or steps of h
     every = 10
 

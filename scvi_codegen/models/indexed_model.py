@@ -13,7 +13,7 @@ from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.lowering.indexed import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import check_controlled, check_one_of, check_step, real, steps_in
+from scvi_codegen.models.model import check_controlled, check_not_both, check_one_of, check_step, real, steps_in
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -34,8 +34,8 @@ class IndexedModel:
         solver: of the equations of a step, as of :func:`~scvi_codegen.compile_indexed`.
         q: initial positions by the name of their array; their shapes are the sizes.
         p, velocity: initial momenta or velocities by the same names, one of both; or neither: 0.
-        h: step, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given.
-        tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off.
+        h: step, not 0, negative for a run backward; or ``None`` for adaptive steps.
+        tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps, or ``None`` if ``span`` is given.
         every: distance between kept states in steps.
@@ -69,7 +69,7 @@ class IndexedModel:
         check_solver(self.solver, ModelFileError)
         if self.p is not None and self.velocity is not None:
             raise ModelFileError("give p or velocity (q_dot), not both")
-        check_one_of("h (step)", self.h, "tolerance", self.tolerance)
+        check_not_both(self.h, self.tolerance)
         check_one_of("span", self.span, "steps", self.steps)
         for name in ("h", "tolerance", "t", "span"):
             if (value := getattr(self, name)) is not None:
@@ -136,7 +136,7 @@ class IndexedModel:
         """Of steps: the one of all, or where those lead that choose theirs."""
         if self.h is not None:
             return {"h": self.h}
-        return {"t_end": self.t + self.covered, "tolerance": self.tolerance or None}
+        return {"t_end": self.t + self.covered, "tolerance": self.tolerance}
 
     @property
     def _beginning(self) -> dict[str, Any]:

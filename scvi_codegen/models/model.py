@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.inputs import input_parameters
-from scvi_codegen.given.counts import LARGEST_COUNT, checked_count
+from scvi_codegen.given.counts import LARGEST_COUNT, check_tolerance, checked_count
 from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import Method, as_method
@@ -51,9 +51,9 @@ class Model:
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h: step size, not 0, negative for a run backward; or ``None`` if ``tolerance`` is given. In transformed time
+        h: step size, not 0, negative for a run backward; or ``None`` for adaptive steps. In transformed time
             steps are of tau, as with a monitor.
-        tolerance: for steps that choose their length: relative error allowed to the end of each, 0 for round-off. In
+        tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. In
             transformed time, and with a monitor, :func:`longest_step` chooses one length of tau for it.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps of h, or ``None`` if ``span`` is given.
@@ -87,7 +87,7 @@ class Model:
         check_kind(SYSTEM, self.system, "system", ModelFileError)
         object.__setattr__(self, "method", as_method(self.method, self.system))
         check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
-        check_one_of("h (step)", self.h, "tolerance", self.tolerance)
+        check_not_both(self.h, self.tolerance)
         check_one_of("span", self.span, "steps", self.steps)
         for name in ("q", "p", "velocity"):
             if (vector := getattr(self, name)) is not None:
@@ -245,12 +245,10 @@ class Model:
         if h is None and self.paced:
             from scvi_codegen.runtime.longest_step import longest_step  # here: reading a model does not wait for NumPy
 
-            assert self.tolerance is not None  # by construction
             if self.system.inputs:
                 raise ModelFileError("with inputs no pilot run finds a step of tau: give one (--step, [run] step)")
-            h = longest_step(
-                stepper, self.q, p, self.covered, self.tolerance, t=self.t, parameters=self.parameters, options=options
-            )
+            own: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
+            h = longest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
         to_end = h is None or self.monitor is not None
         return stepper.start(
             self.q,
@@ -258,7 +256,7 @@ class Model:
             h=abs(h) if h is not None and to_end else h,
             t=self.t,
             t_end=self.t + self.covered if to_end else None,
-            tolerance=self.tolerance or None if h is None else None,
+            tolerance=self.tolerance if h is None else None,
             parameters=self.parameters_at_start(stepper),
             options=options,
         )
@@ -296,8 +294,8 @@ def check_step(h: float, span: float | None) -> None:
 
 def check_controlled(tolerance: float | None, span: float | None) -> None:
     """Refuse what cannot be the tolerance and the span of steps that choose their length."""
-    if tolerance is None or not 0.0 <= tolerance < 1.0:
-        raise ModelFileError(f"tolerance is {tolerance}: a relative error below 1, or 0 for round-off")
+    if tolerance is not None:
+        check_tolerance(tolerance, ModelFileError)
     if span is None:
         raise ModelFileError("steps that choose their length (tolerance) have no number: give span, not steps")
     if span == 0.0:
@@ -314,6 +312,17 @@ def check_length(values: Sequence[object], names: Sequence[str], where: str) -> 
     if len(values) != len(names):
         shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
         raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
+
+
+def check_not_both(h: float | None, tolerance: float | None) -> None:
+    """Refuse a step size with a tolerance; neither means adaptive steps with errors at round-off level."""
+    if h is not None and tolerance is not None:
+        raise ModelFileError("give h (step) for a fixed step size or tolerance for adaptive steps, not both")
+
+
+def allowed_error(model: Any) -> float | None:
+    """Return the relative error allowed to each adaptive step, 0 for round-off; ``None`` for a fixed step size."""
+    return None if model.h is not None else model.tolerance or 0.0
 
 
 def check_one_of(one: str, first: object, other: str, second: object) -> None:

@@ -55,7 +55,8 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
     initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
-    step = {"tolerance": model.tolerance} if model.h is None else {"step": model.h}
+    fields = {"step": model.h, "tolerance": model.tolerance}
+    step = {key: value for key, value in fields.items() if value is not None}
     controller = {"controller": "reversible"} if model.monitor else {}
     run = {**step, **controller, **length, "every": model.every}
     return {"initial": {"t": model.t, **initial}, "method": method_section(model.method), "run": run}

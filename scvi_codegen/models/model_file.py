@@ -5,7 +5,7 @@
     coordinates = ["q"]
     lagrangian = "m*l**2*q_dot**2/2 + m*g*l*cos(q)"     # several lines between """ and """
     # monitor = "1/(1 + sin(q)**2)"                     # dt/dtau, or a name: steps are then of tau, the span is of
-                                                        # time; without a step tolerance = 0
+                                                        # time; without a step adaptive ones
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
     # damping = "gamma"                                 # the rate at which all momenta shrink, or a number; left out: 0
@@ -39,7 +39,7 @@
     [run]
     step = 0.5                                          # negative: backward
     span = 100.0                                        # length of time, or steps = 200
-                                                        # or tolerance = 1e-9 (0, and without both: round-off): steps
+                                                        # or tolerance = 1e-9 (without both: round-off): steps
                                                         # choose their length; then a negative span goes back
     # controller = "reversible"                         # of a monitor: time as it is, steps whose density it carries
     every = 1                                           # distance between kept states; left out: 1
@@ -254,7 +254,7 @@ def _with_own_step(layer: Document) -> Document:
     run = layer.get("run", {})
     if "monitor" not in layer.get("system", {}) or "step" in run or "tolerance" in run:
         return layer
-    return {**layer, "run": {**run, "tolerance": 0.0}}
+    return {**layer, "run": {**run, "tolerance": None}}
 
 
 def _check_complete(document: Document) -> None:

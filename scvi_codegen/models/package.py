@@ -237,7 +237,7 @@ def _chosen_by(model: Model) -> float:
     """What steps choose their length by: a tolerance, or tau."""
     if model.monitor is not None and model.h is not None:
         return abs(model.h)
-    return COMPARED if model.tolerance is None else model.tolerance
+    return COMPARED if model.h is not None else model.tolerance or 0.0
 
 
 def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:

@@ -152,16 +152,15 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
 
 def read_run(section: Section) -> dict[str, Any]:
     """The fields of a model that ``[run]`` gives; without a step its steps choose their length."""
+    section = {key: value for key, value in section.items() if value is not None}
     check_one(section, "run", "step", "tolerance")
     check_one(section, "run", "span", "steps")
     fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
     found: dict[str, Any] = {
         field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
     }
-    if not {"step", "tolerance"} & section.keys():
-        if "steps" in section:
-            raise ModelFileError("[run] has steps and no step, which says how long they are")
-        found["tolerance"] = 0.0
+    if not {"step", "tolerance"} & section.keys() and "steps" in section:
+        raise ModelFileError("[run] has steps and no step, which says how long they are")
     if "steps" in section:
         found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
     found["every"] = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)

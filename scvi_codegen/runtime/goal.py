@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.given.counts import check_tolerance
 from scvi_codegen.native.arguments import checked_number, checked_step
 
 __all__ = ["Goal"]
@@ -30,8 +31,7 @@ class Goal:
         if tolerance is None:
             return cls(t_end=checked_number(t_end, "t_end"))
         allowed = checked_number(tolerance, "the tolerance")
-        if not 0.0 < allowed < 1.0:
-            raise StateError(f"the tolerance is a relative error between 0 and 1, not {allowed:g}")
+        check_tolerance(allowed)
         return cls(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
 
     @classmethod

@@ -153,7 +153,7 @@ def test_an_index_means_one_thing() -> None:
         ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not for sums over indices"),
         ("steps = 4", "", "span"),
         ("step = 0.1", "", "has steps and no step"),
-        ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "a relative error below 1"),
+        ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "must be positive and below 1"),
         ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not for sums over indices"),
     ],
 )

@@ -39,7 +39,7 @@ def test_files_hold_the_monitor(monitor: str) -> None:
     again = parse_model(text)
     assert again == found
     assert again.system.clock is not None
-    assert (again.h, again.tolerance) == (None, 0.0)
+    assert (again.h, again.tolerance) == (None, None)
 
 
 def test_a_step_for_another_time_is_not_taken_over(model: sc.Model) -> None:

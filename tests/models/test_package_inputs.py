@@ -61,7 +61,7 @@ def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):
 
 
 def test_steps_that_choose_their_length_go_from_breakpoint_to_breakpoint(model, tmp_path):
-    model = replace(model, h=None, tolerance=0.0)
+    model = replace(model, h=None, tolerance=None)
     states, _ = states_printed(generate_package(model, tmp_path / "pushed"))
     stepper = compile_stepper(model.system, model.method)
     run = stepper.drive(model.q, velocity=model.velocity, inputs=dict(model.inputs), t_end=2.3)

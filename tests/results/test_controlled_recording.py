@@ -112,7 +112,7 @@ def test_a_model_file_has_a_tolerance():
     assert (model.h, model.tolerance, model.covered) == (None, TOLERANCE, END)
     assert parse_model(dump_model(model)) == model
     assert parse_model(MODEL, {"run": {"step": 0.1}}).step_count == 600
-    exact = Model(system=model.system, method=SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), tolerance=0, span=-2.0)
+    exact = Model(system=model.system, method=SVI(4), q=(1.0, 0.0), p=(0.0, 1.0), span=-2.0)
     assert parse_model(dump_model(exact)) == exact
     assert parse_model(dump_model(Model.from_problem(problem("kepler"))), {"run": {"tolerance": 0.5}}).h is None
 

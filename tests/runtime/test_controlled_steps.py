@@ -249,8 +249,11 @@ def test_what_rests_or_moves_freely_needs_few_steps():
         ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance"),
         ({"t_end": 1.0, "steps": 3}, "leave out steps"),
         ({"t_end": math.nan}, "t_end is nan"),
-        ({"t_end": 1.0, "tolerance": 0.0}, "between 0 and 1, not 0"),
-        ({"t_end": 1.0, "tolerance": 2.0}, "between 0 and 1, not 2"),
+        (
+            {"t_end": 1.0, "tolerance": 0.0},
+            "tolerance must be positive and below 1 .*, not 0: leave it out for round-off",
+        ),
+        ({"t_end": 1.0, "tolerance": 2.0}, "and below 1 .*, not 2: leave it out for round-off"),
         ({"t_end": 1.0, "every": 0}, "every"),
         ({"t_end": 1.0, "t_eval": [2.0]}, "outside"),
     ],
