@@ -5,9 +5,12 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
+import programs
 import pytest
 from browsing import chromium
 from samples import Sample, compile_quickly, sample_named, stepper_for
@@ -20,6 +23,7 @@ from scvi_codegen.runtime.stepper import Stepper
 
 UNOPTIMISED = "-O0"
 
+sys.addaudithook(programs.audit)
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background of a shell
 
 
@@ -27,6 +31,31 @@ def pytest_configure(config: pytest.Config) -> None:
     """What C text means, which most tests ask, does not depend on optimisation, of which compiling is mostly made."""
     if config.option.markexpr == DEFAULT:
         os.environ.setdefault(FLAGS_VARIABLE, UNOPTIMISED)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    programs.forget()
+
+
+SKIPPED_VARIABLE = "SCVI_CODEGEN_TESTS_SKIPPED"
+"""Name of a file to which the tests that were skipped are appended, one a line, for a later run with more programs."""
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    _record_skipped(report)
+
+
+def pytest_collectreport(report: pytest.CollectReport) -> None:
+    _record_skipped(report)
+
+
+def _record_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """Record it in the process that writes the summary, not in the workers of a distributed run."""
+    path = os.environ.get(SKIPPED_VARIABLE)
+    if path and report.skipped and "PYTEST_XDIST_WORKER" not in os.environ:
+        with Path(path).open("a", encoding="utf-8") as file:
+            print(report.nodeid, file=file)
 
 
 @pytest.hookimpl(tryfirst=True)  # before those of the full tier are left out

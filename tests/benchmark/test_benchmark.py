@@ -4,7 +4,6 @@ import importlib.util
 import json
 import math
 import os
-import shutil
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -601,7 +600,7 @@ class TestTables:
         monkeypatch.setattr(builds, "PROBLEMS", ("kepler",))
         monkeypatch.setenv("CC", "cc")
         table = builds.run_builds(bench.Plan(quick=True), lambda text: None)
-        assert {row["build"] for row in table.rows} >= {f"{name}, portable" for name in ("gcc",) if shutil.which(name)}
+        assert {row["build"] for row in table.rows} >= {f"{name}, portable" for name in ("gcc",)}
         assert all(0.0 < row[f"kepler, SVI({degree})"] < 1e3 for row in table.rows for degree in (4, 8))
         assert os.environ["CC"] == "cc"
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 pytestmark = pytest.mark.full
 
@@ -39,8 +39,7 @@ alone is left out."""
 
 
 def completed(shell: str, *words: str) -> set[str]:
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
+    needs(shell)
     script = ASKED[shell].format(words=" ".join(words), last=len(words) - 1)
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     result = subprocess.run(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
 import subprocess
 from contextlib import nullcontext, suppress
 from functools import cache
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import needs
 from samples import QUICK_FLAGS
 
 from scvi_codegen.compiler import compile_stepper
@@ -96,7 +96,7 @@ void scales(double absolute, double *size)
 @cache
 def header(folder: Path, after: int):
     """The functions of the headers alone, of changes that are not squared."""
-    compiler = shutil.which("cc") or pytest.skip("there is no C compiler")
+    compiler = needs("cc")
     headers = Path(__file__).parents[2] / "templates/support"
     (folder / f"{after}.c").write_text(VERDICTS.format(after=after, folder=headers))
     command = [compiler, "-std=c99", "-shared", "-fPIC", f"{after}.c", "-o", f"{after}.so", "-lm"]

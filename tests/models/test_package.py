@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from programs import needs
 
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
@@ -24,7 +24,7 @@ from scvi_codegen.models.problems import problem
 from scvi_codegen.tables.quadrature import Quadrature
 
 STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror"
-COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
+COMPILERS = ("gcc", "clang")
 
 WITHOUT_SYMPY = """
 import sys
@@ -118,6 +118,7 @@ def test_the_c_text_is_compiled_as_it_stands(pendulum, tmp_path):
     [("planar-pendulum", SVI(3)), ("duffing", SpectralCollocation(2)), ("outer-solar-system", SVI(2))],
 )
 def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compiler, name, method, tmp_path):
+    needs("make", compiler)
     model = model_of(name, method=method)
     folder = generate_package(model, tmp_path / "generated_stepper")
     command = ["make", "-s", "-C", str(folder), "run", f"CC={compiler}", f"CFLAGS={STRICT}"]

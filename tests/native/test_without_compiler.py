@@ -12,6 +12,7 @@ import sysconfig
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 from scvi_codegen.errors import BuildError
 from scvi_codegen.native import building
@@ -86,11 +87,10 @@ exec {compiler} -MD -MF {folder}/$$.d "$@"
 """
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="the script calls cc")
 def test_no_header_of_python_is_read(tmp_path, monkeypatch):
     """Of all files that the compiler opens none is Python's, and it is not told where these are."""
     script = tmp_path / "watched-cc"
-    script.write_text(WATCHED.format(folder=tmp_path, compiler=shutil.which("cc")))
+    script.write_text(WATCHED.format(folder=tmp_path, compiler=needs("cc")))
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path / "cache"))

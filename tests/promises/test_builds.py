@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 from scvi_codegen.native import building
 
@@ -35,10 +35,7 @@ def run_stepper_tests(tmp_path: Path, flags: str, *arguments: str, **environment
 
 def sanitizer_library(name: str) -> str:
     """Path of a run-time library of gcc's, which must be there before the interpreter."""
-    compiler = shutil.which("gcc")
-    if compiler is None:
-        pytest.skip("gcc is not installed")
-    result = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+    result = subprocess.run([needs("gcc"), f"-print-file-name={name}"], capture_output=True, text=True, check=True)
     path = result.stdout.strip()
     if not Path(path).is_absolute():
         pytest.skip(f"{name} is not installed")
@@ -87,10 +84,10 @@ def test_a_build_with_wanted_flags_is_another_one(tmp_path, monkeypatch):
         compile_stepper(problem("harmonic-oscillator").system, StoermerVerlet())
 
 
-@pytest.mark.skipif(not (shutil.which("gcc") and shutil.which("clang")), reason="gcc and clang are not both installed")
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
 def test_portable_flags_fix_every_bit(tmp_path, monkeypatch, name):
     """Different compilers, one libm: the same numbers; the tuned build differs by roundings."""
+    needs("gcc", "clang")
     from scvi_codegen.compiler import compile_stepper
     from scvi_codegen.methods import SVI
     from scvi_codegen.models.problems import problem

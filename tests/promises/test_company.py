@@ -142,7 +142,6 @@ def killed(folder: Path, seconds: float, generator: random.Random) -> None:
         process.kill()
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="the script calls cc")
 @pytest.mark.parametrize("times", [3, pytest.param(40, marks=pytest.mark.full)])
 def test_a_process_killed_while_it_compiles_leaves_a_cache_that_works(folder, times, monkeypatch):
     generator, left = random.Random(times), 0

@@ -2,7 +2,6 @@
 
 import ast
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 import scvi_codegen
 from scvi_codegen.models.model import Model
@@ -247,8 +247,7 @@ def test_a_type_checker_knows_them_and_the_code_of_the_pages(tmp_path):
 
 @pytest.mark.full
 def test_another_type_checker_does_too(tmp_path):
-    if shutil.which("pyright") is None:
-        pytest.skip("pyright is not installed")
+    needs("pyright")
     text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
     (tmp_path / "readme.py").write_text(
         "\n".join(re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL))

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import needs
 from samples import QUICK_FLAGS, sample_named
 from style import check_style
 
@@ -130,12 +130,6 @@ def run(command: Sequence[str], folder: Path) -> str:
     return result.stdout
 
 
-def tool(name: str) -> str:
-    if shutil.which(name) is None:
-        pytest.skip(f"{name} is not installed")
-    return name
-
-
 def share_of(method: str, share: int) -> list[Source]:
     """Every sixth of the texts of a method: over the shares all of them."""
     return [source for source, _ in generated(method).values()][share::SHARES]
@@ -147,7 +141,7 @@ def share_of(method: str, share: int) -> list[Source]:
 def test_compiles_without_a_warning_to_pure_code(method, share, tmp_path):
     """The objects export nothing but names with the prefix, and hold no data that could be written."""
     files = write(share_of(method, share), tmp_path)
-    run([tool("gcc"), *C99, "-O1", "-c", *files], tmp_path)
+    run([needs("gcc"), *C99, "-O1", "-c", *files], tmp_path)
     if sys.platform == "linux":
         for file in files:
             check_symbols(Path(file).stem, tmp_path)
@@ -158,7 +152,7 @@ def test_compiles_without_a_warning_to_pure_code(method, share, tmp_path):
 @pytest.mark.parametrize("method", METHODS)
 def test_clang_has_no_warning_either(method, share, tmp_path):
     files = write(share_of(method, share), tmp_path)
-    run([tool("clang"), *C99, "-c", *files], tmp_path)
+    run([needs("clang"), *C99, "-c", *files], tmp_path)
 
 
 @pytest.mark.covering
@@ -176,16 +170,16 @@ def test_texts_that_are_compiled_here_alone_have_no_warning(name, solver, compil
     for number, text in enumerate(texts):
         folder = tmp_path / str(number)
         folder.mkdir()
-        run([tool(compiler), *C99, "-c", *write([text], folder)], folder)
+        run([needs(compiler), *C99, "-c", *write([text], folder)], folder)
         check_style(text.amalgamated().code)
         check_style(text.header)
 
 
 def check_symbols(prefix: str, folder: Path) -> None:
-    symbols = [line.split() for line in run([tool("nm"), "-P", f"{prefix}.o"], folder).splitlines()]
+    symbols = [line.split() for line in run([needs("nm"), "-P", f"{prefix}.o"], folder).splitlines()]
     assert [name for name, kind, *_ in symbols if kind.isupper() and kind != "U" and not name.startswith(prefix)] == []
     assert [name for name, kind, *_ in symbols if kind in "DdBbCSsGg"] == []
-    _, line = run([tool("size"), f"{prefix}.o"], folder).splitlines()
+    _, line = run([needs("size"), f"{prefix}.o"], folder).splitlines()
     assert line.split()[1:3] == ["0", "0"]  # data, bss
 
 
@@ -207,9 +201,9 @@ def test_headers_serve_c_plus_plus(tmp_path):
     includes = "".join(f'#include "{source.prefix}.h"\n' for source, _ in pairs)
     text = f"{includes}int main()\n{{\n  double total = 0.0;\n{uses}  return total > 0.0 ? 0 : 1;\n}}\n"
     (tmp_path / "main.cpp").write_text(text)
-    run([tool("gcc"), "-std=c99", "-c", *files], tmp_path)
+    run([needs("gcc"), "-std=c99", "-c", *files], tmp_path)
     objects = [f"{Path(file).stem}.o" for file in files]
-    run([tool("g++"), *CXX, "main.cpp", *objects, "-lm", "-o", "main"], tmp_path)
+    run([needs("g++"), *CXX, "main.cpp", *objects, "-lm", "-o", "main"], tmp_path)
     run([str(tmp_path / "main")], tmp_path)
 
 
@@ -222,7 +216,7 @@ def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_pa
     sources = [generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
     sources += [generate_source(driven_hamiltonian(), method, solver=solver)[0] for method in methods[:3]]
     files = write(sources, tmp_path)
-    run([tool(compiler), *C99, "-c", *files], tmp_path)
+    run([needs(compiler), *C99, "-c", *files], tmp_path)
 
 
 @pytest.mark.covering
@@ -233,7 +227,7 @@ def test_tuned_builds_compile_without_a_warning(compiler, method, name, tmp_path
     """With the vector instructions of this processor, and with glibc's vector functions where those are."""
     files = write([generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
-        run([tool(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
+        run([needs(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)
 
 
 # Equal bytes.
@@ -323,7 +317,7 @@ def test_names_that_mean_something_in_c_do_no_harm(method, tmp_path):
     results = [stepper.step(np.linspace(-0.5, 0.5, m), np.linspace(0.3, -0.2, m), 0.1) for stepper in steppers]
     np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-13)
     (file,) = write([steppers[0].source], tmp_path)
-    run([tool("gcc"), *C99, "-c", file], tmp_path)
+    run([needs("gcc"), *C99, "-c", file], tmp_path)
 
 
 TITLES = [
@@ -343,14 +337,14 @@ def test_a_title_cannot_leave_its_comment(title, tmp_path):
     source, interface = generate_source(system, SVI(1))
     assert interface.title.isprintable()
     (file,) = write([source], tmp_path)
-    run([tool("gcc"), *C99, "-c", file], tmp_path)
+    run([needs("gcc"), *C99, "-c", file], tmp_path)
 
 
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
 def test_prefixes_that_mean_something_in_c_do_no_harm(prefix, tmp_path):
     source, _ = generate_source(bare_oscillator(), SVI(2), prefix=prefix)
     files = write([source], tmp_path)
-    run([tool("gcc"), *C99, "-c", *files], tmp_path)
+    run([needs("gcc"), *C99, "-c", *files], tmp_path)
 
 
 # Sanitizers: exact workspaces, every exported function.
@@ -429,7 +423,7 @@ MEMORY = ("clang", "-fsanitize=memory")
 
 def sanitizer(command: Sequence[str], folder: Path) -> None:
     """Skip the test where the compiler, or what it links to, is not installed."""
-    tool(command[0])
+    needs(command[0])
     tried = [*command, "-x", "c", "-", "-o", str(folder / "empty")]
     if subprocess.run(
         tried, input="int main(void) { return 0; }", text=True, capture_output=True, check=False
@@ -464,7 +458,7 @@ def test_bands_and_kept_factors_pass_the_sanitizers(command, masses, method, tmp
     sanitizer(command, tmp_path)
     source, interface = generate_source(fput_chain(masses), method, solver="newton")
     assert interface.unknowns >= WORTH_REMEMBERING
-    run([tool(command[0]), *C99, "-c", *write([source], tmp_path)], tmp_path)
+    run([needs(command[0]), *C99, "-c", *write([source], tmp_path)], tmp_path)
     check_sanitized([(source, interface)], command, tmp_path)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from dataclasses import dataclass, replace
 from functools import cache
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from programs import needs
 from samples import sample_named, stepper_for
 
 from scvi_codegen.cli import main
@@ -66,12 +66,6 @@ def run(command: list[str], folder: Path) -> str:
     return result.stdout
 
 
-def tools(*names: str) -> None:
-    for name in names:
-        if shutil.which(name) is None:
-            pytest.skip(f"{name} is not installed (Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm)")
-
-
 @cache
 def embedded(case: str, precision: Embedded) -> tuple[Source, Interface]:
     name, method = CASES[case]
@@ -111,14 +105,14 @@ def states(output: str, precision: Embedded) -> tuple[np.ndarray, np.ndarray]:
 
 
 def on_host(case: str, precision: Embedded, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    tools("gcc")
+    needs("gcc")
     files = write_case(case, precision, folder)
     run(["gcc", "-O2", *STRICT, f"-I{HERE}", "-I.", *files, "-lm", "-o", "host"], folder)
     return states(run(["./host"], folder), precision)
 
 
 def on_board(case: str, board: Board, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    tools(CROSS, QEMU)
+    needs(CROSS, QEMU, "arm-none-eabi-nm", "arm-none-eabi-size")
     files = write_case(case, board.precision, folder)
     pure = PURE_SINGLE if board.precision == "single" else ()
     common = [CROSS, "-mthumb", *board.flags, "-O2", *STRICT, "-ffreestanding", f"-I{HERE}", "-I."]
@@ -190,7 +184,7 @@ int main(void)
 
 @pytest.mark.parametrize("bound", [1, 3, 8])
 def test_iterations_are_bounded_when_it_is_compiled_whatever_the_options_say(bound, tmp_path):
-    tools("gcc")
+    needs("gcc")
     write_case("kepler", "double", tmp_path)
     (tmp_path / "count.c").write_text(COUNTING)
     define = f"-DINTEGRATOR_MAX_ITERATIONS={bound}"
@@ -234,7 +228,7 @@ def test_models_with_numbers_beyond_single_precision_are_refused(number):
 
 def test_energy_does_not_drift_in_single_precision(tmp_path):
     """Twenty thousand steps of the pendulum: the error stays at that of a few, which for a sum without care grows."""
-    tools("gcc")
+    needs("gcc")
     folder = generate_package(
         replace(Model.from_problem(problem("planar-pendulum")), method=SVI(3), h=0.125, span=None, steps=20_000),
         tmp_path / "pendulum",
@@ -253,7 +247,7 @@ FOLDER = ("main.c", "Makefile", "README.md", "interface.json", "model.toml")
 
 
 def test_the_command_line_writes_a_folder_without_python(tmp_path):
-    tools("gcc")
+    needs("gcc")
     outputs = {}
     for precision in EMBEDDED:
         folder = tmp_path / f"kepler_{precision}"
@@ -281,7 +275,7 @@ def test_lanes_are_refused_by_name():
 
 
 def test_other_methods_compile_in_either_precision(tmp_path):
-    tools("gcc")
+    needs("gcc")
     methods = {"collocation": SpectralCollocation(2, form="position"), "printed": SCVI(2, variational=False)}
     for prefix, method in methods.items():
         for precision in EMBEDDED:

@@ -3,12 +3,12 @@
 import difflib
 import importlib.util
 import re
-import shutil
 import subprocess
 from functools import cache
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 import scvi_codegen
 
@@ -55,8 +55,7 @@ def test_no_file_is_stale():
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_every_file_compiles_with_every_warning_an_error(compiler, tmp_path):
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is not installed")
+    needs(compiler)
     files = sorted(FOLDER.glob("*.c"))
     assert files
     command = [compiler, *STRICT, f"-I{FOLDER}", "-c", *map(str, files)]

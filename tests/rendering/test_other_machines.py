@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import platform
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 from scvi_codegen.methods import SCVI, SVI, StoermerVerlet
 from scvi_codegen.methods.method import Method
@@ -57,7 +57,6 @@ def test_a_folder_becomes_a_program_of_another_machine(target, tmp_path):
     assert program.read_bytes().startswith(begins)
 
 
-@pytest.mark.skipif(shutil.which(QEMU) is None, reason="apt install qemu-user")
 @pytest.mark.skipif(
     platform.machine() not in ("x86_64", "AMD64") or sys.platform != "linux", reason="compares with x86-64"
 )
@@ -75,6 +74,7 @@ def test_a_folder_becomes_a_program_of_another_machine(target, tmp_path):
 )
 def test_an_arm_processor_computes_the_same_bits(name, method, tmp_path):
     """One libm, roundings fixed by flags: 17 digits of every state, and steps of their own lengths, too."""
+    needs(QEMU)
     sources = [str(source) for source in sorted(folder_for(name, method, tmp_path).glob("*.c"))]
     said = {}
     for target, runner in {"aarch64-linux-musl": [QEMU], "x86_64-linux-musl": []}.items():

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 from functools import cache
 from pathlib import Path
 
 import pytest
+from programs import needs
 
 from scvi_codegen import SVI, SolverOptions, compile_stepper, problem
 from scvi_codegen.errors import StepFailedError
@@ -26,12 +26,12 @@ def is_sanitized() -> bool:
     """Whether there is a compiler that has the sanitizers."""
     words = [*SANITIZED, "-x", "c", "-", "-o", os.devnull]
     empty = "int main(void) { return 0; }"
-    found = shutil.which(words[0]) is not None
-    return found and subprocess.run(words, input=empty, text=True, capture_output=True, check=False).returncode == 0
+    return subprocess.run(words, input=empty, text=True, capture_output=True, check=False).returncode == 0
 
 
 def said(program: str, folder: Path, *flags: str) -> str:
     """What a program prints, compiled in a folder under the sanitizers."""
+    needs(SANITIZED[0])
     if not is_sanitized():
         pytest.skip("no gcc with sanitizers here")
     (folder / "main.c").write_text(program)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import platform
-import shutil
 import subprocess
 
 import numpy as np
 import pytest
+from programs import needs
 
 import scvi_codegen as sc
 
@@ -33,7 +33,7 @@ void check(const double *x, double *y)
 @pytest.mark.parametrize("flags", ["-march=native -O2", "-O2"])
 @pytest.mark.parametrize("k", [1, 3, 5, 7])
 def test_inverse_roots_are_right_to_two_units(tmp_path, k, flags):
-    compiler = shutil.which("cc") or pytest.skip("there is no C compiler")
+    compiler = needs("cc")
     system = sc.LagrangianSystem.from_text(
         name="power", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**({2 - k}/2)", parameters={}
     )

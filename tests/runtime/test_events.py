@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import shutil
 import subprocess
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 import sympy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from programs import needs
 from scipy.special import ellipk
 from sympy.physics.mechanics import dynamicsymbols
 
@@ -380,8 +380,7 @@ def test_a_stepper_with_events_is_pickled_and_keeps_them(pendulum):
     ],
 )
 def test_the_text_is_the_plain_one_and_more_and_strict_compilers_take_it(compiler, name, method, events, tmp_path):
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is not installed")
+    needs(compiler)
     system = problem(name).system
     plain, _ = generate_source(system, method, prefix="watched")
     source, _ = generate_source(system, method, prefix="watched", events=events)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from programs import needs
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
@@ -384,6 +385,7 @@ int main(void)
 )
 def test_threads_do_not_race(name: str, method: str, solver: str, tmp_path: Path) -> None:
     """By the thread sanitizer, where the compiler has it."""
+    needs("setarch")
     source, interface = generate_indexed(system_of(CASES[name]), method, solver=solver, prefix="shared")
     for path, text in source.files.items():
         (tmp_path / path).parent.mkdir(exist_ok=True)
