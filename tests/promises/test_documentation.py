@@ -96,6 +96,19 @@ def test_pages_of_the_gallery_have_a_light_picture_what_they_print_and_a_source(
         assert (DOCS / "gallery" / picture).stat().st_size < 150_000, name
 
 
+CODE = re.compile(r"^```.*?^```$|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+DISPLAYED = re.compile(r"\$\$.*?\$\$", re.DOTALL)
+LIST_ITEM = re.compile(r"^ *(?:[-+*]|\d+[.)]) ", re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_line_of_a_formula_begins_as_an_item_of_a_list(name):
+    """Markdown would end the formula there and print its dollar signs."""
+    text = CODE.sub("", PAGES[name])
+    formulas = DISPLAYED.findall(text) + re.findall(r"\$([^$]*)\$", DISPLAYED.sub("", text))
+    assert [formula for formula in formulas if LIST_ITEM.search(formula.partition("\n")[2])] == []
+
+
 @pytest.mark.full
 @pytest.mark.usefixtures("as_users_compile")
 @pytest.mark.parametrize("name", RUN)
@@ -147,6 +160,12 @@ class TestTheSite:
         assert pages["galerkin.html"].count("<math") > 10
         loaded = r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="https?:'
         assert [name for name, page in pages.items() if re.search(loaded, page)] == []
+
+    def test_no_formula_is_cut(self, site):
+        """No dollar sign is left in the text outside of code."""
+        code = re.compile(r"<(pre|code|script|style)\b.*?</\1>", re.DOTALL)
+        pages = {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+        assert [name for name, page in pages.items() if "$" in re.sub(r"<[^>]*>", "", code.sub("", page))] == []
 
     def test_pages_fit_a_phone_and_a_desk_by_day_and_by_night(self, site, view):
         wide, pale = [], []
