@@ -28,8 +28,8 @@ _TOKEN = re.compile(
     r"|(?P<operator>\*\*|\.\.|[-+*/(),\[\]<])",
     re.ASCII,
 )
-MOST_WRITTEN_OUT = 64
-"""Terms of a sum within a sum."""
+MOST_WRITTEN_OUT, MOST_NESTED = 64, 4096
+"""Terms of a sum within a sum, and of all such sums within each other."""
 
 Bound: TypeAlias = Loop | int
 
@@ -187,6 +187,7 @@ class IndexedParser(_Indices):
         self.arrays, self.tables = ({each.name: each for each in group} for group in (arrays, tables))
         self.sizes = {name for array in (*arrays, *tables) for name in array.names}
         self.bound: dict[str, Bound] = {}
+        self.nested = 1
         self.accesses: dict[Symbol, Access] = {}
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
 
@@ -239,6 +240,16 @@ class IndexedParser(_Indices):
                 "a sum within a sum has bounds that are whole numbers; write sum(i in N, j in N, ..) for a double sum"
             )
             self.refuse(message, column)
+        count = 1
+        for loop in loops:
+            length = max(0, loop.end.number - loop.first.number)
+            count = count * (length - 1) // 2 if loop.behind else count * length
+        if not 0 < count <= MOST_WRITTEN_OUT:
+            self.refuse(f"a sum over whole numbers has 1 to {MOST_WRITTEN_OUT} terms, not {count}", column)
+        self.nested *= count
+        if self.nested > MOST_NESTED:
+            message = f"sums over whole numbers within each other have at most {MOST_NESTED} terms, not {self.nested}"
+            self.refuse(f"{message}: name the size of an array in place of the number", column)
         rows: list[dict[str, int]] = [{}]
         for loop in loops:
             rows = [
@@ -246,14 +257,13 @@ class IndexedParser(_Indices):
                 for row in rows
                 for k in range(row[loop.behind] + 1 if loop.behind else loop.first.number, loop.end.number)
             ]
-        if not 0 < len(rows) <= MOST_WRITTEN_OUT:
-            self.refuse(f"a sum over whole numbers has 1 to {MOST_WRITTEN_OUT} terms, not {len(rows)}", column)
         start, formulas = self.position, []
         for row in rows:
             self.position = start
             self.bound |= row
             formulas.append(self.sum())
         self.end_of_sum(loops)
+        self.nested //= count
         return Add(*formulas)
 
     def loop(self) -> list[Loop]:
