@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import sympy
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.ir.families import Family, GatherLoop, ScatterLoop, SlopeBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
@@ -15,8 +19,12 @@ from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, mul
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Gather, PointFamily
+from scvi_codegen.tables.precision import mp
 
 __all__ = ["argument_name", "has_action", "lowered_family"]
+
+MOST_COMPARED, UNLIKE = 16, mp.mpf(10) ** -20
+"""Pairs of slopes written differently that are compared by value, and by how much these may differ."""
 
 
 def has_action(system: MechanicalSystem) -> bool:
@@ -133,7 +141,28 @@ def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
     entries = jacobian(family.results, family.arguments)
     if family.scalar is None or family.forced:
         return entries
+    _check_symmetry(family, entries)
     return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
+
+
+def _check_symmetry(family: PointFamily, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
+    """Raise :class:`MethodError` where slopes differ within a pair: Newton's iteration would not converge by them."""
+    unlike = [(i, j) for (i, j), entry in entries.items() if i < j and entry != entries.get((j, i))]
+    for i, j in unlike[:MOST_COMPARED]:
+        pair = entries[i, j], entries.get((j, i), sympy.S.Zero)
+        symbols = sorted(pair[0].free_symbols | pair[1].free_symbols, key=str)
+        known = {symbol: mp.mpf(k + 3) / (k + 5) for k, symbol in enumerate(symbols)}
+        try:
+            one, other = (evaluate(entry, known) for entry in pair)
+        except ArithmeticError:
+            continue
+        if abs(one - other) > UNLIKE * (abs(one) + abs(other)):
+            u = family.arguments
+            raise MethodError(
+                f"the results of the family '{family.name}' are not the gradient of its scalar: the derivative of that "
+                f"for {u[i]} by {u[j]} is {pair[0]}, of that for {u[j]} by {u[i]} {pair[1]}. They must be equal: check "
+                "the signs and the order of the results in its scatters, or give the family no scalar"
+            )
 
 
 def _gather_loop(family: PointFamily, index: int, sites: Sites) -> GatherLoop:

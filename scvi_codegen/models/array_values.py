@@ -13,7 +13,6 @@ node, never run as code.
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Expr
 
-from scvi_codegen.errors import ExpressionError, ModelFileError, StateError, closest
+from scvi_codegen.errors import ExpressionError, ModelFileError, closest
+from scvi_codegen.files.numpy_files import loaded
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.on_arrays import on_arrays
 from scvi_codegen.formulas.symbols import symbol
@@ -131,16 +131,17 @@ def _from_file(array: Array, value: Mapping[str, Any], where: str, folder: Path)
         return reader(folder / name, wanted, array)
     except OSError as error:
         raise ModelFileError(f"{where}: {name}: it cannot be read: {error.strerror or error}") from error
-    except (ModelFileError, StateError, zipfile.BadZipFile, ValueError, EOFError) as error:
+    except ValueError as error:
         raise ModelFileError(f"{where}: {name}: {error}") from error
 
 
 def _read_npy(path: Path, name: str, array: Array) -> Numbers:
-    return real_array(np.load(path, allow_pickle=False), name)
+    with loaded(path) as array_in_file:
+        return real_array(array_in_file, name)
 
 
 def _read_npz(path: Path, name: str, array: Array) -> Numbers:
-    with np.load(path, allow_pickle=False) as arrays:
+    with loaded(path) as arrays:
         chosen = name if name in arrays or len(arrays) != 1 else arrays.files[0]
         if chosen not in arrays:
             raise ModelFileError(f"there is no array {name} among {', '.join(arrays)}")

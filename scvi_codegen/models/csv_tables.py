@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,10 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import ModelFileError
 
 __all__ = ["CsvTable", "parse_table"]
+
+NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
+"""Of digits alone: Python takes 1_0 and digits of other scripts for numbers, too."""
+LONGEST_SHOWN = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +44,10 @@ def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> 
         ModelFileError: naming the column or line at fault.
     """
     reader = csv.reader(text.splitlines(), skipinitialspace=True)
-    lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
+    except csv.Error as error:
+        raise ModelFileError(f"line {reader.line_num} is no line of a table: {error}") from error
     if len(lines) < 2:
         raise ModelFileError("a table has a header of names and at least one line of numbers")
     names = lines[0][1]
@@ -59,10 +67,9 @@ def _row(cells: list[str], names: list[str], number: int) -> list[float]:
         raise ModelFileError(f"line {number} must have a number for each of {len(names)} names, and has {len(cells)}")
     values = []
     for name, cell in zip(names, cells, strict=True):
-        try:
-            values.append(float(cell))
-        except ValueError as error:
-            raise ModelFileError(f"line {number}, {name}: '{cell}' is not a number") from error
+        if not NUMBER.fullmatch(cell):
+            raise ModelFileError(f"line {number}, {name}: '{cell[:LONGEST_SHOWN]}' is not a number")
+        values.append(float(cell))
         if not math.isfinite(values[-1]):
-            raise ModelFileError(f"line {number}, {name}: {cell} is not a finite number")
+            raise ModelFileError(f"line {number}, {name}: {cell[:LONGEST_SHOWN]} is not a finite number")
     return values

@@ -11,14 +11,14 @@ column of an input has its name, or is called ``value``, or is the only one besi
 from __future__ import annotations
 
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.errors import ModelFileError, StateError
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.files.numpy_files import loaded
 from scvi_codegen.models.csv_tables import CsvTable, parse_table
 from scvi_codegen.models.input_tables import InputTable
 from scvi_codegen.models.model import real
@@ -111,9 +111,9 @@ def _read_csv(path: Path) -> CsvTable:
 def _read_npz(path: Path) -> CsvTable:
     """Its arrays of one axis as columns."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with loaded(path) as arrays:
             columns = {name: real_array(arrays[name], name) for name in arrays}
-    except (zipfile.BadZipFile, StateError, ValueError, TypeError) as error:
+    except ValueError as error:
         raise ModelFileError(f"it holds no arrays of numbers: {error}") from error
     count = columns[TIME].size if TIME in columns else 0
     return CsvTable({name: values for name, values in columns.items() if values.shape == (count,)}, ())

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
 from scvi_codegen.given.kinds import PATH, SWITCH, TEXT, Kind, takes
 from scvi_codegen.models.folders import CERTIFICATE_FILE, FORMAT, INTERFACE_FILE, record_text, write_folder
-from scvi_codegen.rendering.source import Interface, Source, included
+from scvi_codegen.rendering.source import PREFIX, Interface, Source, check_interface, included
 from scvi_codegen.runtime.stepper import Stepper
 
 if TYPE_CHECKING:
@@ -102,6 +102,10 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
             raise
         raise _damaged(target, error) from error
     source = source_in(target, interface.prefix)
+    try:
+        check_interface(source, interface)
+    except ValueError as error:
+        raise _damaged(target, error) from error
     controlled = source if ADVANCE_TO in source.declarations else None
     return Stepper(source, interface, controlled=lambda: controlled)
 
@@ -126,6 +130,8 @@ def source_in(folder: Path, prefix: str) -> Source:
     Raises:
         PackageError: if the folder lacks a file or was written by another version.
     """
+    if not PREFIX.fullmatch(prefix):
+        raise _damaged(folder, ValueError(f"{prefix!r} begins no C name"))
     try:
         header, code = (_read(folder / f"{prefix}.{kind}") for kind in "hc")
         declarations = "\n".join(read_record(folder)["declarations"])

@@ -7,18 +7,31 @@ plain C that is the same for every integrator, from a folder ``support`` beside 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from scvi_codegen.version import __version__
 
-__all__ = ["Interface", "Source", "included"]
+__all__ = ["Interface", "Source", "check_interface", "included"]
 
 
 TEXTS = ("header", "code", "declarations")
+PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+SUPPORT = re.compile(r"support/\w+\.h", re.ASCII)
+"""Names of files, which are written into a folder: none leads out of it."""
+KINDS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str),
+    "int": lambda value: type(value) is int and 0 <= value < 2**40,
+    "bool": lambda value: isinstance(value, bool),
+    "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, str) for each in value),
+    "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, bool) for each in value),
+    "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
+}
+"""Whether a value read from JSON is what an annotation of :class:`Interface` says."""
 INCLUDED = re.compile(r'^#include "(support/\w+\.h)"\n', re.MULTILINE)
 
 
@@ -76,7 +89,15 @@ class Source:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Source:
-        """The source that :meth:`to_record` gave, also one of version 0.1, which has no support headers."""
+        """The source that :meth:`to_record` gave, also one of version 0.1, which has no support headers.
+
+        Raises:
+            ValueError: for names that are none of an integrator's files, and texts that are no lists of lines.
+        """
+        names = record["prefix"], *record.get("support", {})
+        for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
+            if not (isinstance(name, str) and pattern.fullmatch(name)):
+                raise ValueError(f"{name!r} is not the name of a file of an integrator")
         beside = record.get("beside")
         return cls(
             prefix=record["prefix"],
@@ -93,6 +114,42 @@ class Source:
     def from_json(cls, text: str) -> Source:
         """The source written by :meth:`to_json`."""
         return cls.from_record(json.loads(text))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def check_interface(source: Source, interface: Interface) -> None:
+    """Raise :class:`ValueError` where an interface says other sizes than the C text, which arrays are made of."""
+    sizes = {
+        "COORDINATES": interface.dimension,
+        "PARAMETERS": len(interface.parameters),
+        "UNKNOWNS": interface.unknowns,
+        "WORKSPACE": interface.workspace,
+    }
+    for name, size in sizes.items():
+        _compare(name, size, re.search(rf"^#define {source.prefix.upper()}_{name} (\d+)$", source.header, re.MULTILINE))
+    for name, size in {"MAPS": len(interface.map_names), "CONSTRAINTS": len(interface.constraints)}.items():
+        _compare(name, size, re.search(rf"^  {name} = (\d+),", source.code, re.MULTILINE))
+    sums = re.search(r"^  SUMS = (\d+),", source.code, re.MULTILINE)
+    if interface.exchange_names and sums:
+        _compare("SUMS", len(interface.exchange_names), sums)
+    lengths: dict[str, tuple[object, object]] = {"prefix": (interface.prefix, source.prefix)}
+    lengths["defaults"] = (len(interface.defaults), len(interface.parameters))
+    lengths["momentum_names"] = (len(interface.momentum_names), interface.dimension if interface.momentum_names else 0)
+    lengths["map_formulas"] = (len(interface.map_formulas), len(interface.map_names))
+    for name, (found, wanted) in lengths.items():
+        if found != wanted:
+            raise ValueError(f"{name}: {found} where {wanted} is wanted")
+    if not set(interface.inputs) <= {name[:-2] for name in interface.parameters if name.endswith("_0")}:
+        raise ValueError(f"inputs {interface.inputs} are no parameters")
+
+
+def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
+    wanted = int(found[1]) if found else 0
+    if size != wanted:
+        raise ValueError(f"{name} is {size}, and {wanted} in the C text")
 
 
 def included(code: str) -> tuple[str, ...]:
@@ -172,7 +229,14 @@ class Interface:
 
     @classmethod
     def from_json(cls, text: str) -> Interface:
-        """The interface written by :meth:`to_json`."""
-        fields: dict[str, Any] = json.loads(text)
-        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in fields.items()}
+        """The interface written by :meth:`to_json`.
+
+        Raises:
+            ValueError, TypeError: for other fields, and values of other kinds.
+        """
+        found: dict[str, Any] = json.loads(text)
+        arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
+        for each in fields(cls):
+            if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
+                raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}, which is no {each.type}")
         return cls(**arguments)

@@ -154,6 +154,8 @@ def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
     times = checked_times(t_eval, "t_eval")
     if times.ndim != 1:
         raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
+    if not times.size:
+        raise StateError("t_eval is empty: give the times at which states are wanted, or leave it out for every step")
     if (np.diff(times) * (t_end - t) < 0.0).any():
         raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
     return within(times, t, t_end)

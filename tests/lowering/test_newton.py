@@ -1,6 +1,7 @@
 """Newton's iteration: the band, its order, exchanges of rows within it, and factors kept from step to step."""
 
 import random
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,8 +18,11 @@ from scvi_codegen import (
     compile_stepper,
     generate_source,
 )
-from scvi_codegen.errors import StepFailedError
+from scvi_codegen.errors import MethodError, StepFailedError
 from scvi_codegen.ir.program import WORTH_REMEMBERING
+from scvi_codegen.lowering.families import lowered_family
+from scvi_codegen.lowering.sites import sites_of
+from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.text import workspace_size
 from scvi_codegen.runtime.stepper import Stepper
@@ -146,3 +150,15 @@ class TestKeptFactors:
         with pytest.raises(StepFailedError):
             strict.record(1)
         assert strict.save() == before
+
+
+def test_a_wrong_sign_in_a_scatter_is_named_before_anything_is_compiled():
+    """Newton's matrix is the Jacobian of a gradient: by one of other results the iteration would never converge."""
+    system = LagrangianSystem.from_text(name="mixed", coordinates=["x"], lagrangian="(1 + x**2)*x_dot**2/2 - x**4")
+    stages = discretise(system, SVI(2))
+    (family,), sites = stages.families, sites_of(stages, 1)
+    lowered_family(system, family, sites)
+    first, *others = family.scatters
+    wrong = replace(first, results=tuple(-each for each in first.results))
+    with pytest.raises(MethodError, match=r"(?s)'quadrature' are not the gradient of its scalar.*check the signs"):
+        lowered_family(system, replace(family, scatters=(wrong, *others)), sites)

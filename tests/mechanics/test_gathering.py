@@ -136,3 +136,16 @@ def test_inputs_keep_their_names():
     )
     other = sc.compile_stepper(system, "svi:3").drive(np.zeros(4), velocity=np.zeros(4), inputs=data, h=0.1, steps=5)
     assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)
+
+
+@pytest.mark.parametrize("term", ["3", "3*sin(t)", "g", "g*cos(t) + x*0 + 2"])
+def test_terms_without_coordinates_leave_a_system_that_can_be_run(term):
+    written = lagrangian(["x", "y"], f"x_dot**2/2 - x**2/2 + y_dot**2/2 - y**2/2 + {term}", g=2.0)
+    found = sc.gather_sums(written)
+    assert {name: table.shape[1] for name, table in found.tables.items()} == {
+        f"at{k}": 1 for k in range(len(found.tables))
+    }
+    data = {"tables": found.tables, "parameters": found.parameters}
+    own = sc.compile_indexed(found.system, "svi:2").integrate([1.0, 2.0], h=0.1, steps=3, **data)
+    other = sc.compile_stepper(written, "svi:2").integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3)
+    assert np.abs(own.q["q"] - other.q).max() < 1e-15

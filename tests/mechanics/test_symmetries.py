@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from itertools import combinations
 
@@ -627,3 +628,19 @@ def test_where_nothing_is_conserved_no_singular_values_are_computed(monkeypatch)
     tilted = particle("sin(x*y) + x**4 + cos(y) + x*cos(t)")
     monkeypatch.setattr(np.linalg, "svd", None)
     assert symmetries(tilted) == ()
+
+
+def test_of_one_forms_whose_forces_depend_on_velocities_nothing_is_claimed():
+    """A Lagrangian a(q) p . v - H, as a system of one's own may have it: no TypeError from floats of symbols."""
+
+    @dataclass(frozen=True, slots=True, kw_only=True)
+    class Gauge(HamiltonianSystem):
+        @property
+        def lagrangian(self):
+            (q,), (p,), (v,) = self.coordinates, self.auxiliaries, self.velocities
+            return p * v * (1 + q**2) - self.formula
+
+    plain = HamiltonianSystem.from_text(name="plain", coordinates=["q"], hamiltonian="p_q**2/2")
+    own = Gauge(**{each.name: getattr(plain, each.name) for each in fields(plain) if each.init})
+    assert symmetries(plain) != ()
+    assert symmetries(own) == ()

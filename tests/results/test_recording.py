@@ -228,6 +228,44 @@ class TestFolders:
         with pytest.raises(RecordingError, match=r"manifest\.json' is damaged"):
             resume_run("a.run")
 
+    @pytest.mark.parametrize(
+        ("place", "value"),
+        [
+            (("source", "support", "../../outside.h"), ["int x;"]),
+            (("source", "support", "support/../../outside.h"), ["int x;"]),
+            (("source", "support", "/tmp/outside.h"), ["int x;"]),
+            (("source", "support", "support/outside.txt"), ["x"]),
+            (("source", "prefix"), "../outside"),
+            (("source", "prefix"), "a b"),
+            (("fallback", "prefix"), "../outside"),
+            (("flags",), ["-O2", "-wrapper", "touch,outside"]),
+            (("flags",), ["-fplugin=./outside.so"]),
+            (("flags",), ["-Wl,-rpath,/tmp"]),
+            (("flags",), ["-o/tmp/outside"]),
+            (("flags",), ["@outside"]),
+            (("flags",), ["-include", "outside"]),
+        ],
+    )
+    def test_a_manifest_is_data_that_leads_nowhere_else(self, kepler, place, value, tmp_path):
+        recorded(kepler, 10)
+        path = Path("a.run/manifest.json")
+        document = json.loads(path.read_text())
+        inner = document
+        for key in place[:-1]:
+            inner = inner[key]
+        inner[place[-1]] = value
+        path.write_text(json.dumps(document))
+        before = sorted(tmp_path.rglob("*"))
+        for act in (lambda: load_run("a.run")[0:3].energy(), lambda: resume_run("a.run", steps=20)):
+            with pytest.raises(RecordingError, match=r"is not the name of a file|compiler flag .* is not one"):
+                act()
+        assert sorted(tmp_path.rglob("*")) == before
+
+    def test_a_run_with_other_flags_is_not_recorded(self, kepler, monkeypatch):
+        monkeypatch.setattr(kepler, "flags", (*kepler.flags, "-fplugin=x.so"))
+        with pytest.raises(StateError, match=r"'-fplugin=x\.so' is not one .* SCVI_CODEGEN_CFLAGS"):
+            recorded(kepler, 10)
+
     def test_two_processes_do_not_record_into_one_folder(self, kepler):
         def second(done: int) -> None:
             with pytest.raises(RecordingError, match=r"another process is recording into 'a\.run'"):

@@ -147,12 +147,14 @@ def test_states_at_given_times_are_those_of_the_dense_output(kepler, h):
         ({"t_eval": [0.3, 0.2]}, "sorted"),
         ({"t_eval": [0.3, 2.2]}, "outside"),
         ({"t_eval": [[0.3]]}, "shape"),
+        ({"t_eval": []}, "t_eval is empty"),
         ({"t_eval": [0.3], "every": 2}, "not both"),
     ],
 )
 def test_given_times_are_checked(kepler, arguments, words):
-    with pytest.raises(StateError, match=words):
-        kepler.integrate(**START, h=0.1, steps=10, **arguments)
+    for way in ({"h": 0.1, "steps": 10}, {"t_end": 1.0}):
+        with pytest.raises(StateError, match=words):
+            kepler.integrate(**START, **way, **arguments)
 
 
 def test_what_was_kept_before_a_failure_is_there():

@@ -82,7 +82,7 @@ def gather_sums(system: MechanicalSystem) -> GatheredSums:
             name=system.name,
             coordinates=["q[N]"],
             parameters={**used, **fields},
-            tables=[f"at{k}[B{k}, {max(1, each.table.shape[1])}]" for k, each in enumerate(found)],
+            tables=[f"at{k}[B{k}, {each.table.shape[1]}]" for k, each in enumerate(found)],
             forces={f"q[at{k}[b, 0]]": each.text for k, each in enumerate(found) if k >= len(kinds)},
             inputs=system.inputs,
             **given,
@@ -134,7 +134,9 @@ def _family(name: str, kind: LikeTerms, defaults: dict[Symbol, float]) -> _Famil
             numbers |= {column[0].name: defaults[column[0]]} if column[0] in defaults else {}
             constants.append(str(column[0]) if _is_plain(column[0]) else f"({column[0]})")
     text = kind.written(lambda k: f"[at{name}[b, {k}]]", constants.__getitem__)
-    table = np.array(kind.places, dtype=np.int32).reshape(len(kind.places), -1)
+    width = max(1, *map(len, kind.places))  # of terms without coordinates one column, which nothing reads
+    table = np.zeros((len(kind.places), width), dtype=np.int32)
+    table[:, : len(kind.places[0])] = kind.places
     return _Family(text, table, fields, numbers)
 
 

@@ -85,6 +85,12 @@ class Rates:
     numbers: Mapping[Symbol, sympy.Rational]
     families: tuple[RolledTerms, ...] = ()
 
+    @property
+    def closed(self) -> bool:
+        """Whether all that occurs in the rates is among the arguments, so that they have values at a point."""
+        known = {*self.arguments, self.time, *self.constants}
+        return all(formula.free_symbols <= known for formula in (*self.transformed, *self.forces))
+
     def arrays(self, parameters: Mapping[Symbol, Array], count: int) -> Sample:
         """``count`` points; NaN where the system is not defined. Parameters: one number, or one a point."""
         generator = np.random.default_rng(SEED)

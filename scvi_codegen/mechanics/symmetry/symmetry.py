@@ -171,6 +171,8 @@ def _found(system: MechanicalSystem) -> list[Terms]:
     if system.dimension > MOST_COORDINATES:
         return _rigid(system)
     motion = rates_of(system)
+    if not motion.closed:  # of one-forms p . v with other momenta than the auxiliaries, forces depend on v, too
+        return []
     if not isinstance(system, HamiltonianSystem):
         return _spanned(system, motion, curved=False)
     mixed = _spanned(system, motion, curved=True)

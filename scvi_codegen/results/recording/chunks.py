@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import io
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import sync_folder, write_atomically
 from scvi_codegen.files.export import COLUMNS, Piece
+from scvi_codegen.files.numpy_files import loaded
 
 __all__ = ["Chunk", "chunk_path", "chunk_paths", "no_states", "read_chunk", "unfinished", "write_chunk"]
 
@@ -78,15 +80,28 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     sync_folder(folder)
 
 
-def read_chunk(path: Path) -> Chunk:
-    """What a file of states holds, its checksums compared.
+def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None) -> Chunk:
+    """What a file of states holds, its checksums compared; of states of m coordinates, so many at most.
 
     Raises:
         RecordingError: if it cannot be read, or was changed.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        with path.open("rb") as file, loaded(file) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
-            return Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            found = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes())
+            _check_shapes(found, q.shape[-1] if dimension is None else dimension, rows)
+            return found
+    except (OSError, ValueError) as error:
         raise RecordingError(f"'{path}' cannot be read: {error}") from error
+
+
+def _check_shapes(chunk: Chunk, dimension: int, rows: int | None) -> None:
+    """Raise :class:`ValueError` for columns of other kinds, or of lengths that differ."""
+    columns: tuple[NDArray[Any], ...] = chunk.piece
+    likes: tuple[NDArray[Any], ...] = no_states(dimension)
+    for name, column, like in zip(COLUMNS, columns, likes, strict=True):
+        if column.shape != (len(chunk), *like.shape[1:]) or column.dtype != like.dtype:
+            raise ValueError(f"{name} has the shape {column.shape} and the type {column.dtype}")
+    if chunk.step < 0 or (rows is not None and len(chunk) > rows):
+        raise ValueError(f"it has {len(chunk)} states up to step {chunk.step}")

@@ -7,12 +7,17 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.given.counts import checked_count
+from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.compilers import compiler_title
 from scvi_codegen.native.fingerprint import fingerprint
+from scvi_codegen.native.flags import check_flags
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.run import Run
@@ -118,6 +123,33 @@ class Manifest:
             texts["certificate"] = json.dumps(self.certificate)
         return texts
 
+    def check(self) -> None:
+        """Raise :class:`ValueError` for numbers that no run has, and flags that none may name."""
+        check_flags(self.flags)
+        check_interface(self.source, self.interface)
+        if self.fallback and self.fallback.prefix != self.source.prefix:
+            raise ValueError(f"the fallback is of '{self.fallback.prefix}', not of '{self.source.prefix}'")
+        if not isinstance(self.model, str | None):
+            raise TypeError(f"the model is {self.model!r:.60}")
+        if not self.builds or not all(type(build.step) is int and build.step >= 0 for build in self.builds):
+            raise ValueError("there are no builds, or their steps are no numbers")
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        for name, least in {"every": 1, "rows": 1, "steps": 0}.items():
+            if (count := getattr(self, name)) is not None or name != "steps":
+                checked_count(count, name, least=least)
+        for name in ("h", "t"):
+            checked_number(getattr(self, name), name)
+        if len(self.parameters) != len(self.interface.parameters):
+            raise ValueError(f"{len(self.parameters)} parameters where {len(self.interface.parameters)} are wanted")
+        for name, value in zip(self.interface.parameters, self.parameters, strict=True):
+            checked_number(value, name)
+        if (self.goal is None) == (self.steps is None) or (self.goal is None) == (self.h == 0.0):
+            raise ValueError("a run has steps of h, or a goal")
+        if self.goal and not (np.isfinite([self.goal.t_end, self.goal.tau]).all() and 0 <= self.goal.tolerance < 1):
+            raise ValueError(f"{self.goal} is not one")
+
     def to_json(self) -> str:
         """Text read back by :meth:`from_json`, with the C code line by line."""
         document = {
@@ -140,7 +172,7 @@ class Manifest:
             raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
         plain = {field: document[field] for field in PLAIN}
         options, goal = document["options"], document["goal"] if document["format"] == FORMAT_TO_A_TIME else None
-        return cls(
+        found = cls(
             **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
             options=None if options is None else SolverOptions(**options),
             goal=None if goal is None else Goal(**goal),
@@ -149,6 +181,8 @@ class Manifest:
             source=Source.from_record(document["source"]),
             fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
         )
+        found.check()
+        return found
 
 
 PLAIN = ("flags", "parameters", "h", "t", "every", "steps", "rows", "model", "certificate")
@@ -167,7 +201,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise RecordingError(f"'{folder}' holds no recorded run: there is no file '{path}'") from error
     except OSError as error:
         raise RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise RecordingError(f"'{path}' is damaged or of another version of this package: {error!r}") from error
 
 

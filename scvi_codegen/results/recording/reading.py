@@ -15,7 +15,7 @@ from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled import checked_units
 from scvi_codegen.given.kinds import MAPPING, PATH, takes
-from scvi_codegen.results.recording.chunks import chunk_paths, no_states, read_chunk
+from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
 from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.quantities import quantities
@@ -62,7 +62,7 @@ class RecordedRun:
             raise RecordingError(f"'{folder}' cannot be read: {error.strerror or error}") from error
         if not self._paths:
             raise RecordingError(f"'{folder}' holds no states, not even the first: record it again")
-        self._last = read_chunk(self._paths[-1])
+        self._last = self._read(self._paths[-1])
         self._recent: tuple[tuple[int, Piece], ...] = ()
         self.t, self.q, self.p, self.iterations = (LazyArray(self, i) for i in range(len(COLUMNS)))
 
@@ -136,16 +136,26 @@ class RecordedRun:
 
     def _pieces(self) -> Iterator[Piece]:
         for path in self._paths[:-1]:
-            yield read_chunk(path).piece
+            yield self._read_full(path)
         if len(self._last):
             yield self._last.piece
+
+    def _read(self, path: Path) -> Chunk:
+        return read_chunk(path, self.manifest.interface.dimension, self.manifest.rows)
+
+    def _read_full(self, path: Path) -> Piece:
+        """One that others follow."""
+        chunk = self._read(path)
+        if len(chunk) != self.manifest.rows:
+            raise RecordingError(f"'{path}' has {len(chunk)} states, and the manifest says {self.manifest.rows}")
+        return chunk.piece
 
     def piece(self, number: int) -> Piece:
         """The states of file ``number``, of the files read last from memory."""
         if number == len(self._paths) - 1:
             return self._last.piece
         recent = dict(self._recent)  # replaced as a whole, so that threads may read the run
-        piece = recent.pop(number, None) or read_chunk(self._paths[number]).piece
+        piece = recent.pop(number, None) or self._read_full(self._paths[number])
         self._recent = ((number, piece), *recent.items())[:PIECES_IN_MEMORY]
         return piece
 

@@ -20,6 +20,7 @@ from scvi_codegen.files.export import Piece, chunk_rows
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.given.kinds import FUNCTION, PATH, REAL, TEXT, of, takes
 from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.native.flags import check_flags
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
@@ -86,6 +87,7 @@ def record_run(
     if run.steps:
         raise StateError(f"a run is recorded from its start, but this one has {run.steps} steps: start another")
     _check_inputs(run)
+    check_flags(run.stepper.flags, StateError)
     manifest = Manifest(
         source=run.stepper.source,
         fallback=run.stepper.fallback,
