@@ -17,7 +17,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from scvi_codegen.errors import BuildError
-from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed
+from scvi_codegen.files.cache import CACHE_VARIABLE, cache_folder, cache_info, exposed, remedy_of
 from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
 from scvi_codegen.native.compilers import compiler_title, find_compiler, from_wheel
 from scvi_codegen.native.processes import running
@@ -211,7 +211,7 @@ def _cache() -> Equipment:
     except BuildError as error:
         return Equipment(name="cache", status=LACKS, found=str(folder), remedy=str(error))
     if exposed(folder):
-        remedy = f"every user may write there, so it is not used: chmod o-w '{folder}'"
+        remedy = f"it is not used, because {remedy_of(folder)}"
         return Equipment(name="cache", status=LACKS, found=held, remedy=remedy)
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         remedy = f"it cannot be written, so nothing is kept: name another folder in {CACHE_VARIABLE}"

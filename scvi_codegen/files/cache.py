@@ -1,11 +1,11 @@
 """The user's cache folder: compiled integrators, generated texts, reference solutions.
 
 Anything in it can be made again, and is made again when it is missing or not what its checksum says. A checksum finds
-accidents; what protects from others is that nobody else may write here: a folder or an entry that every user of the
-machine may write is not used. When the entries are larger than ``$SCVI_CODEGEN_CACHE_SIZE`` (1G by default; 0: no
-limit), those used least recently are removed. To count thousands of entries takes as long as to compile one: a process
-counts them at its first, and again when it has written a share of what was free. Processes may do all this at once:
-entries come and go by renaming.
+accidents; what protects from others is that nobody else may write here: a folder or an entry that belongs to another
+user than this one or root, or that its group or every user of the machine may write, is not used. When the entries
+are larger than ``$SCVI_CODEGEN_CACHE_SIZE`` (1G by default; 0: no limit), those used least recently are removed. To
+count thousands of entries takes as long as to compile one: a process counts them at its first, and again when it has
+written a share of what was free. Processes may do all this at once: entries come and go by renaming.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ __all__ = [
     "exposed",
     "make_folder",
     "make_room",
+    "remedy_of",
     "size_limit",
     "touch",
     "trusted_folder",
@@ -63,16 +64,19 @@ def cache_folder() -> Path:
 
 
 def trusted_folder() -> Path | None:
-    """The cache folder, or ``None``, with a warning, if anyone may write into it: what lies there is run."""
+    """The cache folder, or ``None``, with a warning, if others may write into it: what lies there is run."""
     folder = cache_folder()
     if not exposed(folder):
         return folder
-    warn(
-        f"the cache folder '{folder}' is not used, because every user of this machine may write into it, and what lies "
-        f"there is run: chmod o-w '{folder}', or name another folder in {CACHE_VARIABLE}",
-        CacheWarning,
-    )
+    warn(f"the cache folder '{folder}' is not used, because {remedy_of(folder)}", CacheWarning)
     return None
+
+
+def remedy_of(folder: Path) -> str:
+    """Why a folder is not used, and what to do."""
+    reason = exposed(folder)
+    remedy = f"chmod go-w '{folder}', or name" if "write" in reason else "name"
+    return f"{reason}, and what lies there is run: {remedy} another folder in {CACHE_VARIABLE}"
 
 
 def make_folder(folder: Path) -> None:
@@ -80,12 +84,19 @@ def make_folder(folder: Path) -> None:
     folder.mkdir(mode=0o755, parents=True, exist_ok=True)
 
 
-def exposed(path: Path) -> bool:
-    """Whether every user of the machine may write there."""
+def exposed(path: Path) -> str:
+    """Why others than this user and root may change what is there; nothing where they may not, or nothing is there."""
+    if os.name != "posix":
+        return ""
     try:
-        return os.name == "posix" and bool(path.stat().st_mode & stat.S_IWOTH)
+        found = path.stat()
     except OSError:
-        return False
+        return ""
+    if found.st_uid not in (os.geteuid(), 0):
+        return f"it belongs to the user number {found.st_uid}, not to you ({os.geteuid()}) or root"
+    if found.st_mode & stat.S_IWOTH:
+        return "every user of this machine may write into it"
+    return "every user of its group may write into it" if found.st_mode & stat.S_IWGRP else ""
 
 
 def size_limit() -> int:

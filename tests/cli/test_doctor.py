@@ -116,7 +116,7 @@ def test_a_cache_that_is_not_used_is_named(tmp_path, monkeypatch):
     shared.mkdir()
     shared.chmod(0o777)
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(shared))
-    assert f"chmod o-w '{shared}'" in findings()["cache"]["remedy"]
+    assert f"chmod go-w '{shared}'" in findings()["cache"]["remedy"]
     monkeypatch.setenv("SCVI_CODEGEN_CACHE_SIZE", "much")
     assert "it must be a size" in findings()["cache"]["remedy"]
 

@@ -125,12 +125,52 @@ class TestTrust:
     def test_a_folder_that_everyone_may_write_is_not_used(self, folder):
         folder.mkdir()
         folder.chmod(0o777)
-        with pytest.warns(CacheWarning, match=r"every user of this machine may write into it.*chmod o-w"):
+        with pytest.warns(CacheWarning, match=r"every user of this machine may write into it.*chmod go-w"):
             assert answer(1) == 1.0
         assert list(folder.iterdir()) == []
         with pytest.warns(CacheWarning):
             spring()
         assert list(folder.iterdir()) == []
+
+    def test_a_folder_that_its_group_may_write_is_not_used(self, folder):
+        folder.mkdir()
+        folder.chmod(0o775)
+        with pytest.warns(CacheWarning, match=r"every user of its group may write into it.*chmod go-w"):
+            assert answer(1) == 1.0
+        assert list(folder.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("owner", "me", "trusted"), [(1000, 1000, True), (0, 1000, True), (65534, 1000, False), (1000, 0, False)]
+    )
+    def test_a_folder_of_another_user_is_not_used(self, folder, monkeypatch, owner, me, trusted):
+        """But one of root's is; and root uses none of others."""
+        folder.mkdir(mode=0o755)
+        stat = Path.stat
+
+        def owned(path: Path, **given: bool) -> os.stat_result:
+            found = list(stat(path, **given))
+            return os.stat_result([*found[:4], owner, *found[5:]])
+
+        monkeypatch.setattr(Path, "stat", owned)
+        monkeypatch.setattr(os, "geteuid", lambda: me)
+        if trusted:
+            assert cache.trusted_folder() == folder
+            return
+        with pytest.warns(CacheWarning, match=rf"belongs to the user number {owner}, not to you \({me}\) or root"):
+            assert cache.trusted_folder() is None
+
+    def test_entries_of_another_user_are_not_loaded(self, folder, monkeypatch):
+        """Where there is a way to make some: as root."""
+        if os.geteuid() != 0:
+            pytest.skip("only root gives files to other users")
+        answer(1)
+        forge(folder)
+        os.chown(building._binding(entry(folder, 1)), 65534, 65534)
+        assert answer(1) == 1.0
+        forge(folder)
+        os.chown(folder, 65534, 65534)
+        with pytest.warns(CacheWarning, match="belongs to the user number 65534"):
+            assert answer(1) == 1.0
 
     def test_an_entry_that_everyone_may_write_is_built_anew(self, folder, monkeypatch):
         for exposed in (entry(folder, 1), building._library(entry(folder, 1))):
