@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import EventError, StateError
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.dense_output import grid_tolerance
-from scvi_codegen.runtime.events import Crossings
+from scvi_codegen.runtime.events import ACCUMULATED, Crossings
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.kept_states import KeptStates
 
@@ -37,7 +37,8 @@ class CrossingSearch:
             self.watch.direction[number] = event.direction
             self.watch.remaining[number] = int(event.terminal)
         m = stepper.dimension
-        fields = [("t", float), ("function", np.int32), ("q", float, (m,)), ("p", float, (m,))]
+        numbers = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
+        fields = [*numbers, ("q", float, (m,)), ("p", float, (m,))]
         self._record = np.dtype(fields, align=True)
         self._room = ROOM
 
@@ -93,6 +94,9 @@ class CrossingSearch:
         if self.watch.undefined:
             function = self.stepper.events[self.watch.undefined - 1].function
             return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
+        if self.watch.accumulated:
+            function = self.stepper.events[self.watch.accumulated - 1].function
+            return EventError(ACCUMULATED.format(function=function, t=report.t))
         return step_failure(status, report, step=step, h=h)
 
     def crossings(self) -> tuple[Crossings, ...]:

@@ -15,10 +15,15 @@ from scvi_codegen.given.counts import checked_count
 if TYPE_CHECKING:
     from sympy import Expr
 
-__all__ = ["Crossings", "Event", "EventLike", "as_events"]
+__all__ = ["ACCUMULATED", "Crossings", "Event", "EventLike", "as_events"]
 
 Array = NDArray[np.float64]
 DIRECTIONS = (-1, 0, 1)
+ACCUMULATED = (
+    "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at a zero of it, "
+    "leaves and is back within a rounding error, as at the last of infinitely many bounces; end the motion here, or "
+    "go on with the state held by a constraint"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +34,8 @@ class Event:
         function: g, as text of the grammar or as a SymPy expression. It may use the coordinates, their velocities
             (``q_dot``), their momenta (``p_q``, or as the Hamiltonian calls them), time ``t``, inputs and parameters.
         direction: 1 for crossings from negative to positive as the run goes, -1 for the opposite, 0 for both.
-        terminal: whether the first crossing ends the run; or the number of the crossing that does.
+        terminal: whether the first crossing ends the run; or the number of the crossing that does. Other events that
+            are crossed at the same state, such as two walls met in their corner, are recorded as well: look at all.
 
     Raises:
         EventError: for another direction.

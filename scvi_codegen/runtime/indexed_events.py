@@ -2,21 +2,23 @@
 
 A function is a formula of the grammar of sums over indices, in coordinates, velocities, momenta, parameters and t. It
 is looked at after every step; where its sign changed, the step is taken again in parts, of which each is as accurate as
-the method, until the zero is found to the last bit of its time (Brent's method). Two zeros within a step are not seen.
+the method, until the zero is found to the last bit of its time (Brent's method). Two zeros within a step are not seen,
+but where a run starts at a zero and moves away from it: a ball that was thrown back returns within a step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
-from scvi_codegen.runtime.events import Event
+from scvi_codegen.runtime.events import ACCUMULATED, Event
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, check_accesses
 from scvi_codegen.runtime.indexed_memory import IndexedMark
 from scvi_codegen.runtime.indexed_run import IndexedRun
@@ -26,8 +28,20 @@ if TYPE_CHECKING:
 
 __all__ = ["IndexedCrossings", "IndexedSearch"]
 
+Sample: TypeAlias = tuple[float, float]
+"""A part of a step, and a function there."""
 LAST_BIT = 2.0**-52
 """Of a step."""
+TIE = 2.0**-30
+"""Of a step: crossings nearer to each other may be one."""
+AT_ZERO, AT_REST = 16.0 * LAST_BIT, 4.0 * LAST_BIT
+"""Of the change of a function in a step: what the search for a zero leaves, and a change that may be rounding."""
+PROBES = tuple(2.0**-place for place in range(40, -1, -1))
+"""Parts of a first step at which a function that starts at a zero is looked at."""
+RATE_PART = 2.0**-50
+"""Of a first step, which tells the rates of the state by its low words: shorter than to any probe."""
+LEAST_DIFFERENCE, RELATIVE_DIFFERENCE = 2.0**-10, 2.0**-17
+"""Of the first step, and of the coordinates: over what a rate is a difference."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,22 +77,107 @@ class IndexedSearch:
         self.found: list[list[tuple[float, dict[str, Numbers], dict[str, Numbers]]]] = [[] for _ in events]
         self.ended = False
         self.values = self._values(run)
+        self.started = False
 
     def step(self) -> None:
         """One step of the run, or the part of it that leads to a terminal event."""
         run, before, values = self.run, self.run.mark, self.values
         run.advance(1)
         self.values = self._values(run)
-        h = run.t - before.moments["t"] if run.goal else run.h
-        crossed = [k for k, event in enumerate(self.events) if _crosses(event, values[k], self.values[k])]
-        zeros = sorted((self._zero(before, k, h, values[k]), k) for k in crossed)
-        for part, k in zeros:
+        low = run._run.t_low - before.moments["t_low"]
+        h = (run.t - before.moments["t"]) + low if run.goal else run.h
+        zeros: list[tuple[float, int, bool]] = []
+        for k, event in enumerate(self.events):
+            looked = [(0.0, values[k]), (1.0, self.values[k])]
+            if not self.started and (between := self._leaves_zero(before, k, h, looked)):
+                looked[1:1] = between
+            pairs = [pair for pair in pairwise(looked) if _crosses(event, pair[0][1], pair[1][1])]
+            zeros += [(self._zero(before, k, h, *pair), k, pair[1][1] > pair[0][1]) for pair in pairs]
+        self.started = True
+        for number, (part, k, _) in enumerate(sorted(zeros)):
             there = self._part(before, part * h) if part < 1.0 else run.apart(h)
-            self.found[k].append((there.t, there.q, there.p))
-            self.remaining[k] -= 1
-            if self.remaining[k] == 0:
+            if self._take(k, there):
+                for other, j, rises in sorted(zeros)[number + 1 :]:
+                    if other - part <= TIE and self._value(there, j) * (1.0 if rises else -1.0) >= 0.0:
+                        self._take(j, there)
                 self._end(before, there)
                 return
+
+    def _take(self, k: int, there: IndexedRun) -> bool:
+        """Keep a crossing; return whether it ends the run."""
+        self.found[k].append((there.t, there.q, there.p))
+        self.remaining[k] -= 1
+        return self.remaining[k] == 0
+
+    def _leaves_zero(self, before: IndexedMark, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
+        """Samples between the ends of a first step that begins at a zero, on the side from which the run came to it.
+
+        Raises:
+            EventError: for a terminal event, where the run returns within a rounding error.
+        """
+        (_, old), (_, new) = ends
+        start = self.run.apart(h)
+        start.rewind(before)
+        noise = self._rounding(start, k, old)
+        change, doubt = self._first_change(before, start, k, h, noise)
+        sign, size = 1.0 if change > 0.0 else -1.0, abs(change) + abs(new - old)
+        if abs(old) > AT_ZERO * size + 8.0 * noise or sign * old > 0.0:
+            return []
+        if not abs(change) > AT_REST * size + 4.0 * doubt:
+            return []
+        found: list[Sample] = []
+        for part in PROBES[:-1]:
+            value = self._value(self._part(before, part * h), k)
+            if found or abs(value) > 8.0 * noise + 4.0 * abs(old):
+                found.append((part, value))
+            if len(found) == 1 and sign * value < 0.0:
+                event = self.events[k]
+                if self.remaining[k] > 0 and event.direction != sign:
+                    raise EventError(ACCUMULATED.format(function=event.function, t=start.t))
+                return []
+        return found
+
+    def _rounding(self, start: IndexedRun, k: int, old: float) -> float:
+        """By how much a function changes if coordinates change by an ulp, up or down."""
+        rng, found = np.random.default_rng(0), 0.0
+        for _ in range(4):
+            ulps = LAST_BIT * np.abs(start.state) * rng.choice([-1.0, 1.0], start.state.size)
+            found = max(found, abs(self._moved(start, k, start.t, ulps) - old))
+        return found
+
+    def _first_change(
+        self, before: IndexedMark, start: IndexedRun, k: int, h: float, noise: float
+    ) -> tuple[float, float]:
+        """dg/dt h of a function at the start of a step, and its uncertainty; zeros where g is undefined near it."""
+        n, part, next_ = start.problem.count, RATE_PART, self._part(before, RATE_PART * h)
+        low = [np.concatenate([run._numbers["carry_q"], run._numbers["carry_p"]]) for run in (start, next_)]
+        along_q = ((next_.state - start.state) + (low[1] - low[0])) / part
+        along_p = along_q.copy()
+        along_q[n:], along_p[:n] = 0.0, 0.0
+        fast = np.abs(along_q).max() or 1.0
+        size = max(LEAST_DIFFERENCE, RELATIVE_DIFFERENCE * float(np.abs(start.state[:n]).max() / fast))
+        try:
+            by_q = self._difference(start, k, 0.0, along_q, size)
+            by_rest = self._difference(start, k, h, along_p, LEAST_DIFFERENCE)
+        except EventError:
+            return 0.0, 0.0
+        return by_q + by_rest, noise / size + (noise / LEAST_DIFFERENCE if by_rest else 0.0)
+
+    def _difference(self, start: IndexedRun, k: int, dt: float, along: Numbers, size: float) -> float:
+        """The central difference of a function along a direction."""
+        above, below = (self._moved(start, k, start.t + part * dt, part * along) for part in (size, -size))
+        return (above - below) / (2.0 * size)
+
+    def _moved(self, start: IndexedRun, k: int, t: float, change: Numbers) -> float:
+        """A function at a changed state."""
+        state, when = start.state.copy(), start.t
+        start.state += change
+        start._run.t = t
+        try:
+            return self._value(start, k)
+        finally:
+            start.state[:] = state
+            start._run.t = when
 
     def crossings(self) -> tuple[IndexedCrossings, ...]:
         """What was found, by event."""
@@ -99,18 +198,18 @@ class IndexedSearch:
         self.run.stand_at(there)
         self.ended = True
 
-    def _zero(self, before: IndexedMark, k: int, h: float, old: float) -> float:
-        """The part of a step after which a function first has its new sign, or is 0."""
+    def _zero(self, before: IndexedMark, k: int, h: float, left: Sample, right: Sample) -> float:
+        """The part of a step after which a function first has its new sign, or is 0; between two samples."""
         from scipy.optimize import brentq  # here: slow to import
 
-        def value(part: float) -> float:
-            if part in (0.0, 1.0):
-                return old if part == 0.0 else self.values[k]
-            return self._value(self._part(before, part * h), k)
+        known = dict((left, right))
 
-        part, width = float(brentq(value, 0.0, 1.0, xtol=LAST_BIT, rtol=4 * LAST_BIT)), LAST_BIT
-        while part < 1.0 and value(part) * old > 0.0:
-            part, width = min(1.0, part + width), 2.0 * width
+        def value(part: float) -> float:
+            return known[part] if part in known else self._value(self._part(before, part * h), k)
+
+        part, width = float(brentq(value, left[0], right[0], xtol=LAST_BIT * right[0], rtol=4 * LAST_BIT)), LAST_BIT
+        while part < right[0] and value(part) * left[1] > 0.0:
+            part, width = min(right[0], part + width * right[0]), 2.0 * width
         return part
 
     def _part(self, before: IndexedMark, h: float) -> IndexedRun:

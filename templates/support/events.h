@@ -6,9 +6,14 @@ enum {
   EVENT_SPLITS = 6, /* a step is split into parts at most so many times over */
   EVENT_TRIALS = 200, /* at most so many states are tried for one crossing: bisection takes 52 */
   EVENT_BISECTIONS = 30, /* of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60 */
+  EVENT_FIRST_PROBE = 40, /* 2^-40 of a step is the first state looked at after a start at a zero */
+  EVENT_LAST_PROBE = 4,
   EVENT_NO_ROOM = -1
 };
 
+#define EVENT_TIE 0x1p-30 /* of a step: crossings nearer to each other may be one */
+#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* of the range of a function on a step: what the search for a zero leaves */
+#define EVENT_AT_REST (4.0 * DBL_EPSILON) /* of the range of a function on a step: a change that may be rounding */
 #define EVENT_SMALL_PART 0.03 /* a polynomial in doubt by less than this part of its range follows its function */
 #define EVENT_STEEPNESS 8.0 /* a zero is simple where the slope is more than so many doubts */
 
@@ -196,7 +201,9 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   if (status != OK)
     return status;
   crossing->t = at.t;
+  crossing->fraction = at.fraction;
   crossing->function = e;
+  crossing->direction = direction;
   memcpy(crossing->q, at.q, sizeof at.q);
   memcpy(crossing->p, at.p, sizeof at.p);
   ++*step->filled;
@@ -265,6 +272,110 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
 }
 
+/* By how much a function changes if each coordinate changes by an ulp: what rounding of the state makes of it. */
+static int rounding_of(const event_step *step, int e, const event_sample *at, real *noise)
+{
+  *noise = 0.0;
+  for (int i = 0; i < M; i++) {
+    event_sample next = *at;
+    int status;
+    next.q[i] *= 1.0 + DBL_EPSILON;
+    status = evaluate_functions(step, &next);
+    if (status != OK)
+      return status;
+    *noise += fabs(next.g[e] - at->g[e]);
+  }
+  return OK;
+}
+
+/* The central difference of a function along (q, p, t), divided by the size of the change. */
+static int difference(const event_step *step, int e, const event_sample *at, const real *dq, const real *dp, real dt,
+    real size, real *found)
+{
+  event_sample ends[2] = {*at, *at};
+  for (int side = 0; side < 2; side++) {
+    const real part = side ? size : -size;
+    int status;
+    for (int i = 0; i < M; i++) {
+      ends[side].q[i] += part * dq[i];
+      ends[side].p[i] += part * dp[i];
+    }
+    ends[side].t += part * dt;
+    status = evaluate_functions(step, ends + side);
+    if (status != OK)
+      return status;
+  }
+  *found = (ends[1].g[e] - ends[0].g[e]) / (2.0 * size);
+  return OK;
+}
+
+/* dg = (g_q v + g_p p_dot + g_t) h, by which a function would change in a step at its first rate, and how uncertain it
+ * is. Differences along q are as long as rounding of q demands, beside which p and t may change faster. */
+static int first_change(const event_step *step, int e, const event_sample *at, real noise, real *change, real *doubt)
+{
+  const real none[M] = {0.0}, little = 0x1p-10;
+  real v[M], dq[M], dp[M], fast = 0.0, large = 0.0, size, by_q, by_rest;
+  event_sample next;
+  int status = event_velocity(at->t, at->q, at->p, step->parameters, v, step->workspace);
+  if (status == OK)
+    status = take_sample(step, little, &next);
+  if (status != OK)
+    return status;
+  for (int i = 0; i < M; i++) {
+    dq[i] = v[i] * (next.t - at->t) / little;
+    dp[i] = (next.p[i] - at->p[i]) / little;
+    fast = fmax(fast, fabs(dq[i]));
+    large = fmax(large, fabs(at->q[i]));
+  }
+  size = fast > 0.0 && 0x1p-17 * large / fast > little ? 0x1p-17 * large / fast : little;
+  status = difference(step, e, at, dq, none, 0.0, size, &by_q);
+  if (status == OK)
+    status = difference(step, e, at, none, dp, (next.t - at->t) / little, little, &by_rest);
+  *change = by_q + by_rest;
+  *doubt = noise / size + (by_rest != 0.0 ? noise / little : 0.0);
+  return status;
+}
+
+/* Where the search of a first step begins. A run that was ended at a zero and starts from there again, thrown back, may
+ * stand on the side from which it came to that zero by a rounding, or exactly on it; if it leaves to the other side and
+ * returns within the step, no sign tells. States behind the start, each four times as far as the one before, are looked
+ * at until one is beyond rounding, then for the return. If it returns before the first of these, crossings accumulate. */
+static int leave_zero(const event_step *step, int e, const event_sample *left, real range, event_sample *from)
+{
+  event_sample next;
+  real noise, change, doubt;
+  int sign, place = EVENT_FIRST_PROBE, away = 0, status = rounding_of(step, e, left, &noise);
+  if (status == OK && fabs(left->g[e]) > EVENT_AT_ZERO * range + 8.0 * noise)
+    return OK;
+  if (status == OK)
+    status = first_change(step, e, left, noise, &change, &doubt);
+  if (status != OK) {
+    step->watch->undefined = 0; /* not on the motion: no rate is known */
+    return OK;
+  }
+  sign = change > 0.0 ? 1 : -1;
+  if (fabs(change) <= EVENT_AT_REST * range + 4.0 * doubt || sign * left->g[e] > 0.0)
+    return OK;
+  for (; place >= EVENT_LAST_PROBE; place -= 2) {
+    status = take_sample(step, ldexp(1.0, -place), &next);
+    if (status != OK)
+      return status;
+    if (!away && fabs(next.g[e]) <= 8.0 * noise + 4.0 * fabs(left->g[e]))
+      continue;
+    if (!away && sign * next.g[e] < 0.0 && step->watch->remaining[e] > 0 && step->watch->direction[e] != sign) {
+      step->watch->accumulated = e + 1;
+      return NOT_CONVERGED;
+    }
+    away = 1;
+    if (changes_sign(from->g[e], next.g[e]))
+      status = add_crossing(step, e, from, &next);
+    if (status != OK)
+      return status;
+    *from = next;
+  }
+  return OK;
+}
+
 /* The crossings of all functions on a step, in no order. */
 static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
 {
@@ -278,29 +389,69 @@ static int search_step(const event_step *step, const event_sample *left, const e
       inner[e][j - 1] = sample.g[e];
   }
   for (int e = 0; e < EVENTS; e++) {
-    const int status = search_part(step, e, left, right, inner[e], EVENT_SPLITS);
+    event_sample from = *left;
+    int status = OK;
+    if (!step->watch->started) {
+      real range = fabs(right->g[e] - left->g[e]);
+      for (int j = 1; j < EVENT_DEGREE; j++)
+        range = fmax(range, fabs(inner[e][j - 1] - left->g[e]));
+      status = leave_zero(step, e, left, range, &from);
+    }
+    if (status == OK)
+      status = search_part(step, e, &from, right, from.fraction > 0.0 ? NULL : inner[e], EVENT_SPLITS);
     if (status != OK)
       return status;
   }
   return OK;
 }
 
-/* Crossings of one step in order of time; those after the one that ends the search are dropped. */
-static void settle_crossings(const event_step *step, long long first)
+/* Counts a crossing; whether it ends the search. */
+static int ends_search(event_watch *watch, const event_crossing *crossing)
+{
+  int *remaining = watch->remaining + crossing->function;
+  watch->ended |= *remaining > 0 && --*remaining == 0;
+  return watch->ended;
+}
+
+/* After the crossing that ends the search, those of other functions that have their new signs at its state already:
+ * met there, too, they would not be found from there on. */
+static int keep_ties(const event_step *step, long long last)
+{
+  const long long filled = *step->filled;
+  const event_crossing end = step->found[last];
+  event_sample at = {.t = end.t};
+  int status;
+  memcpy(at.q, end.q, sizeof at.q);
+  memcpy(at.p, end.p, sizeof at.p);
+  status = evaluate_functions(step, &at);
+  *step->filled = last + 1;
+  for (long long i = last + 1; status == OK && i < filled; i++) {
+    const event_crossing other = step->found[i];
+    if (other.fraction - end.fraction > EVENT_TIE || (real)other.direction * at.g[other.function] < 0.0)
+      continue;
+    ends_search(step->watch, &other);
+    step->found[*step->filled] = end;
+    step->found[*step->filled].function = other.function;
+    step->found[*step->filled].direction = other.direction;
+    ++*step->filled;
+  }
+  return status;
+}
+
+/* Crossings of one step in order of their fractions, as times may tie; those after the one that ends the search are
+ * dropped. */
+static int settle_crossings(const event_step *step, long long first)
 {
   for (long long i = first + 1; i < *step->filled; i++)
-    for (long long k = i; k > first && (step->found[k].t - step->found[k - 1].t) * step->h < 0.0; k--) {
+    for (long long k = i; k > first && step->found[k].fraction < step->found[k - 1].fraction; k--) {
       const event_crossing later = step->found[k - 1];
       step->found[k - 1] = step->found[k];
       step->found[k] = later;
     }
-  for (long long i = first; i < *step->filled; i++) {
-    int *remaining = step->watch->remaining + step->found[i].function;
-    if (*remaining > 0 && --*remaining == 0) {
-      step->watch->ended = 1;
-      *step->filled = i + 1;
-    }
-  }
+  for (long long i = first; i < *step->filled; i++)
+    if (ends_search(step->watch, step->found + i))
+      return keep_ties(step, i);
+  return OK;
 }
 
 int NAME(crossings)(event_watch *watch, long long count, const real *h, const real *t, const real *q,
@@ -329,7 +480,10 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
       *filled = first;
       return status == EVENT_NO_ROOM ? OK : status;
     }
-    settle_crossings(&step, first);
+    status = settle_crossings(&step, first);
+    if (status != OK)
+      return status;
+    watch->started |= k > 0;
     report->steps = k;
     left = right;
   }

@@ -17,7 +17,9 @@ from sympy.physics.mechanics import dynamicsymbols
 
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.errors import EventError, ExpressionError, StateError, StepFailedError
+from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
@@ -400,3 +402,93 @@ def test_a_stepper_may_be_compiled_with_events():
     assert "free_particle" in stepper.source.prefix
     assert stepper.integrate([0.0], [1.0], h=0.3, steps=10).t[-1] == pytest.approx(1.0, abs=1e-15)
     assert stepper.integrate([0.0], [1.0], h=0.3, steps=10, events=()).t[-1] == pytest.approx(3.0)
+
+
+# Runs that go on from a crossing with another velocity.
+
+
+BALL = LagrangianSystem.from_text(name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 9.81})
+BALLS = IndexedSystem.from_text(
+    name="balls", coordinates=["y[N]"], lagrangian="sum(i in N, y_dot[i]**2/2 - g*y[i])", parameters={"g": 9.81}
+)
+DISC = LagrangianSystem.from_text(name="puck", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
+DISCS = IndexedSystem.from_text(name="pucks", coordinates=["r[N]"], lagrangian="sum(i in N, r_dot[i]**2/2)")
+CORNERS = [(0.5, (0.5, 0.5), (1, 1)), (5.0, (0.5, 0.5), (1, 1)), (0.5, (0.25, 0.5), (0.7, 1.4))]
+WALLS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def until_event(stepper, events, q, v, t, h):
+    """The end of a run by a terminal event: t, q, v, and the events met there."""
+    run = stepper.integrate(q, velocity=v, t=t, h=h, steps=400, events=events)
+    q, v = run.q, run.velocity
+    if isinstance(q, dict):
+        (q,), (v,) = q.values(), v.values()
+    return (
+        run.t[-1],
+        q[-1],
+        v[-1],
+        [k for k, found in enumerate(run.events) if found.t.size and found.t[-1] == run.t[-1]],
+    )
+
+
+@pytest.fixture(scope="module", params=["coordinates", "arrays"])
+def thrown(request):
+    """Steppers of a ball and a puck with the names of their coordinates, scalar and indexed."""
+    if request.param == "arrays":
+        return compile_indexed(BALLS, "svi:2"), compile_indexed(DISCS, "svi:2"), ("y[0]", "r[0]", "r[1]")
+    return compiled_plainly(BALL, SVI(2)), compiled_plainly(DISC, SVI(2)), ("y", "x", "y")
+
+
+@pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
+@pytest.mark.parametrize(("floor", "error"), [(0.0, 1e-12), (1000.0, 2e-5)])
+@pytest.mark.parametrize("h", [0.1, -0.02])
+def test_a_ball_that_comes_to_rest_bounces_until_its_crossings_accumulate(thrown, floor, error, h):
+    """Times of bounces form a geometric series; hops get shorter than rounding before its end."""
+    ball, _, (height, *_) = thrown
+    restitution, fall = 0.5, math.sqrt(2.0 / 9.81)
+    end = fall * (1.0 + restitution) / (1.0 - restitution)
+    q, v, t, times = np.array([floor + 1.0]), np.zeros(1), 0.0, []
+
+    def bounce():
+        """Until no bounce is told from the next."""
+        nonlocal t, q, v
+        for _ in range(100):
+            t, q, v, met = until_event(ball, [Event(f"{height} - {floor}", -1, terminal=True)], q, v, t, h)
+            assert met == [0]
+            v = -restitution * v
+            times.append(abs(t))
+
+    with pytest.raises(EventError, match="accumulate at t = ") as raised:
+        bounce()
+    expected = end - 2.0 * fall * restitution ** np.arange(1, len(times) + 1) / (1.0 - restitution)
+    assert len(times) > 15
+    assert np.abs(times - expected).max() < error
+    assert abs(abs(float(str(raised.value).split("t = ")[1].split(":")[0])) - end) < error
+
+
+@pytest.mark.parametrize("t0", [0.0, 7e4])
+@pytest.mark.parametrize(("h", "start", "velocity"), CORNERS)
+def test_walls_met_in_a_corner_are_both_found(thrown, t0, h, start, velocity):
+    """A puck in a square that hits corners exactly: its paths are folded straight lines."""
+    _, puck, (_, x, y) = thrown
+    h = min(h, 0.5) if "[" in x else h  # of arrays, ends of steps alone are looked at
+    events = [Event(g, -1, terminal=True) for g in (x, f"1 - {x}", y, f"1 - {y}")]
+    q, v, t, corners = np.array(start), np.array(velocity, dtype=float), t0, 0
+    for _ in range(12):
+        t, q, v, met = until_event(puck, events, q, v, t, h)
+        for wall in met:
+            v = v - 2.0 * (WALLS[wall] @ v) * WALLS[wall]
+        corners += len(met) == 2
+        folded = np.abs((np.array(start) + np.array(velocity) * (t - t0) + 1.0) % 2.0 - 1.0)
+        assert met
+        assert np.abs(q - folded).max() < (1e-9 if t0 else 1e-13)
+    assert corners >= 2
+
+
+def test_crossings_of_a_step_come_by_their_fractions_where_their_times_tie():
+    """An ulp of t = 1e12 is 1.2e-4 long: the wall behind the other is met 1e-6 later."""
+    stepper = compiled_plainly(FREE, SVI(2))
+    events = [Event("q - 1.000001", terminal=True), Event("q - 1", terminal=True)]
+    run = stepper.integrate([0.5], [1.0], t=1e12, h=1.0, steps=1, events=events)
+    assert [len(found) for found in run.events] == [0, 1]
+    assert abs(run.q[-1, 0] - 1.0) < 1e-15
