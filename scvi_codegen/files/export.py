@@ -148,23 +148,30 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> 
 
 
 def to_dataframe(states: States) -> pandas.DataFrame:
-    """A line a state, by time: a column for each coordinate x and each momentum p_x, and iterations."""
+    """One row per state, indexed by time, with the columns of a CSV file (:func:`_names`)."""
     library = imported("pandas")
-    arrays, names = _joined(states), states.coordinates
-    columns = dict(zip(names, arrays["q"].T, strict=True))
-    columns |= {f"p_{name}": column for name, column in zip(names, arrays["p"].T, strict=True)}
+    t, *columns = (np.concatenate(parts) for parts in zip(*map(tuple, _columns(states)), strict=True))
     frame: pandas.DataFrame = library.DataFrame(
-        {**columns, "iterations": arrays["iterations"]}, index=library.Index(arrays["t"], name="t")
+        dict(zip(_names(states)[1:], columns, strict=True)), index=library.Index(t, name="t")
     )
     frame.attrs = states.attributes
     return frame
 
 
-def _joined(states: States) -> dict[str, NDArray[Any]]:
-    """All states at once."""
-    return {
-        name: np.concatenate(parts) for name, parts in zip(COLUMNS, zip(*states.pieces(), strict=True), strict=True)
-    }
+def _names(states: States) -> list[str]:
+    """Column names: t, coordinates x, momenta p_x, iterations; then velocities x_dot and the energy, where known."""
+    names = ["t", *states.coordinates, *(f"p_{name}" for name in states.coordinates), "iterations"]
+    if states.quantities is not None:
+        names += [*(f"{name}_dot" for name in states.coordinates), "energy"]
+    return names
+
+
+def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
+    """The columns of :func:`_names`, (n,) each, piece by piece."""
+    for t, q, p, iterations in states.pieces():
+        found = {} if states.quantities is None else states.quantities(t, q, p)
+        more = (*found["velocity"].T, found["energy"]) if found else ()
+        yield iter((t, *q.T, *p.T, iterations, *more))
 
 
 def _write_npz(states: States, path: Path) -> None:
@@ -189,12 +196,12 @@ def _write_npz(states: States, path: Path) -> None:
 
 
 def _write_csv(states: States, path: Path) -> None:
-    names = states.coordinates
-    formats = ["%.17g"] * (1 + 2 * len(names)) + ["%d"]
+    names = _names(states)
+    formats = ["%d" if name == "iterations" else "%.17g" for name in names]
     with path.open("w", encoding="utf-8") as file:
-        file.write(",".join(["t", *names, *(f"p_{name}" for name in names), "iterations"]) + "\n")
-        for piece in states.pieces():
-            np.savetxt(file, np.column_stack(piece), delimiter=",", fmt=formats)
+        file.write(",".join(names) + "\n")
+        for columns in _columns(states):
+            np.savetxt(file, np.column_stack(tuple(columns)), delimiter=",", fmt=formats)
 
 
 def _write_labelled(states: States, path: Path, *, write: Callable[[Labelled, Path], None]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -78,6 +78,10 @@ class Crossings:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def chosen(self, which: NDArray[np.bool_]) -> Crossings:
+        """Return some of the crossings, by (k,) truth values."""
+        return replace(self, t=self.t[which], q=self.q[which], p=self.p[which])
 
 
 def as_events(events: EventLike | Sequence[EventLike] | None) -> tuple[Event, ...]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +14,23 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["KeptStates"]
+__all__ = ["KeptStates", "checked_row"]
 
 Array = NDArray[np.float64]
+
+
+def checked_row(row: Any, count: int) -> int:
+    """Return the number of a state from the start, where negative ones count from the end; IndexError if none is there.
+
+    Raises:
+        TypeError: for anything but a whole number.
+    """
+    if isinstance(row, bool) or not hasattr(row, "__index__"):
+        raise TypeError(f"states are indexed by whole numbers and slices, as in run[-1] and run[10:], not by {row!r}")
+    number = operator.index(row)
+    if not -count <= number < count:
+        raise IndexError(f"there is no state {number} among {count}")
+    return number % count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.exchanges import exchanged_until
-from scvi_codegen.runtime.kept_states import Array
+from scvi_codegen.runtime.kept_states import Array, checked_row
 from scvi_codegen.runtime.nearby import NearbyMotions
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.standing import holds, lengths_of
@@ -75,6 +75,36 @@ class Trajectory(NearbyMotions):
 
     def __repr__(self) -> str:
         return holds(self, lengths_of(self.h, self.goal, tau=self.tau is not None))
+
+    @overload
+    def __getitem__(self, rows: slice) -> Self: ...
+    @overload
+    def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
+    def __getitem__(self, rows: slice | int) -> Self | tuple[float, Array, Array]:
+        """Return some of the states as a trajectory, for a slice; (t, q, p) of one state, for a number.
+
+        Events outside the times of a slice are left out; ``steps`` and ``step_error`` stay those of the whole run.
+
+        Raises:
+            IndexError: for a state that is not there, and for a slice that is empty or goes backward.
+        """
+        if not isinstance(rows, slice):
+            k = checked_row(rows, len(self))
+            return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
+        first, last, stride = rows.indices(len(self))
+        if stride < 0 or first >= last:
+            raise IndexError(f"a slice of a trajectory goes forward and holds at least one state, unlike {rows}")
+        lengths = self.lengths[rows]
+        if stride > 1 and self.goal is not None:  # the next state kept is not the end of the step
+            lengths = np.full_like(lengths, np.nan)
+        low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations")},
+            tau=None if self.tau is None else self.tau[rows],
+            lengths=lengths,
+            events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
+        )
 
     @classmethod
     def before(cls, failure: StepFailedError) -> Self:
@@ -250,8 +280,8 @@ class Trajectory(NearbyMotions):
         """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
 
         An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and texts title,
-        system, method, version. A CSV file has columns t, the coordinates x, the momenta p_x, iterations. HDF5 and Zarr
-        hold what :meth:`to_xarray` gives.
+        system, method, version. A CSV file has columns t, coordinates x, momenta p_x, iterations, velocities x_dot,
+        energy, which are nan where they cannot be computed. HDF5 and Zarr hold what :meth:`to_xarray` gives.
 
         Raises:
             StateError: for another suffix, or units in a format that has none.
@@ -276,7 +306,7 @@ class Trajectory(NearbyMotions):
         return to_dataset(self.states(units).labelled())
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """A line a state, by time: columns for each coordinate x and momentum p_x, and iterations.
+        """Return one row per state, indexed by time, with the columns of a CSV file (:meth:`save`).
 
         Raises:
             MissingLibraryError: without pandas (extra ``data``).

@@ -9,7 +9,7 @@ from samples import QUICK_FLAGS
 from scvi_codegen import SVI, MethodError, StateError, StepFailedError, compile_stepper, problem, torch_flow
 
 torch = pytest.importorskip("torch", reason="needs the extra 'torch'")
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:FutureWarning")  # torch's of itself
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # PyTorch's warning of its own call
 
 STEPS = 12
 X = [0.4, 0.1, -0.2, 0.3, 0.05]

@@ -156,7 +156,7 @@ every_setting = pytest.mark.parametrize("number", range(len(SETTINGS)), ids=name
 
 
 @every_setting
-def test_of_trajectories(number):
+def test_of_trajectories(number, tmp_path):
     given, run = SETTINGS[number], trajectory(number)
     times = given.t + given.h * given.every * np.arange((STEPS + 1) // given.every + 1)
     assert np.allclose(run.t, times, rtol=0, atol=1e-14)
@@ -170,6 +170,37 @@ def test_of_trajectories(number):
     table = run.to_dataframe()
     assert np.array_equal(table.index, run.t)
     assert np.array_equal(table.iloc[:, :4], np.hstack([run.q, run.p]))
+    names = run.stepper.coordinates
+    assert [*table.columns][4:] == ["iterations", *(f"{name}_dot" for name in names), "energy"]
+    assert close(table.iloc[:, 5:7].to_numpy(), np.array([state.velocity for state in states]))
+    assert close(table["energy"].to_numpy(), np.array([state.energy for state in states]))
+    run.save(tmp_path / "run.csv")
+    header, lines = (tmp_path / "run.csv").read_text().split("\n", 1)
+    assert header.split(",") == ["t", *table.columns]
+    assert np.array_equal(np.loadtxt(lines.splitlines(), delimiter=","), table.reset_index().to_numpy())
+
+
+@every_setting
+def test_some_of_the_states(number):
+    run = trajectory(number)
+    for rows in (slice(2, None), slice(None, 5), slice(1, -1, 2), slice(3, 4)):
+        part = run[rows]
+        assert [*part.t] == [*run.t[rows]]
+        assert np.array_equal(part.q, run.q[rows])
+        assert np.array_equal(part.p, run.p[rows])
+        assert np.array_equal(part.energy(), run.energy()[rows])
+        between = (part.t[0] + part.t[-1]) / 2
+        assert close(part.at(between)[0], expected(number, between).q)
+        assert part.tau is None or np.array_equal(part.tau, run.tau[rows])
+    for k in (0, 3, -1):
+        t, q, p = run[k]
+        assert (t, *q, *p) == (run.t[k], *run.q[k], *run.p[k])
+    assert len(list(run)) == len(run)
+    for rows in (len(run), slice(4, 4), slice(None, None, -1)):
+        with pytest.raises(IndexError, match=r"there is no state|goes forward"):
+            run[rows]
+    with pytest.raises(TypeError, match=r"by whole numbers and slices.*not by 'q'"):
+        run["q"]
 
 
 @every_setting

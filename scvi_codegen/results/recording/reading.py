@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -17,6 +18,7 @@ from scvi_codegen.files.labelled import checked_units
 from scvi_codegen.given.kinds import MAPPING, PATH, takes
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
+from scvi_codegen.runtime.kept_states import checked_row
 from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.times import times_after
@@ -75,12 +77,18 @@ class RecordedRun:
         end = f"t = {self.t[-1]:g} of {goal.t_end:g}" if goal else f"step {self.steps} of {self.manifest.steps}"
         return f"<RecordedRun '{self.folder}': {len(self)} states, {end}>"
 
-    def __getitem__(self, rows: slice) -> Trajectory:
-        """States by number, as a trajectory in memory; ``iterations`` counts as in the whole run."""
+    @overload
+    def __getitem__(self, rows: slice) -> Trajectory: ...
+    @overload
+    def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
+    def __getitem__(self, rows: slice | int) -> Trajectory | tuple[float, Array, Array]:
+        """Return some of the states as a trajectory in memory, for a slice; (t, q, p) of one state, for a number.
+
+        ``iterations`` counts as in the whole run.
+        """
         if not isinstance(rows, slice):
-            raise TypeError(
-                f"a recorded run is indexed by slices, as in run[-1000:], not by {rows!r}; see run.q, run.p"
-            )
+            k = checked_row(rows, len(self))
+            return float(self.t[k]), self.q[k], self.p[k]
         wanted = self.rows(rows)
         return self._trajectory(tuple(self.gather(wanted, range(len(COLUMNS)))), wanted)
 
@@ -208,8 +216,13 @@ class RecordedRun:
 
     @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
-        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`."""
-        write_states(self.states(units), path)
+        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`.
+
+        A CSV file has no velocities and no energy: to compute them, the C text of the recording is compiled and run.
+        ``run[:].save(path)`` and HDF5 files have them.
+        """
+        states, plain = self.states(units), Path(path).suffix.lower() == ".csv"
+        write_states(replace(states, quantities=None) if plain else states, path)
 
     def _trajectory(self, piece: tuple[Any, ...], rows: NDArray[np.int64]) -> Trajectory:
         t, q, p, iterations = piece
