@@ -37,9 +37,10 @@ def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]
     for table in tables:
         for names, numbers in zip(table.names, table.entries, strict=True):
             for name, value in zip(names, numbers, strict=True):
-                base, _, divisor = name.partition("/")
+                base, _, divisor = name.removeprefix("-").partition("/")
                 if base:
-                    values[sympy.Symbol(base, real=True)] = value * int(divisor or 1)
+                    sign = -1 if name.startswith("-") else 1
+                    values[sympy.Symbol(base, real=True)] = value * sign * int(divisor or 1)
     return entries(values, method)
 
 

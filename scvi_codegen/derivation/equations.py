@@ -33,7 +33,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import Block, PointFamily, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, PointFamily, Row, StageSystem, Table
 from scvi_codegen.tables.precision import Number
 
 __all__ = ["StepEquations", "derive"]
@@ -249,16 +249,23 @@ class _Writer:
 
     def _rows(self) -> list[list[list[sympy.Expr]]]:
         sizes = self.stages.row_sizes(self.system.dimension)
-        momenta = [*(row.momentum for row in self.stages.rows), self.stages.end_momentum]
+        momenta = [*map(self._momentum, itertools.count(1), self.stages.rows), _rational(self.stages.end_momentum)]
         powers = [*(row.power for row in self.stages.rows), 0]
         rows: list[list[list[sympy.Expr]]] = [
-            [[_rational(c) * self.p[i]] if c else [] for i in range(size)]
-            for c, size in zip(momenta, sizes, strict=True)
+            [[c * self.p[i]] if c != 0 else [] for i in range(size)] for c, size in zip(momenta, sizes, strict=True)
         ]
         for family in self.stages.families:
             for n in range(len(family.abscissae)):
                 self._scatter(family, n, powers, rows)
         return rows
+
+    def _momentum(self, column: int, row: Row) -> sympy.Expr:
+        """The coefficient of p_k: the named entry of q_(k+1) in that column where it is one, else a number."""
+        table = self.stages.end_position
+        name = table.names[0][column] if column < len(table.names[0]) else ""
+        if name.startswith("beta") and row.momentum == table.entries[0][column]:
+            return self._named(name, row.momentum)
+        return _rational(row.momentum)
 
     def _scatter(self, family: PointFamily, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
         arguments = self._arguments(family, n)

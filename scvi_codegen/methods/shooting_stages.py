@@ -160,9 +160,9 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
     slopes = cardinal_slopes(abscissae, rule.abscissae)
     none = Table.constant(points, size)
 
-    def first_and_sum(lines: Matrix) -> Table:
+    def first_and_sum(name: str, lines: Matrix) -> Table:
         first, both = [(line[0],) for line in lines], [(line[0] + line[-1],) for line in lines]
-        return Table.joined(Table.named("l", first), none, Table.named("l", both))
+        return Table.joined(Table.named(name, first), none, Table.named(name, both, column=2))
 
     quadrature = lagrangian_scatters(
         PointFamily(
@@ -174,8 +174,8 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
             scatters=(),
         ),
         system,
-        Scatter(results=(), table=first_and_sum(values), power=1),
-        Scatter(results=(), table=first_and_sum(slopes), power=0),
+        Scatter(results=(), table=first_and_sum("s1", values), power=1),
+        Scatter(results=(), table=first_and_sum("s2", slopes), power=0),
     )
     inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
     node = residual_family(
@@ -188,7 +188,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
             *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
         ),
         families=(quadrature, node),
-        end_position=Table.named("r", [(1, *end_row)], column=0),
+        end_position=Table.named("beta", [(1, *end_row)], column=0),
         end_momentum=mp.one,
         end_numbers=("34c", "34e"),
         extrapolation=acceleration_extrapolation(tableau),

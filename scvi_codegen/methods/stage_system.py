@@ -47,6 +47,8 @@ __all__ = [
 ]
 
 DYADIC_BITS = 52
+ROUNDING = mp.mpf("1e-50")
+"""Entries below are what rounding leaves of sums that are 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +66,7 @@ class Table:
     @classmethod
     def named(cls, prefix: str, entries: Sequence[Sequence[Number]], *, row: int = 1, column: int = 1) -> Table:
         """Name the entries ``prefix_n_b``, counting from ``row`` and ``column``; 0, 1 and -1 stay anonymous."""
-        rows = tuple(tuple(mp.mpf(x) for x in line) for line in entries)
+        rows = tuple(tuple(mp.mpf(x) if abs(x) > ROUNDING else mp.zero for x in line) for line in entries)
         names = tuple(
             tuple("" if x in (0, 1, -1) else f"{prefix}_{n}_{b}" for b, x in enumerate(line, column))
             for n, line in enumerate(rows, row)

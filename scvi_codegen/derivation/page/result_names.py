@@ -23,6 +23,11 @@ MEANINGS = {
     "L_dot": "L with a dot its time derivative along the curve, by what its index says",
 }
 
+MULTIPLIED_FORCES = (
+    ", without forces f; these add -f to E, f_v lambda to S_v and its time derivative less f_q lambda to S_q, the "
+    "adjoint of what they add to E"
+)
+
 
 def place_name(family: PointFamily, point: object = "n") -> str:
     """The index of a point of a family: n, or k and k + 1 where it is an end of the step."""
@@ -59,5 +64,6 @@ def scalar_name(family: PointFamily) -> str:
 def meaning(family: PointFamily) -> str:
     """What the letter of a family's results stands for."""
     if family.scalar is not None:
-        return MEANINGS[scalar_name(family)[:5]]
+        name = scalar_name(family)
+        return MEANINGS[name[:5]] + (MULTIPLIED_FORCES if name == "S" and family.forced else "")
     return MEANINGS["E"] if family.name == "node" else MEANINGS["L"]

@@ -124,8 +124,9 @@ def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
     for _, blocks in groups:
         members = [block.name.replace("_", "^") if block.name[0] in "QVP" else block.name for block in blocks]
         names.append(", ".join(members if len(members) < 4 else (members[0], "..", members[-1])))
-    size = len(stages.blocks) * system.dimension
-    each = f", each of them {system.dimension} numbers" if system.dimension > 1 else ""
+    sizes = [system.dimension if block.size is None else block.size for block in stages.blocks]
+    size = sum(sizes)
+    each = f", each of them {sizes[0]} numbers" if sizes[0] > 1 and len(set(sizes)) == 1 else ""
     return f"Unknown are {', '.join(names)}{each}: {size} in all. Known are q_k, p_k, t_k and h."
 
 

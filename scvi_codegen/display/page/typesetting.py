@@ -29,7 +29,9 @@ SIGNS = {
 SIGN = re.compile("|".join(map(re.escape, SIGNS)))
 SCIENTIFIC = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?)0*(\d+)(?!\w)")
 RAISED = re.compile(r"\^(?:\{([^}]*)\}|\(([^)]*)\)|(-?\w+))")
-LOWERED = re.compile(r"(?<![\w.])(d?[A-Za-z]|lambda|tau|theta)_(?:(\d+|[a-z]{1,2}\d?)(?!\w)|\((\w\+1)\)|\{([^}]*)\})")
+LOWERED = re.compile(
+    r"((?<![\w.])(?:d?[A-Za-z]|s\d|beta|gamma|lambda|tau|theta)|\))_(?:(\d+|[a-z]{1,2}\d?)(?!\w)|\((\w\+1)\)|\{([^}]*)\})"
+)
 EQUALITY = re.compile(r"(?<=\w) = (?=[-\d])")
 INDEX = re.compile(f"^([ijkn])(?={SPACE}=)")
 NEGATIVE = re.compile(r"(?<![\w)\]>;-])-(?=\d)|(?<== )-(?=\w)|(?<= )-(?= |[A-Za-z](?:<su|\())")
