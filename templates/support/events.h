@@ -314,7 +314,7 @@ static int difference(const event_step *step, int e, const event_sample *at, con
 static int first_change(const event_step *step, int e, const event_sample *at, real noise, real *change, real *doubt)
 {
   const real none[M] = {0.0}, little = 0x1p-10;
-  real v[M], dq[M], dp[M], fast = 0.0, large = 0.0, size, by_q, by_rest;
+  real v[M], dq[M], dp[M], fast = 0.0, large = 0.0, size, by_q = 0.0, by_rest = 0.0;
   event_sample next;
   int status = event_velocity(at->t, at->q, at->p, step->parameters, v, step->workspace);
   if (status == OK)
