@@ -44,7 +44,7 @@ def momenta_of_each(
         raise StateError(f"q has shape {positions.shape}, velocity {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
     states = zip(positions, velocities, values, strict=True)
-    return np.array([stepper.momentum(position, v, at, value) for position, v, value in states])
+    return np.array([stepper.initial_momentum(position, v, at, value) for position, v, value in states])
 
 
 def start_of_ensemble(

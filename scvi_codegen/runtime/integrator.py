@@ -28,6 +28,9 @@ from scvi_codegen.runtime.linearised import LinearisedMethod
 
 __all__ = ["Integrator"]
 
+TOLD = 1e-3
+"""Of the largest velocity: how far one may be off that its momentum tells."""
+
 
 class Integrator(LinearisedMethod):
     """What a compiled method computes."""
@@ -134,7 +137,32 @@ class Integrator(LinearisedMethod):
             StateError: if both or none are given.
         """
         name, given = self.momentum_or_velocity(p, velocity)
-        return given if name == "p" else self._transform("momentum", q, given, t, parameters, name)
+        return given if name == "p" else self.initial_momentum(q, given, t, parameters)
+
+    def initial_momentum(self, q: ArrayLike, velocity: ArrayLike, t: float, parameters: Parameters) -> Array:
+        """Return the (m,) momentum of a state that a run starts from.
+
+        Raises:
+            StateError: where the mass matrix is singular along the velocity, so that the momentum does not tell it.
+        """
+        p, v = self._transform("momentum", q, velocity, t, parameters, "velocity"), np.asarray(velocity, dtype=float)
+        dropped = (p == 0.0) & (v != 0.0)
+        if dropped.any():
+            try:
+                back = self.velocity(q, p, t, parameters)
+            except StateError:
+                back = np.full_like(v, np.nan)
+            dropped &= ~(np.abs(back - v) <= TOLD * np.abs(v).max())
+        if not dropped.any():
+            return p
+        i = int(np.flatnonzero(dropped)[0])
+        name = self.coordinates[i]
+        raise StateError(
+            f"the velocity {name}_dot = {v.ravel()[i]:g} at q = {np.asarray(q)} has no momentum: the mass matrix is "
+            f"singular there in the direction of '{name}', which leaves the motion undetermined; start from a state "
+            f"where the kinetic energy depends on {name}_dot, or choose coordinates that are regular there (Cartesian "
+            "ones in place of polar ones at their origin)"
+        )
 
     def momentum_or_velocity(self, p: ArrayLike | None, velocity: ArrayLike | None) -> tuple[str, ArrayLike]:
         """The one of both that is given, with its name.

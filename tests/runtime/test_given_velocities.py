@@ -34,6 +34,36 @@ def test_velocities_stand_for_momenta_with_the_parameters_and_the_time_of_the_ru
     assert np.array_equal(run.record(20).q, one.q)
 
 
+@pytest.mark.parametrize(
+    ("coordinates", "lagrangian", "q", "v", "dropped"),
+    [
+        ("x", "x**2*x_dot**2/2 - x**2", [0.0], [1.0], "x_dot = 1"),
+        ("r th", "(r_dot**2 + r**2*th_dot**2)/2 - r**2", [0.0, 0.3], [0.5, 2.0], "th_dot = 2"),
+        ("x y", "(x_dot - y_dot)**2/2 + y**2*y_dot**2/2", [1.0, 0.0], [1.0, 1.0], "x_dot = 1"),
+    ],
+)
+def test_a_velocity_that_the_mass_matrix_drops_is_refused(coordinates, lagrangian, q, v, dropped):
+    system = LagrangianSystem.from_text(name="singular", coordinates=coordinates.split(), lagrangian=lagrangian)
+    stepper = compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
+    with pytest.raises(
+        StateError, match=f"the velocity {dropped} at .* the mass matrix is singular there .* start from"
+    ):
+        stepper.integrate(q, velocity=v, h=0.1, steps=3)
+    with pytest.raises(StateError, match=f"the velocity {dropped} at "):
+        stepper.integrate_ensemble([q, q], velocity=[np.zeros_like(v), v], h=0.1, steps=3)
+    assert stepper.start(q, velocity=np.zeros_like(v), h=0.1).p.tolist() == [0.0] * len(q)
+    assert stepper.start(np.add(q, 0.25), velocity=v, h=0.1).advance(1) is None
+
+
+def test_a_velocity_whose_momentum_is_zero_is_one_all_the_same():
+    """In a magnetic field p = v - y may be 0."""
+    system = LagrangianSystem.from_text(
+        name="drifting", coordinates=["x", "y"], lagrangian="x_dot**2/2 + y_dot**2/2 - y*x_dot"
+    )
+    run = compile_stepper(system, "svi:2", flags=QUICK_FLAGS).start([0.0, 1.0], velocity=[1.0, 0.0], h=0.1)
+    assert run.p.tolist() == [0.0, 0.0]
+
+
 def test_velocities_of_momenta_that_are_not_linear_are_found_to_round_off():
     """Newton's iteration for L_v = p, where one that ends early is seen only when it ends between two squares."""
     system = LagrangianSystem.from_text(
