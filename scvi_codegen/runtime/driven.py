@@ -197,11 +197,15 @@ def drive(
         progress: called with the steps done.
     """
     pieces: list[Trajectory] = []
-    first = run.steps
+    first, run._crossed = run.steps, (0,) * len(run.stepper.events)
     told = None if progress is None else lambda _: progress(run.steps - first)
     for steps in stretches(run, inputs, t_end, values):
-        pieces.append(with_end(run.record(steps, every=every, progress=told), run))
-        if pieces[-1].ended_by is not None:
+        piece = run.record(steps, every=every, progress=told)
+        run._crossed = tuple(n + len(found) for n, found in zip(run._crossed, piece.events, strict=True))
+        terminal = [int(found.event.terminal) for found in piece.events]
+        ended = any(0 < last <= count for last, count in zip(terminal, run._crossed, strict=True))
+        pieces.append(piece if ended else with_end(piece, run))
+        if ended:
             break
     if run.leaving and pieces:
         warn_of_long_steps(pieces[-1])
@@ -272,7 +276,7 @@ def later(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]
 
 def with_end(piece: Trajectory, run: Run) -> Trajectory:
     """A stretch with the state that it ends at, whatever the number of that."""
-    if piece.t[-1] == run.t or piece.ended_by is not None:
+    if piece.t[-1] == run.t:
         return piece
     iterations, run.iterations = run.iterations, 0
     return replace(

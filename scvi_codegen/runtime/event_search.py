@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,18 +25,22 @@ ROOM = 256
 class CrossingSearch:
     """The crossings of a stepper's events along consecutive parts of one run.
 
+    Args:
+        stepper: with its events.
+        crossed: numbers of crossings of each event before these parts; none by default.
+
     Attributes:
         ended: whether a terminal event was met; ``found[-1]`` is then its crossing.
         found: structured arrays (t, function, q, p), in order of the run.
     """
 
-    def __init__(self, stepper: Integrator) -> None:
+    def __init__(self, stepper: Integrator, crossed: Sequence[int] = ()) -> None:
         self.stepper, self.binding = stepper, stepper.binding
         self.found: list[NDArray[Any]] = []
         self.watch = self.binding.new("watch *")
         for number, event in enumerate(stepper.events):
             self.watch.direction[number] = event.direction
-            self.watch.remaining[number] = int(event.terminal)
+            self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed and event.terminal else 0)
         m = stepper.dimension
         numbers = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
         fields = [*numbers, ("q", float, (m,)), ("p", float, (m,))]

@@ -68,6 +68,7 @@ class Memory(OneThread):
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
         self.goal, self._awaited, self.longest = goal, awaited, 0.0
+        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
 
     @classmethod
     def started(

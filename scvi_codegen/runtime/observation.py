@@ -43,7 +43,7 @@ class Observation:
 
     def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None, end: float | None = None) -> None:
         self.run, self.every, self.times = run, checked_count(every, "every", least=1), times
-        self.search = CrossingSearch(run.stepper) if run.stepper.events else None
+        self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
         self.end, self.arrived = end, False
         self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations = 0
