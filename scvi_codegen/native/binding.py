@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.errors import MethodError
 from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import NEEDED, SolverOptions, checked_options
 
@@ -58,9 +59,14 @@ class Binding:
         return self._borrowing(function, *own) if self._lacks_fallback else partial(function, *own)
 
     def with_function(self, name: str) -> Self:
-        """This one, or that of the fallback where the function is there alone."""
-        if self._fallback is None or self._has(name):
+        """This one, or that of the fallback where the function is there alone; MethodError where it is in neither."""
+        if self._has(name):
             return self
+        if self._fallback is None:
+            raise MethodError(
+                f"the function {name} needs Newton's iteration, which this integrator was compiled without: compile it "
+                "with solver='auto' or solver='newton'"
+            )
         if self._lender is None:
             lender = type(self)(self._fallback(), self._prefix)
             lender._workspace = lender.constant("LENT_WORKSPACE")

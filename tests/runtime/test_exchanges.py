@@ -100,3 +100,10 @@ def test_who_keeps_no_account(thrown):
     stepper = compile_stepper(thrown, RadauIIA(2))
     with pytest.raises(MethodError, match="SVI, SCVI and Gauss"):
         stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
+
+
+def test_without_newtons_iteration_there_is_an_error_and_not_a_missing_function(thrown):
+    stepper = compile_stepper(thrown, SVI(3), solver="fixed-point")
+    run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)
+    with pytest.raises(MethodError, match="exchanges needs Newton's iteration"):
+        run.work()
