@@ -1,0 +1,52 @@
+"""Every quantity, in systems and situations in which nothing is a default: a table, and a property for each column."""
+
+from __future__ import annotations
+
+import pytest
+from matrix_properties import PROPERTIES, SITUATIONS, Case
+from matrix_systems import PROBLEMS
+from tiers import cover
+
+CASES = [
+    (name, Case(problem, method, situation))
+    for problem in PROBLEMS
+    for method in range(len(problem.methods))
+    for situation in SITUATIONS
+    for name, (_, applies) in PROPERTIES.items()
+    if applies(Case(problem, method, situation))
+]
+INDICES = [
+    tuple(
+        (kind, names.index(value))
+        for kind, names, value in (
+            ("property of a kind", [(x, y.kind) for x in PROPERTIES for y in PROBLEMS], (name, case.kind)),
+            ("situation", [*SITUATIONS], case.situation),
+            (
+                "stepper",
+                [(x.name, k) for x in PROBLEMS for k in range(len(x.methods))],
+                (case.problem.name, case.method),
+            ),
+        )
+    )
+    for name, case in CASES
+]
+QUICK = cover(INDICES)
+"""Each property of each kind of run, each situation and each stepper, in few combinations; the full tier has all."""
+
+
+def identity(name: str, case: Case) -> str:
+    method, solver, _ = case.problem.methods[case.method]
+    word = method if isinstance(method, str) else ":".join(map(str, list(method.values())[:2]))
+    return f"{name}-{case.problem.name}-{word}-{solver}-{case.situation}"
+
+
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [
+        pytest.param(name, case, id=identity(name, case), marks=[] if index in QUICK else pytest.mark.full)
+        for (name, case), index in zip(CASES, INDICES, strict=True)
+    ],
+)
+def test_quantities_are_those_of_independent_code(name: str, case: Case) -> None:
+    check, _ = PROPERTIES[name]
+    check(case)

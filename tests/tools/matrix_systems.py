@@ -1,0 +1,456 @@
+"""Systems of the property matrix, in which nothing is a default, and their motion by independent code.
+
+A system is text. The package compiles it; :class:`Truth` reads the same text with SymPy, forms the equations of motion
+in its own way (momenta, mass matrix, multipliers by index reduction) and integrates them with DOP853.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+import sympy
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+import scvi_codegen as sc
+
+__all__ = ["PROBLEMS", "STOP", "Problem", "Truth"]
+
+STOP = "stop"
+"""The parameter after which a force is the root of a negative number; by default far away."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A system as text, a state, and what its table of solvers is.
+
+    Attributes:
+        own: parameters of a run that are no defaults.
+        x: initial velocities, or momenta where a Hamiltonian is given.
+        methods: name and solver, with the error of states that is allowed.
+        event: a function that crosses zero.
+        maps: momentum maps by formula, in the order of the stepper.
+        impulses: momentum maps of L alone, p . xi by the formulas of xi.
+        falls_back: whether fixed-point iterations fail at steps of h, so that Newton's iteration takes their place.
+        work: whether forces act whose work is told.
+    """
+
+    name: str
+    q: tuple[float, ...]
+    x: tuple[float, ...]
+    own: Mapping[str, float]
+    methods: tuple[tuple[Any, str, float], ...]
+    event: str
+    text: Mapping[str, Any]
+    maps: tuple[str, ...] = ()
+    impulses: tuple[tuple[str, ...], ...] = ()
+    work: bool = False
+    h: float = 0.04
+    kind: str = "plain"
+    monitor: str = ""
+    inputs: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    falls_back: bool = False
+    array: Mapping[str, Any] | None = None
+    fields: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def system(self) -> Any:
+        """The system as the package reads it."""
+        if self.array is not None:
+            return sc.IndexedSystem.from_text(name=self.name, **self.array)
+        made = sc.HamiltonianSystem if "hamiltonian" in self.text else sc.LagrangianSystem
+        system = made.from_text(name=self.name, **self.text)
+        return sc.reparametrise(system, self.monitor) if self.kind == "slowed" else system
+
+    @property
+    def coordinates(self) -> list[str]:
+        return list(self.text["coordinates"])
+
+    def values(self, own: bool) -> dict[str, float]:
+        """Parameters by name, of this problem's own or by default."""
+        return {**self.text["parameters"], **(self.own if own else {})}
+
+    def data(self, start: float, end: float) -> dict[str, Any]:
+        """Inputs as tabulated: cubic polynomials of time, which a spline reproduces."""
+        times = np.linspace(min(start, end) - 0.5, max(start, end) + 0.5, 7)
+        return {name: CubicSpline(times, np.polynomial.Polynomial(c)(times)) for name, c in self.inputs.items()}
+
+
+class Truth:
+    """The motion of a problem with given parameters from a state at a time, by SymPy's derivatives and DOP853."""
+
+    def __init__(self, problem: Problem) -> None:
+        text, self.problem = problem.text, problem
+        names = problem.coordinates
+        others = list(text.get("momenta", [f"{name}_dot" for name in names]))
+        t, inputs, parameters = sympy.Symbol("t"), list(problem.inputs), list(text["parameters"])
+        known = {name: sympy.Symbol(name) for name in (*names, *others, *inputs, *parameters)} | {"t": t}
+
+        def read(formula: str | float) -> sympy.Expr:
+            return sympy.sympify(str(formula), locals=known)
+
+        q, x = (sympy.Matrix([known[name] for name in group]) for group in (names, others))
+        f = sympy.Matrix([read(text.get("forces", {}).get(name, 0)) for name in names])
+        damping = read(text.get("damping", 0))
+        arguments = [t, list(q), list(x), [known[name] for name in parameters], [known[name] for name in inputs]]
+
+        def function(expression: Any) -> Callable[..., np.ndarray]:
+            made = sympy.lambdify(arguments, expression, "numpy", cse=True)
+            return lambda *given: np.array(made(*given), dtype=float)
+
+        if "hamiltonian" in text:
+            H = read(text["hamiltonian"])
+            p, v, energy = x, sympy.Matrix([H.diff(y) for y in x]), H
+            rate = (-sympy.Matrix([H.diff(y) for y in q]) + f - damping * x, sympy.zeros(0, 1))
+        else:
+            L = read(text["lagrangian"])
+            p, v = sympy.Matrix([L.diff(y) for y in x]), x
+            energy = p.dot(x) - L
+            force = sympy.Matrix([L.diff(y) for y in q]) + f - damping * p - p.jacobian(q) * x - p.diff(t)
+            g = sympy.Matrix(
+                [read("-".join(f"({side})" for side in c.split("="))) for c in text.get("constraints", ())]
+            )
+            G = g.jacobian(q) if len(g) else sympy.zeros(0, len(q))
+            turning = (G * x + g.diff(t)) if len(g) else sympy.zeros(0, 1)
+            bent = turning.jacobian(q) * x + turning.diff(t) if len(g) else sympy.zeros(0, 1)
+            block = sympy.Matrix(sympy.BlockMatrix([[p.jacobian(x), -G.T], [G, sympy.zeros(len(g))]]))
+            self._block, self._right = function(block), function(sympy.Matrix([*force, *(-bent)]))
+            rate = None
+        self._rate = function(rate[0]) if rate else None
+        self._p, self._v, self._energy, self._f = map(function, (p, v, energy, f))
+        self._maps = [function(read(each)) for each in problem.maps]
+        self._event = function(read(problem.event))
+        self.directions = function(
+            sympy.Matrix([[read(each) for each in xi] for xi in problem.impulses] or [[0] * len(names)])
+        )
+        self.m = len(names)
+
+    def _inputs(self, t: float) -> list[float]:
+        return [float(np.polynomial.Polynomial(c)(t)) for c in self.problem.inputs.values()]
+
+    def rates(self, t: float, q: Any, x: Any, values: list[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Velocities, the rates of x, and multipliers."""
+        given = (t, q, x, values, self._inputs(t))
+        if self._rate is not None:
+            return self._v(*given).ravel(), self._rate(*given).ravel(), np.empty(0)
+        solved = np.linalg.solve(self._block(*given), self._right(*given).ravel())
+        return np.asarray(x), solved[: self.m], solved[self.m :]
+
+    def motion(self, start: float, end: float, q: Any, x: Any, parameters: Mapping[str, float]) -> Motion:
+        """From (q, x) at start to end."""
+        return Motion(self, start, end, tuple(q), tuple(x), tuple(parameters.values()))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion of a :class:`Truth`: functions of time."""
+
+    truth: Truth
+    start: float
+    end: float
+    q0: tuple[float, ...]
+    x0: tuple[float, ...]
+    values: tuple[float, ...]
+
+    @cached_property
+    def _solution(self) -> Callable[[Any], np.ndarray]:
+        truth, m, count = self.truth, self.truth.m, len(self.truth.problem.impulses)
+
+        def rates(t: float, y: np.ndarray) -> np.ndarray:
+            q, x = y[:m], y[m : 2 * m]
+            v, a, _ = truth.rates(t, q, x, list(self.values))
+            f = truth._f(t, q, x, list(self.values), truth._inputs(t)).ravel()
+            xi = truth.directions(t, q, x, list(self.values), truth._inputs(t))[:count]
+            return np.array([*v, *a, f @ v, *(xi @ f)])
+
+        begin = [*self.q0, *self.x0, *np.zeros(1 + count)]
+        found = solve_ivp(
+            rates, (self.start, self.end), begin, method="DOP853", rtol=3e-13, atol=1e-13, dense_output=True
+        )
+        assert found.success, found.message
+        return found.sol
+
+    def _each(self, function: Callable[..., np.ndarray], t: Any) -> np.ndarray:
+        return np.array([function(s, *self._state(s), list(self.values), self.truth._inputs(s)) for s in np.ravel(t)])
+
+    def _state(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        return tuple(np.split(self._solution(t)[: 2 * self.truth.m], 2))
+
+    def q(self, t: Any) -> np.ndarray:
+        return np.array([self._state(s)[0] for s in np.ravel(t)])
+
+    def p(self, t: Any) -> np.ndarray:
+        return self._each(self.truth._p, t).reshape(-1, self.truth.m)
+
+    def v(self, t: Any) -> np.ndarray:
+        return self._each(self.truth._v, t).reshape(-1, self.truth.m)
+
+    def x(self, t: Any) -> np.ndarray:
+        return np.array([self._state(s)[1] for s in np.ravel(t)])
+
+    def energy(self, t: Any) -> np.ndarray:
+        return self._each(self.truth._energy, t).ravel()
+
+    def event(self, t: Any) -> np.ndarray:
+        return self._each(self.truth._event, t).ravel()
+
+    def maps(self, t: Any) -> np.ndarray:
+        return np.array([self._each(each, t).ravel() for each in self.truth._maps]).reshape(-1, np.size(t)).T
+
+    def exchanged(self, t: Any) -> np.ndarray:
+        """(n, 1 + k) the work of the forces, and their impulses."""
+        return np.array([self._solution(s)[2 * self.truth.m :] for s in np.ravel(t)])
+
+    def multipliers(self, t: Any) -> np.ndarray:
+        return np.array([self.truth.rates(s, *self._state(s), list(self.values))[2] for s in np.ravel(t)])
+
+
+@cache
+def truth_of(problem: Problem) -> Truth:
+    return Truth(problem)
+
+
+def _chain(count: int) -> tuple[str, dict[str, str]]:
+    """L and the forces of a chain with masses m0, m1, .. written out."""
+    kinetic = "+".join(f"m{i}*q{i}_dot**2/2" for i in range(count))
+    springs = "+".join(f"k*(q{i + 1}-q{i})**2/2 + b*(q{i + 1}-q{i})**4/4" for i in range(count - 1))
+    own = "+".join(f"(1 + a*cos(t))*q{i}**2/2" for i in range(count))
+    forces = {f"q{i}": f"-c*q{i}_dot*m{i} + sin(2*t)/3 + e*sqrt({STOP} - t)" for i in range(count)}
+    return f"{kinetic} - ({springs}) - ({own})", forces
+
+
+CHAIN = 4
+CHAIN_L, CHAIN_FORCES = _chain(CHAIN)
+CHAIN_VALUES = {"k": 1.0, "b": 0.1, "a": 0.2, "c": 0.1, "e": 0.01, STOP: 100.0}
+MASSES, OTHER_MASSES = (1.0, 1.0, 1.0, 1.0), (1.3, 0.7, 2.1, 0.9)
+HIGH, LOW = 3e-8, 3e-3
+
+PROBLEMS: tuple[Problem, ...] = (
+    Problem(
+        name="pair",
+        q=(0.3, -0.4),
+        x=(0.5, -0.2),
+        own={"m": 1.7, "n": 0.6, "k": 2.3, "l": 0.8, "c": 0.4, "e": 0.05, "d": 0.3},
+        methods=(("svi:4", "fixed-point", HIGH), ("svi:3", "newton", HIGH), ("gauss:4", "auto", HIGH)),
+        event="x - y - l - t/50",
+        text={
+            "coordinates": ["x", "y"],
+            "lagrangian": "m*x_dot**2/2 + n*y_dot**2/2 + d*x_dot*y_dot - k*(x - y - l)**2/2 - (x - y)**4/4",
+            "parameters": {"m": 1.0, "n": 1.0, "k": 1.0, "l": 0.5, "c": 0.1, "e": 0.02, "d": 0.1, STOP: 100.0},
+            "forces": {"x": f"-c*x_dot + sin(2*t) + e*sqrt({STOP} - t)", "y": "-c*x**2*y_dot + cos(t)/3"},
+        },
+        impulses=(("1", "1"),),
+        work=True,
+    ),
+    Problem(
+        name="cart",
+        q=(0.2, 0.9),
+        x=(0.4, -0.7),
+        own={"M": 2.7, "m": 0.6, "l": 1.1, "a": 0.35, "w": 1.2, "c": 0.3},
+        methods=(("svi:4", "fixed-point", HIGH), ("scvi:5", "newton", HIGH), ("sc:7", "auto", HIGH)),
+        event="th - x*m - 0.3",
+        text={
+            "coordinates": ["x", "th"],
+            "lagrangian": """M*x_dot**2/2 - k*x**2/2 + m*g*l*(1 + a*sin(w*t))*cos(th)
+                + m*(x_dot + l*a*w*cos(w*t)*sin(th) + l*(1 + a*sin(w*t))*cos(th)*th_dot)**2/2
+                + m*(l*(1 + a*sin(w*t))*sin(th)*th_dot - l*a*w*cos(w*t)*cos(th))**2/2""",
+            "parameters": {"M": 2.0, "m": 1.0, "l": 0.8, "g": 3.0, "a": 0.2, "w": 1.7, "k": 0.5, "c": 0.1},
+            "forces": {"x": "-c*x_dot + sin(3*t)/2", "th": "-c*th_dot*x**2"},
+        },
+        work=True,
+    ),
+    Problem(
+        name="springs",
+        q=(0.7, -0.3),
+        x=(0.2, 0.6),
+        own={"m": 1.7, "n": 0.6, "k": 2.3, "a": 0.4, "w": 1.2, "e": 0.3},
+        methods=(
+            ({"method": "composition", "order": 8}, "auto", HIGH),
+            ("stoermer-verlet", "explicit", LOW),
+            ("stoermer-verlet", "newton", LOW),
+            ("svi:4", "auto", HIGH),
+        ),
+        event="x_dot + k*y/9",
+        text={
+            "coordinates": ["x", "y"],
+            "lagrangian": f"""m*x_dot**2/2 + n*y_dot**2/2 - k*(1 + a*cos(w*t))*x**2/2 - x**2*y**2 - y**4/4 + y*sin(t)
+                + e*x*sqrt({STOP} - t)""",
+            "parameters": {"m": 1.0, "n": 1.0, "k": 1.0, "a": 0.2, "w": 1.7, "e": 0.02, STOP: 100.0},
+        },
+        h=0.03,
+    ),
+    Problem(
+        name="stiff",
+        q=(0.7, -0.3),
+        x=(0.2, 0.6),
+        own={"m": 1.7, "n": 0.6, "k": 1900.0, "a": 0.3, "c": 0.2, "e": 0.1},
+        methods=(("svi:8", "auto", 1e-6), ("gauss:8", "auto", 1e-6)),
+        event="y - x/2 - t/90",
+        text={
+            "coordinates": ["x", "y"],
+            "lagrangian": "m*x_dot**2/2 + n*y_dot**2/2 - k*(1 + a*cos(t))*x**2/2 - (x - y)**2 - y**4/4",
+            "parameters": {"m": 1.0, "n": 1.0, "k": 1600.0, "a": 0.2, "c": 0.1, "e": 0.02, STOP: 100.0},
+            "forces": {"x": "-c*x_dot", "y": f"sin(2*t) - c*y_dot*x**2 + e*sqrt({STOP} - t)"},
+        },
+        work=True,
+        h=0.1,
+        falls_back=True,
+    ),
+    Problem(
+        name="damped",
+        q=(0.6, 0.2),
+        x=(-0.3, 0.5),
+        own={"m": 1.4, "c": 0.7, "r": 0.9},
+        methods=(("svi:4", "fixed-point", HIGH), ("gauss:4", "newton", HIGH)),
+        event="x - z/m",
+        text={
+            "coordinates": ["x", "z"],
+            "lagrangian": "m*x_dot**2/2 + x_dot*z_dot*cos(z) + z_dot**2 - (1 + cos(t)/3)*x**2 + cos(z)",
+            "parameters": {"m": 2.0, "c": 0.4, "r": 0.7},
+            "damping": "c*r",
+        },
+    ),
+    Problem(
+        name="swing",
+        q=(0.6, -0.2),
+        x=(-0.3, 0.4),
+        own={"l": 1.1, "a": 0.35, "w": 1.2, "c": 0.3, "g": 2.3},
+        methods=(("gauss:4", "fixed-point", HIGH), ("sc:7", "newton", HIGH)),
+        event="q - s*l/5",
+        text={
+            "coordinates": ["q", "s"],
+            "momenta": ["p", "r"],
+            "hamiltonian": """p**2/(2*l**2*(1 + a*sin(w*t))**2) - g*l*(1 + a*sin(w*t))*cos(q) + (r - a*q)**2/(2*l)
+                + g*s**2*(1 + q**2)""",
+            "parameters": {"l": 0.8, "g": 3.0, "a": 0.2, "w": 1.7, "c": 0.1},
+            "forces": {"q": "-c*p + cos(t)", "s": "-c*r*l"},
+        },
+        work=True,
+    ),
+    Problem(
+        name="slowed",
+        q=(0.8, 0.1),
+        x=(0.1, 1.2),
+        own={"m": 1.6, "u": 1.3},
+        methods=(("svi:5", "auto", HIGH), ("gauss:5", "newton", HIGH)),
+        event="x - y*m/3",
+        text={
+            "coordinates": ["x", "y"],
+            "lagrangian": "m*(x_dot**2 + y_dot**2)/2 + m*u/sqrt(x**2 + y**2)",
+            "parameters": {"m": 1.0, "u": 1.0},
+        },
+        maps=("m*(x*y_dot - y*x_dot)",),
+        kind="slowed",
+        monitor="sqrt(x**2 + y**2)",
+    ),
+    Problem(
+        name="monitored",
+        q=(0.8, 0.1),
+        x=(0.1, 1.1),
+        own={"m": 1.6, "u": 1.3, "c": 0.1, "a": 0.2},
+        methods=(("svi:5", "auto", HIGH), ("gauss:5", "newton", HIGH)),
+        event="x - y*m/3",
+        text={
+            "coordinates": ["x", "y"],
+            "lagrangian": "m*(x_dot**2 + y_dot**2)/2 + m*u*(1 + a*sin(t))/sqrt(x**2 + y**2)",
+            "parameters": {"m": 1.0, "u": 1.0, "c": 0.02, "a": 0.1},
+            "forces": {"x": "-c*x_dot", "y": "-c*m*y_dot"},
+        },
+        impulses=(("-y", "x"),),
+        work=True,
+        kind="monitored",
+        monitor="distance",
+    ),
+    Problem(
+        name="rods",
+        q=(0.6, -0.8, 1.4, -1.4),
+        x=(0.4, 0.3, 0.7, 0.7),
+        own={"m": 1.3, "g": 2.1, "c": 0.3},
+        methods=(
+            ({"method": "svi", "degree": 1, "quadrature": "gauss-lobatto:2"}, "auto", 2e-2),
+            ("svi:5", "auto", 1e-7),
+        ),
+        event="x1 - x2/3 - g/30",
+        text={
+            "coordinates": ["x1", "y1", "x2", "y2"],
+            "lagrangian": "m*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - g*(m*y1 + y2) - x1*cos(t)/2",
+            "parameters": {"m": 2.0, "g": 3.0, "c": 0.1},
+            "constraints": ["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+            "forces": {"x2": "sin(2*t)*c"},
+        },
+        h=0.02,
+    ),
+    Problem(
+        name="pushed",
+        q=(0.6, -0.1),
+        x=(-0.3, 0.2),
+        own={"c": 0.5, "m": 1.6},
+        methods=(("svi:4", "fixed-point", HIGH), ("gauss:4", "newton", HIGH)),
+        event="q - s*m/4",
+        text={
+            "coordinates": ["q", "s"],
+            "lagrangian": "m*q_dot**2/2 + s_dot**2/2 + (1 + w)*cos(q) - (s - q)**2",
+            "parameters": {"c": 0.2, "m": 1.0},
+            "forces": {"q": "u - c*q_dot", "s": "-c*w*s_dot"},
+            "inputs": ["u", "w"],
+        },
+        inputs={"u": (0.3, 0.2, -0.1, 0.02), "w": (0.1, -0.3, 0.1, 0.01)},
+        work=True,
+        kind="driven",
+    ),
+    Problem(
+        name="array",
+        q=(0.3, -0.2, 0.5, 0.1),
+        x=(0.1, 0.4, -0.3, 0.2),
+        own={"k": 1.6, "b": 0.3, "a": 0.5, "c": 0.2, "e": 0.05, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES)}},
+        methods=(("svi:4", "fixed-point", HIGH), ("gauss:4", "fixed-point", HIGH)),
+        event="q0 - q2*k/4",
+        text={
+            "coordinates": [f"q{i}" for i in range(CHAIN)],
+            "lagrangian": CHAIN_L,
+            "parameters": {**CHAIN_VALUES, **{f"m{i}": x for i, x in enumerate(MASSES)}},
+            "forces": CHAIN_FORCES,
+        },
+        array={
+            "coordinates": ["q[N]"],
+            "parameters": {**CHAIN_VALUES, "m[N]": 1.0},
+            "lagrangian": """sum(i in N, m[i]*q_dot[i]**2/2 - (1 + a*cos(t))*q[i]**2/2)
+                - sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2 + b*(q[i+1] - q[i])**4/4)""",
+            "forces": {"q[i]": f"-c*q_dot[i]*m[i] + sin(2*t)/3 + e*sqrt({STOP} - t)"},
+        },
+        fields={"m": OTHER_MASSES},
+        kind="array",
+    ),
+    Problem(
+        name="array without friction",
+        q=(0.3, -0.2, 0.5),
+        x=(0.1, 0.4, -0.3),
+        own={"k": 1.6, "a": 0.5, "e": 0.3, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES[:3])}},
+        methods=(
+            ({"method": "composition", "order": 8}, "fixed-point", HIGH),
+            ("stoermer-verlet", "fixed-point", LOW),
+            ("svi:4", "newton", HIGH),
+        ),
+        event="q0 - q2*k/4",
+        text={
+            "coordinates": ["q0", "q1", "q2"],
+            "lagrangian": "+".join(f"m{i}*q{i}_dot**2/2 - (1 + a*cos(t))*q{i}**2/2" for i in range(3))
+            + "".join(f" - k*(q{i + 1} - q{i})**2/2 - (q{i + 1} - q{i})**4/4" for i in range(2)),
+            "parameters": {"k": 1.0, "a": 0.2, "e": 0.1, "m0": 1.0, "m1": 1.0, "m2": 1.0},
+            "forces": {f"q{i}": f"e*sin(2*t - q{i})" for i in range(3)},
+        },
+        array={
+            "coordinates": ["q[N]"],
+            "parameters": {"k": 1.0, "a": 0.2, "e": 0.1, "m[N]": 1.0},
+            "forces": {"q[i]": "e*sin(2*t - q[i])"},
+            "lagrangian": """sum(i in N, m[i]*q_dot[i]**2/2 - (1 + a*cos(t))*q[i]**2/2)
+                - sum(i in 0..N-2, k*(q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)""",
+        },
+        fields={"m": OTHER_MASSES[:3]},
+        kind="array",
+        h=0.03,
+    ),
+)
