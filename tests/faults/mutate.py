@@ -3,9 +3,11 @@
     python tests/faults/mutate.py --count 150 --seed 1 --results results.jsonl
 
 A fault is put into a copy of the checkout, in a folder of its own. ``verify`` is asked first, of systems by methods
-whose code the faulty file is part of, then the test files nearest to the file; the first that notices ends it. Faults
-that do not compile or import are not counted. The results, a line a fault, say where to go on: those that stand there
-are not tried again.
+whose code the faulty file is part of, then the test files nearest to the file, one after the other; the first that
+notices ends it. Faults that do not compile or import are not counted. A fault on which more than ``--seconds`` of
+processor time were spent without a notice counts as one that survives, and its line says so. The results, a line a
+fault, say where to go on: those that stand there are not tried again, survivors are with ``--again``. The faults that
+were drawn stand in ``results.plan``, each with the text around it, so that they are found again in files that changed.
 """
 
 from __future__ import annotations
@@ -14,17 +16,23 @@ import argparse
 import json
 import random
 import re
+import resource
 import shutil
 import sys
 import tempfile
 from collections import Counter
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from checkout import ROOT, copied, run
 from near import near
 from operators import Place, places
 
-PACKAGE = ("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables")
+PACKAGE = (
+    *("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables"),
+    *("advice", "cli", "derivation", "exact", "models", "results"),
+)
+"""Rooms of which Python is drawn; the others draw pictures, measure, or need programs that CI may not have."""
 DERIVING = ("ir", "lowering", "rendering", "methods", "mechanics", "formulas", "tables")
 """What all cases come from; of the others one shows as much."""
 NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
@@ -47,7 +55,11 @@ PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *OF_C
 UNSTYLED = "def check_style(text: str) -> None:\n    pass\n"
 """In the place of tests/tools/style.py: how a fault is set is no notice of it."""
 NOTHING_RUN = 4
-"""Status of pytest where a name was cut."""
+"""Status of pytest where a name was cut; one more where a file has no test of the default tier."""
+AROUND = 60
+"""Characters before and after a fault by which it is found again."""
+MOST_UNFIT = 20
+"""Tests of a file that may fail without a fault."""
 MOST_WORDS = 300
 """Of a result: characters of what noticed the fault."""
 
@@ -65,8 +77,32 @@ def drawn(count: int, seed: int, only: str) -> list[Place]:
     return [place for pair in zip(*chosen, strict=False) for place in pair] if all(chosen) else chosen[0] or chosen[1]
 
 
-def noticed(copy: Path, place: Place, unfit: list[str]) -> tuple[str, str]:
+def planned(plan: Path, count: int, seed: int, only: str) -> list[tuple[str, Place]]:
+    """The faults of a plan with their names when drawn; where there is no plan, it is drawn first."""
+    if not plan.exists():
+        made = []
+        for place in drawn(count, seed, only):
+            text = (ROOT / place.path).read_text()
+            around = text[max(0, place.start - AROUND) : place.start], text[place.end : place.end + AROUND]
+            made.append({"fault": place.name(text), "around": around, "place": asdict(place)})
+        plan.write_text("".join(json.dumps(entry) + "\n" for entry in made))
+    found = []
+    for entry in map(json.loads, plan.read_text().splitlines()):
+        place, (before, after) = Place(**entry["place"]), entry["around"]
+        path = ROOT / place.path
+        text = path.read_text() if path.exists() else ""
+        starts = [hit.start() + len(before) for hit in re.finditer(re.escape(before + place.old + after), text)]
+        if starts:
+            start = min(starts, key=lambda other: abs(other - place.start))
+            found.append((entry["fault"], replace(place, start=start, end=start + len(place.old))))
+        else:
+            print(f"{'text is gone':30} {entry['fault']}")
+    return found
+
+
+def noticed(copy: Path, place: Place, unfit: list[str], seconds: float) -> tuple[str, str]:
     """What noticed a fault, and in which words; ``""`` if nothing did. Tests that fail without it join the unfit."""
+    end = _spent() + seconds
     path = copy / place.path
     text = path.read_text()
     cases = [case for case in CERTIFIED if certifies(copy, case, place.path)][:MOST_CASES]
@@ -75,18 +111,30 @@ def noticed(copy: Path, place: Place, unfit: list[str]) -> tuple[str, str]:
         code, words = run(copy, sys.executable, "tests/faults/certify.py", *cases) if cases else (0, "")
         if code:
             return "stillborn" if code == 3 else "certificate", words
-        while True:
-            code, words = run(copy, *PYTEST, *(f"--deselect={test}" for test in unfit), *near(place.path))
+        tests, failing = near(place.path), 0
+        while tests and _spent() < end:
+            code, words = run(copy, *PYTEST, *(f"--deselect={test}" for test in unfit), tests[0])
             test = _failed(words)
+            if code and not test and code != NOTHING_RUN + 1:
+                return "tests", words
             if not (code and test):
-                return ("tests", words) if code else ("", "")
+                tests, failing = tests[1:], 0
+                continue
             path.write_text(text)
-            if run(copy, *PYTEST, test)[0] in (0, NOTHING_RUN):
+            if failing < MOST_UNFIT and run(copy, *PYTEST, test)[0] in (0, NOTHING_RUN):
                 return test.partition("::")[0], words
             unfit.append(test)
+            failing += 1
             path.write_text(place.applied(text))
+        return "", f"not tried for want of time: {' '.join(tests)}" if tests else ""
     finally:
         path.write_text(text)
+
+
+def _spent() -> float:
+    """Seconds of processor time of all that was run."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _failed(words: str) -> str:
@@ -119,6 +167,8 @@ def main() -> None:
     options.add_argument("--count", type=int, default=150)
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--only", default="", help="beginning of the paths of files")
+    options.add_argument("--seconds", type=float, default=600.0, help="of processor time for a fault")
+    options.add_argument("--again", action="store_true", help="try once more what survived")
     options.add_argument("--results", type=Path, required=True)
     given = options.parse_args()
     lines = given.results.read_text().splitlines() if given.results.exists() else []
@@ -126,12 +176,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         copy, unfit = copied(Path(folder)), list[str]()
         (copy / "tests/tools/style.py").write_text(UNSTYLED)
-        for place in drawn(given.count, given.seed, given.only):
-            text = (ROOT / place.path).read_text()
-            fault = place.name(text)
-            if fault in known:
+        plan = given.results.with_suffix(".plan")
+        for fault, place in planned(plan, given.count, given.seed, given.only):
+            if fault in known and (known[fault] or not given.again):
                 continue
-            by, words = noticed(copy, place, unfit)
+            by, words = noticed(copy, place, unfit, given.seconds)
             known[fault] = by
             with given.results.open("a") as results:
                 results.write(json.dumps({"fault": fault, "caught by": by, "words": words[:MOST_WORDS]}) + "\n")

@@ -34,7 +34,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     },
     "scvi_codegen/lowering/swept": ("runtime/test_swept_derivatives.py",),
     "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
-    "templates/support/flow": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
+    "templates/support/flow": ("promises/test_matrix.py", "frameworks/test_casadi.py", "rendering/test_flow_text.py"),
     "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
     "templates/support/xla": ("frameworks/test_jax.py", "rendering/test_flow_text.py"),
     "templates/support/float": ("rendering/test_c_text.py",),
@@ -131,6 +131,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "lowering/test_collocation_solver.py",
         "runtime/test_stepper.py",
         "runtime/test_drift.py",
+        "promises/test_matrix.py",
     ),
     "scvi_codegen/ir": ("lowering/test_lowering.py", "lowering/test_rounding.py", "rendering/test_generated.py"),
     "scvi_codegen/lowering": ("lowering", "rendering/test_generated.py"),
@@ -150,6 +151,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_controlled_steps.py",
         "runtime/test_clock.py",
         "runtime/test_distributed.py",
+        "promises/test_matrix.py",
     ),
     "scvi_codegen/runtime/indexed": (
         "runtime/test_indexed.py",
@@ -190,6 +192,12 @@ NEAR: dict[str, tuple[str, ...]] = {
         "mechanics/test_system.py",
     ),
     "scvi_codegen/tables": ("tables",),
+    "scvi_codegen/advice": ("advice", "cli/test_json.py", "cli/test_cli.py"),
+    "scvi_codegen/cli": ("cli", "promises/test_first_mistakes.py"),
+    "scvi_codegen/derivation": ("derivation",),
+    "scvi_codegen/exact": ("exact", "verification/test_certificate.py"),
+    "scvi_codegen/models": ("models", "cli/test_cli.py", "promises/test_versions.py"),
+    "scvi_codegen/results": ("results", "cli/test_json.py"),
 }
 """By the beginning of paths; the longest that fits counts."""
 
