@@ -10,6 +10,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import Flow
+from scvi_codegen.given.kinds import takes
 
 __all__ = ["ArrayFlow", "Arrays"]
 
@@ -39,6 +40,7 @@ class ArrayFlow(Flow):
     def _along(self, x: Any) -> Any:
         """(.., kept, 2m) states of the flows from (.., given) numbers each."""
 
+    @takes(StateError)
     def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
         """States at the end, or where every so-many-th is kept, at these.
 

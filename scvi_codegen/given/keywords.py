@@ -20,6 +20,8 @@ ELSEWHERE: Final = {
     "h": "steps of h are taken by a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",
     "parameters": "their values go to the run, .integrate(..., parameters={...}), their names to the system",
     "velocity": "it takes momenta, p = stepper.momentum(q, velocity)",
+    "t_end": "adaptive steps belong to .integrate(..., t_end=...); a fixed number of steps takes steps of h: "
+    "h = (t_end - t) / steps",
     "degree": "it goes with the name of the method, 'svi:8', or with its class, SVI(8)",
     "solver": "it is chosen where a stepper is compiled: compile_stepper(system, method, solver=...)",
     "method": "the method is said where it is compiled: compile_stepper(system, method)",

@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pumped_leapfrog as pumped
 import pytest
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
@@ -171,3 +172,15 @@ def test_what_there_is_not_is_refused():
     given = symbols(flow)
     with pytest.raises(RuntimeError, match="Derivatives cannot be calculated"):
         ca.hessian(flow(*given)[0][0], given[0])[0]
+
+
+def test_time_and_parameters_of_a_flow_of_several_pieces():
+    flow = casadi_flow(pumped.stepper(), steps=pumped.STEPS, every=pumped.EVERY)
+    given = symbols(flow)
+    values = ca.vec(ca.vertcat(*flow(*given)))
+    jacobian = ca.Function("J", given, [ca.jacobian(values, ca.vertcat(*given))])
+    for row in pumped.ROWS:
+        at = (row[:2], row[2:4], row[4:8], row[8], row[9])
+        found = np.vstack([each.full() for each in flow(*at)])
+        assert_allclose(found.T, pumped.states(row), rtol=0, atol=2e-12)
+        assert_allclose(jacobian(*at).full(), pumped.slopes(row).reshape(-1, 10), rtol=1e-11, atol=1e-11)

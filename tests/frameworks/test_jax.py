@@ -7,12 +7,14 @@ import sys
 from functools import cache, partial
 
 import numpy as np
+import pumped_leapfrog as pumped
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from samples import QUICK_FLAGS
 
 from scvi_codegen import (
     SVI,
+    ArgumentError,
     LagrangianSystem,
     MethodError,
     StateError,
@@ -261,3 +263,22 @@ except sc.StateError as error:
 def test_without_binary64_it_says_how_to_have_it():
     result = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=True)
     assert "jax.config.update('jax_enable_x64', True)" in result.stdout
+
+
+def test_time_and_parameters_of_a_flow_of_several_pieces():
+    flow = jax_flow(pumped.stepper(), steps=pumped.STEPS, every=pumped.EVERY)
+
+    def along(x):
+        q, p = flow(x[:2], x[2:4], h=x[9], t=x[8], parameters=x[4:8])
+        return jnp.concatenate([q, p], axis=-1)
+
+    for row in pumped.ROWS:
+        assert_allclose(along(jnp.array(row)), pumped.states(row), rtol=0, atol=2e-12)
+        for derivative in (jax.jacfwd, jax.jacrev):
+            assert_allclose(derivative(along)(jnp.array(row)), pumped.slopes(row), rtol=1e-11, atol=1e-11)
+    with pytest.raises(ArgumentError, match=r"no 't_end'.*steps of h: h = \(t_end - t\) / steps"):
+        flow(pumped.ROWS[0][:2], pumped.ROWS[0][2:4], t_end=3.0)
+    with pytest.raises(ArgumentError, match=r"no 'velocity': it takes momenta, p = stepper.momentum"):
+        flow(pumped.ROWS[0][:2], velocity=pumped.ROWS[0][2:4], h=0.1)
+    with pytest.raises(ArgumentError, match=r"no 't_end'.*steps of h"):
+        jax_flow(pumped.stepper(), t_end=3.0)

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import pumped_leapfrog as pumped
 import pytest
 from numpy.testing import assert_allclose
 from samples import QUICK_FLAGS
@@ -126,3 +127,15 @@ def test_what_there_is_not_is_refused():
         flow(torch.ones(3, 2, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64), h=0.05)
     with pytest.raises(StepFailedError):
         flow(numbers([0.0, 0.0]), p, h=0.05)
+
+
+def test_time_and_parameters_of_a_flow_of_several_pieces():
+    flow = torch_flow(pumped.stepper(), steps=pumped.STEPS, every=pumped.EVERY)
+
+    def along(x):
+        return torch.cat(flow(x[:2], x[2:4], h=x[9], t=x[8], parameters=x[4:8]), dim=-1)
+
+    for row in pumped.ROWS:
+        assert_allclose(along(numbers(row)), pumped.states(row), rtol=0, atol=2e-12)
+        for derivative in (torch.func.jacfwd, torch.func.jacrev):
+            assert_allclose(derivative(along)(numbers(row)), pumped.slopes(row), rtol=1e-11, atol=1e-11)

@@ -1,0 +1,143 @@
+"""The C entry points of flows, called as frameworks call them, without these: the time, parameters and pieces of steps.
+
+The system depends on time, t and the parameters differ from their defaults, and the steps fill several pieces.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.testing import assert_allclose
+from pumped_leapfrog import EVERY, GIVEN, ROWS, STEPS, hessian, slopes, states, stepper, weights
+
+from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
+from scvi_codegen.native import building
+from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow, with_xla_flow
+
+KEPT, SIZE = STEPS // EVERY + 1, len(GIVEN)
+compiled = cache(stepper)
+WAYS = {"rtol": 0, "atol": 2e-12}
+
+
+@cache
+def flow():
+    return FlowOfRows.checked(compiled(), STEPS, EVERY)
+
+
+def called(binding, name, head, arrays, shape):
+    """Call a function whose arguments are numbers, arrays, what is found and a report."""
+    found, pointers = np.zeros(shape), [binding.pointer(np.ascontiguousarray(array, dtype=float)) for array in arrays]
+    status = binding.function(name)(*head, *pointers, binding.pointer(found), binding.new("report *"))
+    assert status == 0
+    return found
+
+
+def test_values_of_rows():
+    found = called(flow().library, "flow_rows", (0, STEPS, EVERY, 0, 2), [ROWS, ROWS], (2, KEPT, 4))
+    assert_allclose(found, [states(row) for row in ROWS], **WAYS)
+
+
+def test_derivatives_of_rows_forward_and_back():
+    changes = np.tile(np.eye(SIZE), (2, 1, 1))
+    exact = np.array([slopes(row) for row in ROWS])
+    pushed = called(flow().library, "flow_rows", (1, STEPS, EVERY, SIZE, 2), [ROWS, changes], (2, SIZE, KEPT, 4))
+    assert_allclose(pushed, np.moveaxis(exact, -1, 1), rtol=1e-11, atol=1e-11)
+    one = np.tile(weights(), (2, 1, 1, 1))
+    pulled = called(flow().library, "flow_rows", (2, STEPS, EVERY, 1, 2), [ROWS, one], (2, 1, SIZE))
+    assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)
+
+
+def test_second_derivatives_of_rows():
+    same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
+    found = called(flow().second_library, "bend_rows", (STEPS, EVERY, SIZE, 2), [ROWS, same, changes], (2, SIZE, SIZE))
+    exact = np.array([hessian(row) for row in ROWS])
+    assert_allclose(found, exact, rtol=0, atol=1e-7 * abs(exact).max())
+
+
+def test_external_functions_of_casadi():
+    source, name = with_casadi_flow(compiled().derivatives, STEPS, EVERY), casadi_name(compiled().source.prefix)
+    arguments = "(const double **arg, double **res, long long *iw, double *w, int mem);\n"
+    shapes = f"const long long *{name}_sparsity_out(long long i);\n"
+    functions = "".join(f"int {prefix}{name}{arguments}" for prefix in ("", "jac_", "adj1_"))
+    source = replace(source, declarations=source.declarations + functions + shapes)
+    lib, ffi, _ = building.load(source, flags=compiled().flags)
+    assert list(ffi.unpack(getattr(lib, f"{name}_sparsity_out")(0), 3)) == [4, KEPT, 1]
+
+    def external(prefix, arrays, shape):
+        found, kept = np.zeros(shape), [np.ascontiguousarray(array, dtype=float) for array in arrays]
+        given = [ffi.cast("double *", array.ctypes.data) for array in kept]
+        result = ffi.new("double *[]", [ffi.cast("double *", found.ctypes.data)])
+        function = getattr(lib, prefix + name)
+        assert function(ffi.new("const double *[]", given), result, ffi.NULL, ffi.NULL, 0) == 0
+        return found
+
+    for row in ROWS:
+        assert_allclose(external("", [row], (KEPT, 4)), states(row), **WAYS)
+        columns = external("jac_", [row, row], (SIZE, KEPT, 4))
+        assert_allclose(np.moveaxis(columns, 0, -1), slopes(row), rtol=1e-11, atol=1e-11)
+        pulled = external("adj1_", [row, row, weights()], (SIZE,))
+        assert_allclose(pulled, np.tensordot(weights(), slopes(row), 2), rtol=1e-11, atol=1e-11)
+
+
+XLA = """
+#include <stddef.h>
+#include <stdint.h>
+#define XLA_FFI_API_MAJOR 0
+#define XLA_FFI_API_MINOR 1
+#define XLA_FFI_Error_Create_Args_STRUCT_SIZE sizeof(XLA_FFI_Error_Create_Args)
+enum { XLA_FFI_Extension_Metadata = 1, XLA_FFI_Error_Code_ABORTED = 10 };
+typedef struct XLA_FFI_Error { char text[200]; } XLA_FFI_Error;
+typedef struct { size_t size; void *next; const char *message; int errc; } XLA_FFI_Error_Create_Args;
+typedef struct { XLA_FFI_Error *(*XLA_FFI_Error_Create)(XLA_FFI_Error_Create_Args *); } XLA_FFI_Api;
+typedef struct XLA_FFI_Extension_Base { int type; struct XLA_FFI_Extension_Base *next; } XLA_FFI_Extension_Base;
+typedef struct { int major_version, minor_version; } XLA_FFI_Api_Version;
+typedef struct { XLA_FFI_Api_Version api_version; int traits; } XLA_FFI_Metadata;
+typedef struct { XLA_FFI_Extension_Base base; XLA_FFI_Metadata *metadata; } XLA_FFI_Metadata_Extension;
+typedef struct { void *value; } XLA_FFI_Scalar;
+typedef struct { void *data; int64_t rank; int64_t *dims; } XLA_FFI_Buffer;
+typedef struct {
+  XLA_FFI_Extension_Base *extension_start;
+  const XLA_FFI_Api *api;
+  struct { XLA_FFI_Buffer **args; } args;
+  struct { XLA_FFI_Buffer **rets; } rets;
+  struct { XLA_FFI_Scalar **attrs; } attrs;
+} XLA_FFI_CallFrame;
+"""
+"""What ``xla_flow.h`` uses of XLA's C interface, by the same names; tests with JAX compile it with that itself."""
+FRAME = """
+typedef struct { void *value; } scalar;
+typedef struct { void *data; int64_t rank; int64_t *dims; } buffer;
+typedef struct { void *extension, *api; buffer **args, **rets; scalar **attrs; } call_frame;
+"""
+
+
+def test_handlers_of_xla(tmp_path):
+    header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
+    header.parent.mkdir(parents=True)
+    header.write_text(XLA)
+    source = with_xla_flow(compiled().derivatives, "stub")
+    source = replace(source, declarations=source.declarations + FRAME)
+    lib, ffi, _ = building.load(source, flags=(*compiled().flags, f"-I{tmp_path}"))
+    failed = ffi.callback("void *(void *)", lambda error: error)
+    api = ffi.new("void *[1]", [ffi.cast("void *", failed)])
+
+    def handled(part, arrays, shape):
+        alive = [np.ascontiguousarray(array, dtype=float) for array in (*arrays, np.zeros(shape))]
+        buffers, kept = [], []
+        for array in alive:
+            dims = ffi.new("int64_t[]", list(array.shape))
+            buffers.append(ffi.new("buffer *", (ffi.cast("void *", array.ctypes.data), array.ndim, dims)))
+            kept.append(dims)
+        counts = [ffi.new("long long *", value) for value in (EVERY, STEPS)]  # sorted by name
+        scalars = [ffi.new("scalar *", (ffi.cast("void *", count),)) for count in counts]
+        args, rets = ffi.new("buffer *[]", buffers[:-1]), ffi.new("buffer *[]", buffers[-1:])
+        frame = ffi.new("call_frame *", (ffi.NULL, api, args, rets, ffi.new("scalar *[]", scalars)))
+        assert getattr(lib, f"{source.prefix}_xla_{part}")(frame) == ffi.NULL
+        return alive[-1]
+
+    assert_allclose(handled("states", [ROWS], (2, KEPT, 4)), [states(row) for row in ROWS], **WAYS)
+    exact, changes = np.array([slopes(row) for row in ROWS]), np.tile(np.eye(SIZE), (2, 1, 1))
+    pushed = handled("push", [ROWS, changes], (2, SIZE, KEPT, 4))
+    assert_allclose(np.moveaxis(pushed, 1, -1), exact, rtol=1e-11, atol=1e-11)
+    pulled = handled("pull", [ROWS, np.tile(weights(), (2, 1, 1, 1))], (2, 1, SIZE))
+    assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)
