@@ -5,6 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from programs import needs
 from samples import linkage
 from style import check_style
 
@@ -45,7 +46,7 @@ def test_compiles_without_a_warning(compiler, tmp_path):
         (tmp_path / f"{source.prefix}.h").write_text(source.header)
         (tmp_path / "all.c").write_text(source.code)
         check_style(source.code)
-        found = subprocess.run([compiler, *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True)
+        found = subprocess.run([needs(compiler), *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True)
         assert found.returncode == 0, found.stderr
 
 

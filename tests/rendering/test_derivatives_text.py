@@ -3,6 +3,7 @@
 import subprocess
 
 import pytest
+from programs import needs
 from samples import damped_pendulum, linkage, pumped_cart_pole, pushed_pendulum, two_rods
 from style import check_style
 
@@ -43,6 +44,6 @@ def test_compiles_without_a_warning(name, second, compiler, tmp_path):
     (tmp_path / "all.c").write_text(source.code)
     check_style(source.code)
     found = subprocess.run(
-        [compiler, *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True, check=False
+        [needs(compiler), *STRICT, "-c", "all.c"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert found.returncode == 0, found.stderr

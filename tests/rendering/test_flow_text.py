@@ -3,6 +3,7 @@
 import subprocess
 
 import pytest
+from programs import needs
 from samples import linkage, pumped_cart_pole, two_rods
 from style import check_style
 
@@ -26,7 +27,7 @@ CASES = {
 def compile_with(compiler, flags, source, folder):
     (folder / f"{source.prefix}.h").write_text(source.header)
     (folder / "all.c").write_text(source.code)
-    command = [compiler, *STRICT, *flags, "-c", "all.c"]
+    command = [needs(compiler), *STRICT, *flags, "-c", "all.c"]
     found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr
 
