@@ -20,7 +20,7 @@ from scvi_codegen.rendering.sharing import MOST_THREADS
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import GROSS_ERROR, MET, warn_of_energies, warn_of_long_steps
 from scvi_codegen.runtime.compiled_method import no_text
-from scvi_codegen.runtime.driven import checked_inputs, end_of, entered, parameters_at, stretches
+from scvi_codegen.runtime.driven import checked_inputs, end_of, entered, parameters_at, planned, stretches
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import consistent, project
@@ -29,6 +29,7 @@ from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
 from scvi_codegen.runtime.inputs import check_inputs_given, check_left_to_inputs, inputs_not_given
+from scvi_codegen.runtime.times import steps_to
 
 __all__ = ["IndexedStepper"]
 
@@ -213,7 +214,8 @@ class IndexedStepper:
             p, velocity: momenta, or velocities in their place, in the same way; by default 0.
             h: step, negative to go back.
             steps, every: numbers of steps.
-            t_end: in place of h and steps: where to go, by steps that choose their length. The last ends there exactly.
+            t_end: in place of ``steps``: where to go. Without h by adaptive steps; the last ends there exactly. With h
+                by steps of h, the last of them shorter unless t_end - t is a whole number of them (within 1e-9).
             tolerance: error of the end of such a step, relative to the largest coordinate; by default round-off.
             t: initial time.
             parameters: numbers, and arrays of them, by name; others keep their defaults.
@@ -240,16 +242,29 @@ class IndexedStepper:
         """
         every = checked_count(every, "every", least=1)
         check_inputs_given(self.interface, parameters)
-        if h is not None and steps is None and t_end is None:
+        if h is not None and t_end is not None:
+            if steps is not None:
+                raise StateError(f"the run ends after steps={steps} or at t_end={t_end:g}: give one of the two")
+            steps_to(t, t_end, h)  # refuses an end that they do not lead to
+        elif h is not None and steps is None:
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if h is None and steps is not None:
             raise StateError("so many steps need their length h; those that choose theirs lead to t_end, alone")
         count = np.inf if steps is None else checked_count(steps, "steps", least=0)
         beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
         beside |= {"options": options, "threads": threads}
-        run = self.start(q, p, velocity=velocity, h=h, t_end=t_end, tolerance=tolerance, **beside)
+        adaptive = t_end if h is None else None
+        run = self.start(q, p, velocity=velocity, h=h, t_end=adaptive, tolerance=tolerance, **beside)
         record = IndexedRecord(run, observe, as_events(events))
-        record.follow(count, every, progress=progress)
+        if h is None or t_end is None:
+            record.follow(count, every, progress=progress)
+            return _said(record)
+        record.take(keep=True)
+        for part in planned(run.t, t_end, h, {}):
+            run.change(h=part.h)
+            record.go_on(run.steps + part.steps, every, progress=progress, to_end=True)
+            if record.search and record.search.ended:
+                break
         return _said(record)
 
     @takes(StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION)

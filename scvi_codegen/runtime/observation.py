@@ -38,7 +38,7 @@ class Observation:
         run: to be advanced.
         every: keep the present state and each whose step number is a multiple of this, if no times are given.
         times: (n,) sorted as the run goes; keep the states at these.
-        end: in transformed time, where the run ends, by a last step that is shorter.
+        end: of steps of h, also in transformed time, where the run ends, by a last step that is shorter.
     """
 
     def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None, end: float | None = None) -> None:
@@ -134,8 +134,10 @@ class Observation:
             part = record(self.run, whole)
         q, p, tau = self._inside(part, self.end)
         lengths = part.lengths.copy()
-        if tau is not None:
-            lengths[-1] = tau - part.stepped[-1]
+        lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
+        if tau is None:
+            run = self.run
+            q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
         return self._closed(part, lengths, self.end, q, p, tau)
 
     def _inside(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
@@ -205,7 +207,7 @@ def observed_until(
     t_eval: ArrayLike | None,
     progress: Callable[[int], None] | None,
 ) -> Trajectory:
-    """The trajectory of a run in transformed time to t_end, with the states kept that are asked for."""
+    """The trajectory of a run by steps of h to t_end, the last shorter, with the states kept that are asked for."""
     end = checked_number(t_end, "the time t_end")
     if steps is not None:
         raise StateError(f"the run ends after steps={steps} or at t_end={end:g}: give one of the two")

@@ -29,7 +29,7 @@ from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.observation import Observation, observed_until
 from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.times import times_after
+from scvi_codegen.runtime.times import steps_to, times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Stepper"]
@@ -69,9 +69,9 @@ class Stepper(Ensembles):
             velocity: (m,) initial velocities, in place of p.
             h: step size, negative to go back; in transformed time (:func:`~scvi_codegen.reparametrise`) of tau.
             steps: number of steps.
-            t_end: instead of both: where to go, by steps that choose their length. The last ends there exactly. In
-                transformed time, and where a monitor chooses the steps (:func:`~scvi_codegen.compile_stepper`), instead
-                of steps alone: steps of h, the last of them shorter, lead there.
+            t_end: instead of ``steps``: where to go. Without h by adaptive steps; the last ends there exactly. With h,
+                also in transformed time and where a monitor chooses the steps (:func:`~scvi_codegen.compile_stepper`),
+                by steps of h, the last of them shorter unless t_end - t is a whole number of them (within 1e-9).
             tolerance: relative error of the end of such a step; by default round-off. Many of them add up.
             every: steps between kept states; the one at t_end is kept, too.
             t: initial time.
@@ -102,13 +102,16 @@ class Stepper(Ensembles):
             velocity=velocity,
             h=h,
             t=t,
-            t_end=None if clocked else t_end,
+            t_end=t_end if h is None or self.interface.monitor else None,
             tolerance=tolerance,
             parameters=parameters,
             options=options,
         )
-        if clocked and t_end is not None:
-            return _said(observed_until(run, t_end, steps, every, t_eval, progress))
+        if h is not None and t_end is not None and not self.interface.monitor:
+            whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
+            if whole is None or whole % checked_count(every, "every", least=1):
+                return _said(observed_until(run, t_end, steps, every, t_eval, progress))
+            steps = whole
         _check_number(run, steps)
         if t_eval is None:
             found = run.record(steps, every=every, progress=progress)

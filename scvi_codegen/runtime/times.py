@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["WHOLE", "steps_within", "times_after"]
+__all__ = ["WHOLE", "steps_to", "steps_within", "times_after"]
 
 SPLITTER = 2.0**27 + 1.0
 """Times a number of 53 bits, it splits off the upper 26 (Dekker 1971)."""
@@ -40,6 +41,20 @@ def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
     if not counts.sum() <= MOST_STEPS:
         raise StateError(f"steps of h = {h:g} would be {counts.sum():.0e} of them: give a longer one")
     return counts.astype(np.intp)
+
+
+def steps_to(t: float, t_end: float, h: float) -> int | None:
+    """Return how many steps of h lead from t to t_end, or ``None`` if the last of them has to be shorter.
+
+    Raises:
+        StateError: where they lead away from t_end.
+    """
+    span = (checked_number(t_end, "t_end") - checked_number(t, "the time t")) / checked_step(h)
+    if span < 0.0:
+        raise StateError(f"steps of h = {h:g} do not lead from t = {t:g} to t_end = {t_end:g}: give h the other sign")
+    if not span <= MOST_STEPS:
+        raise StateError(f"steps of h = {h:g} from t = {t:g} to t_end = {t_end:g} are {span:.0e}: give a larger h")
+    return round(span) if abs(span - round(span)) <= WHOLE else None
 
 
 def _product(x: Array, y: float) -> tuple[Array, Array]:

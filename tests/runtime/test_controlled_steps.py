@@ -464,3 +464,67 @@ def test_runs_end_at_t_end_counted_with_the_low_word_of_time(far_away, way, span
         assert run.steps == near.steps
         assert abs(q[-1, 0] - there[-1, 0]) < 1e-13
         assert abs(q[-1, 0] - math.cos(span)) < 1e-10
+
+
+@pytest.fixture(scope="module")
+def oscillators():
+    """A stepper and an indexed one, with the names that their event functions use."""
+    system = sc.LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
+    summed = sc.IndexedSystem.from_text(
+        name="o", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
+    )
+    return {"q": sc.compile_stepper(system, "svi:4"), "q[0]": sc.compile_indexed(summed, "svi:4")}
+
+
+@pytest.mark.parametrize("name", ["q", "q[0]"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+class TestStepsOfHLeadToAnEnd:
+    @staticmethod
+    def positions(run):
+        return (run.q if isinstance(run.q, np.ndarray) else run.q["q"])[:, 0]
+
+    def test_a_whole_number_of_them_is_that_many_steps(self, oscillators, name, sign):
+        run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, t_end=sign * 2.0)
+        same = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, steps=20)
+        assert np.array_equal(run.t, same.t)
+        assert np.array_equal(self.positions(run), self.positions(same))
+
+    @pytest.mark.parametrize("every", [1, 4])
+    def test_the_last_is_shorter_where_h_does_not_divide(self, oscillators, name, sign, every):
+        run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, every=every, t=0.0)
+        times = sign * np.array([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0] if every == 1 else [0.0, 1.2, 2.0])
+        assert np.abs(run.t[[*range(len(times) - 1), -1]] - times).max() < 1e-15
+        assert run.t[-1] == sign * 2.0
+        assert np.abs(self.positions(run) - np.cos(run.t)).max() < 1e-10
+        between = np.linspace(0.0, sign * 2.0, 15)
+        q, _ = run.at(between)
+        assert np.abs((q if name == "q" else q["q"])[:, 0] - np.cos(between)).max() < 1e-9
+
+    def test_events_on_the_way_and_in_the_last_step_are_found(self, oscillators, name, sign):
+        wanted = [f"{name} - 0.5", f"{name} - cos(1.95)", sc.Event(f"{name} - cos(1.99)", terminal=True)]
+        run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, events=wanted)
+        found = sign * np.concatenate([each.t for each in run.events])
+        assert np.abs(found - [np.pi / 3.0, 1.95, 1.99]).max() < 1e-9
+        assert run.t[-1] == sign * found[-1]
+
+
+def test_states_at_times_are_kept_up_to_an_end_that_h_does_not_divide(oscillators):
+    times = np.linspace(0.0, 2.0, 9)
+    run = oscillators["q"].integrate([1.0], [0.0], h=0.3, t_end=2.0, t_eval=times)
+    assert np.array_equal(run.t, times)
+    assert np.abs(run.q[:, 0] - np.cos(times)).max() < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"h": 0.1, "t_end": -1.0}, "do not lead from t = 0 to t_end = -1"),
+        ({"h": 0.1, "t_end": 1.0, "steps": 3}, "give one of the two"),
+        ({"h": 0.1, "t_end": 1.0, "tolerance": 1e-3}, "a tolerance is for"),
+        ({"h": 1e-12, "t_end": 1.0}, r"are 1e\+12: give a larger h"),
+    ],
+)
+@pytest.mark.parametrize("name", ["q", "q[0]"])
+def test_ends_that_steps_of_h_do_not_lead_to_are_refused(oscillators, name, given, message):
+    with pytest.raises(StateError, match=message):
+        oscillators[name].integrate([1.0], [0.0], **given)

@@ -102,9 +102,10 @@ class TestControlledSteps:
             ({}, "give one of them"),
             ({"h": 0.1}, "need their number"),
             ({"steps": 3}, "need their length"),
-            ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give one of them"),
+            ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give one of the two"),
+            ({"h": 0.1, "t_end": -1.0}, "do not lead from t = 0 to t_end = -1"),
             ({"h": 0.1, "steps": 3, "tolerance": 1e-3}, "a tolerance is for"),
-            ({"t_end": 1.0, "tolerance": 2.0}, "between 0 and 1"),
+            ({"t_end": 1.0, "tolerance": 2.0}, "positive and below 1"),
         ):
             with pytest.raises(StateError, match=message):
                 stepper.integrate(Q, **given)
