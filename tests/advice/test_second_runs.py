@@ -1,0 +1,126 @@
+"""What advice is wired to: parameters, times and velocities that are no defaults, worst and end errors, chaos."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.advice import promise
+from scvi_codegen.advice.advice import advise
+from scvi_codegen.advice.known_digits import Known, _at_the_end, _tenfold, known_digits
+from scvi_codegen.advice.promise import broken_promise
+
+T, SPAN = 2.5, 7.5
+STIFFER = {"k": 9.0, "a": 0.75}
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Stiffer by far than its defaults, and driven by the clock."""
+    return sc.LagrangianSystem.from_text(
+        name="driven",
+        coordinates=["x"],
+        lagrangian="x_dot**2/2 - k*x**2/2 + a*x*cos(t)",
+        parameters={"k": 1.0, "a": 0.0},
+    )
+
+
+def exact(t, q, p):
+    """x'' = -k x + a cos t, from the state at T."""
+    k, a = STIFFER["k"], STIFFER["a"]
+    w, forced = math.sqrt(k), a / (k - 1.0)
+    b, c = q - forced * math.cos(T), (p + forced * math.sin(T)) / w
+    return forced * np.cos(t) + b * np.cos(w * (t - T)) + c * np.sin(w * (t - T))
+
+
+def run(system, h, q=0.75, p=-0.5):
+    steps = round(SPAN / h)
+    return sc.compile_stepper(system, "svi:2").integrate([q], [p], h=h, steps=steps, t=T, parameters=STIFFER)
+
+
+@pytest.mark.parametrize("h", [0.125, 0.03125])
+def test_the_second_run_has_the_time_and_parameters_of_the_first(driven, h):
+    trajectory = run(driven, h)
+    off = abs(trajectory.q[:, 0] - exact(trajectory.t, 0.75, -0.5))
+    known = known_digits(driven, trajectory, most=10_000)
+    late = off[-max(1, len(off) // 16) :]
+    assert known.q[0] == pytest.approx(max(off[-1], math.sqrt(np.mean(late**2))), rel=1e-3)
+    assert not known.chaotic
+
+
+def test_advice_is_of_the_parameters_and_the_time_given(driven):
+    advice = advise(driven, "svi:2", [0.75], [-0.5], SPAN, 1e-5, parameters=STIFFER, t=T)
+    assert advice.h * advice.steps == pytest.approx(SPAN)
+    trajectory = run(driven, advice.h)
+    error = abs(trajectory.q[-1, 0] - exact(T + SPAN, 0.75, -0.5)) / np.sqrt(np.mean(trajectory.q**2))
+    assert 1e-7 < error <= 1e-5
+    assert advice.expected_error <= 1e-5
+    assert advise(driven, "svi:2", [0.75], [-0.5], SPAN, 1e-5).h > 1.5 * advice.h
+
+
+def test_a_lucky_end_is_not_the_error():
+    apart = np.full((160, 1), 1e-3)
+    apart[-1] = 1e-9
+    assert 0.9e-3 < _at_the_end(apart)[0] < 1e-3
+    apart[-1], apart[:140] = 5e-3, 1.0
+    assert _at_the_end(apart)[0] == 5e-3
+
+
+@pytest.mark.parametrize("span", [20.0, 50.0])
+def test_chaos_is_growth_by_decades(span):
+    share = np.linspace(0.0, 1.0, 1024)
+    assert _tenfold(1e-13 * 10.0 ** (8.0 * share), span) == pytest.approx(span / 8.0, rel=0.02)
+    assert _tenfold(1e-13 * (1.0 + 1e3 * share), span) == math.inf
+    assert _tenfold(1e-13 * (1.0 + 1e3 * share**2), span) == math.inf
+
+
+def test_a_chaotic_motion_is_known_as_such():
+    double = sc.problem("double-pendulum")
+    stepper = sc.compile_stepper(double.system, "svi:4")
+    found = {}
+    for angle in (0.05, 2.5):
+        trajectory = stepper.integrate([angle, angle / 2], [0.0, 0.0], h=0.02, steps=1500)
+        found[angle] = known_digits(double.system, trajectory, most=50_000)
+    assert not found[0.05].chaotic
+    assert found[2.5].chaotic
+    assert 0.3 < found[2.5].tenfold < 10.0
+
+
+def of_promise(**more):
+    """A run whose worst step and energy are in doubt or not."""
+    q = np.ones((64, 1))
+    stated = {"step_error": 1e-12, "step_error_t": 3.25, "q": q, "p": q, "velocity": q, "steps": 63}
+    return SimpleNamespace(**(stated | {"energy": lambda: np.ones(64)} | more))
+
+
+@pytest.mark.parametrize(
+    ("known", "more", "words"),
+    [
+        (1e-7, {}, ""),
+        (1.9e-6, {}, ""),
+        (2.1e-6, {}, "ends 2.1e-06 away"),
+        (1e-7, {"step_error": 1e-4}, ""),
+        (1e-3, {"step_error": 1e-4}, "the step from t = 3.25 alone has a relative error of about 1.0e-04"),
+        (1e-3, {"energy": lambda: np.linspace(1.0, 1.01, 64)}, "the energy, which the motion conserves, is off by"),
+    ],
+    ids=["kept", "just kept", "just broken", "doubt that a second run dispels", "worst step", "energy"],
+)
+def test_a_promise_is_held_against_the_end(known, more, words):
+    system = sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    regular, chaotic = (Known(q=np.array([known]), p=np.array([9.0]), tenfold=tenfold) for tenfold in (math.inf, 2.0))
+    found = broken_promise(system, of_promise(**more), 1e-6, regular)
+    assert (words in found) if words else found == ""
+    assert bool(broken_promise(system, of_promise(**more), 1e-6, chaotic)) == bool(more)
+
+
+def test_without_a_second_run_one_is_made_of_doubts_alone(driven, monkeypatch):
+    asked = []
+    monkeypatch.setattr(promise, "known_digits", lambda system, run, *, most: asked.append(most))
+    assert broken_promise(driven, of_promise(), 1e-6) == ""
+    assert asked == []
+    assert "alone has a relative error" in broken_promise(driven, of_promise(step_error=1e-4), 1e-6)
+    assert asked == [10_000 + 4 * 63]
