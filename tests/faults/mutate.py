@@ -56,6 +56,8 @@ UNSTYLED = "def check_style(text: str) -> None:\n    pass\n"
 """In the place of tests/tools/style.py: how a fault is set is no notice of it."""
 NOTHING_RUN = 4
 """Status of pytest where a name was cut; one more where a file has no test of the default tier."""
+HANGS = 100
+"""Seconds of work after which certificates of few cases count as hanging."""
 AROUND = 60
 """Characters before and after a fault by which it is found again."""
 MOST_UNFIT = 20
@@ -108,7 +110,7 @@ def noticed(copy: Path, place: Place, unfit: list[str], seconds: float) -> tuple
     cases = [case for case in CERTIFIED if certifies(copy, case, place.path)][:MOST_CASES]
     path.write_text(place.applied(text))
     try:
-        code, words = run(copy, sys.executable, "tests/faults/certify.py", *cases) if cases else (0, "")
+        code, words = run(copy, sys.executable, "tests/faults/certify.py", *cases, seconds=HANGS) if cases else (0, "")
         if code:
             return "stillborn" if code == 3 else "certificate", words
         tests, failing = near(place.path), 0

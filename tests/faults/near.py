@@ -14,6 +14,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_indexed_scales.py",
         "runtime/test_indexed_newton.py",
         "runtime/test_indexed_runs.py",
+        "runtime/test_low_words.py",
         "verification/test_indexed.py",
         "rendering/test_indexed.py",
     ),
@@ -131,6 +132,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "lowering/test_collocation_solver.py",
         "runtime/test_stepper.py",
         "runtime/test_drift.py",
+        "runtime/test_low_words.py",
         "promises/test_matrix.py",
     ),
     "scvi_codegen/ir": ("lowering/test_lowering.py", "lowering/test_rounding.py", "rendering/test_generated.py"),
@@ -140,7 +142,13 @@ NEAR: dict[str, tuple[str, ...]] = {
         "rendering/test_written_out.py",
         "rendering/test_c_text.py",
     ),
-    "scvi_codegen/methods": ("methods", "promises/test_identities.py", "promises/test_order.py", "display"),
+    "scvi_codegen/methods": (
+        "methods",
+        "promises/test_identities.py",
+        "promises/test_order.py",
+        "display",
+        "mechanics",
+    ),
     "scvi_codegen/runtime": (
         "runtime/test_quantities.py",
         "runtime/test_stepper.py",
@@ -158,10 +166,12 @@ NEAR: dict[str, tuple[str, ...]] = {
         "runtime/test_indexed_runs.py",
         "models/test_indexed_model_file.py",
     ),
-    **{f"scvi_codegen/runtime/{stem}": ("runtime/test_fitting.py",) for stem in ("measurements", "fitting")},
+    **{
+        f"scvi_codegen/runtime/{stem}": ("runtime/test_fitting.py",) for stem in ("measurements", "fitting", "segments")
+    },
     **{
         f"scvi_codegen/runtime/{stem}": ("runtime/test_exchanges.py", "runtime/test_step_error.py")
-        for stem in ("retaken", "accuracy", "segments")
+        for stem in ("retaken", "accuracy")
     },
     **{
         f"scvi_codegen/runtime/{stem}": ("runtime/test_deviations.py", "runtime/test_tangents.py")
@@ -174,7 +184,11 @@ NEAR: dict[str, tuple[str, ...]] = {
     "scvi_codegen/runtime/driven": ("runtime/test_driven.py", "runtime/test_driven_ensemble.py"),
     "scvi_codegen/runtime/longest": ("runtime/test_longest_step.py",),
     "scvi_codegen/runtime/constrain": ("methods/test_constraints.py", "methods/test_rolling.py"),
-    "scvi_codegen/lowering/indexed": ("lowering/test_indexed_sums.py", "runtime/test_indexed.py"),
+    "scvi_codegen/lowering/indexed": (
+        "lowering/test_indexed_sums.py",
+        "runtime/test_indexed.py",
+        "runtime/test_indexed_runs.py",
+    ),
     "scvi_codegen/rendering/indexed": ("rendering/test_indexed.py", "runtime/test_indexed.py"),
     "scvi_codegen/mechanics/indexed": ("mechanics/test_indexed.py", "runtime/test_indexed.py"),
     "scvi_codegen/formulas/indexed": (

@@ -1,0 +1,243 @@
+"""Low words of compensated sums, compared in exact arithmetic: high plus low word, not statistics.
+
+Bodies whose forces depend on differences keep their momentum, and their centre of mass moves on a line, by every method
+here: with fractions of the high and the low words both are known exactly. Increments err by roundings of their own
+size, a thousandth of a rounding of the state at these steps; a low word that is dropped, added twice or with the other
+sign shows as a rounding of the state.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from oracle import collocation_tableau, points
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+
+MASSES = (2.0, 1.0, 0.5)
+Q, P = np.array([0.7, 0.9, 1.3]), np.array([1.9, -0.8, 0.7])
+LOW = np.array([0.4, -0.3, 0.2])
+"""Of a rounding, what the first state has as low words."""
+H, STEPS = 2.0**-11, 500
+L = "x_dot**2 + y_dot**2/2 + z_dot**2/4 - (x - y)**2 - (y - z)**4/4 + cos(z - x + t)/3"
+COORDINATES = ["x", "y", "z"]
+
+
+def bodies() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(name="bodies", coordinates=COORDINATES, lagrangian=L)
+
+
+def coupled() -> sc.LagrangianSystem:
+    """The mass matrix depends on differences."""
+    text = L + " + (x_dot - y_dot)**2*sin(x - z)**2/8"
+    return sc.LagrangianSystem.from_text(name="coupled", coordinates=COORDINATES, lagrangian=text)
+
+
+def hamiltonian() -> sc.HamiltonianSystem:
+    text = "p**2/4 + r**2/2 + s**2 + (x - y)**2 + (y - z)**4/4 - cos(z - x + t)/3"
+    return sc.HamiltonianSystem.from_text(
+        name="bodies", coordinates=COORDINATES, momenta=["p", "r", "s"], hamiltonian=text
+    )
+
+
+def rod() -> sc.LagrangianSystem:
+    """Two bodies on a rod, and a third: the lengths along x alone are compared."""
+    return sc.LagrangianSystem.from_text(
+        name="rod",
+        coordinates=["x", "y", "z", "w"],
+        lagrangian="x_dot**2 + y_dot**2/2 + z_dot**2/4 + w_dot**2/2 - (y - z)**4/4 + cos(z - x + t)/3",
+        constraints=["(x - y)**2 + w**2 = 1"],
+    )
+
+
+def array() -> sc.IndexedSystem:
+    return sc.IndexedSystem.from_text(
+        name="bodies of an array",
+        coordinates=["q[N]"],
+        parameters={"m[N]": 1.0},
+        lagrangian="sum(i in N, m[i]*q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2 + (q[i+1] - q[i])**4/4)",
+    )
+
+
+RATTLE = {"method": "svi", "degree": 1, "quadrature": "gauss-lobatto:2"}
+CASES: dict[str, tuple[Any, Any, str]] = {
+    "svi": (bodies, "svi:3", "fixed-point"),
+    "svi by Newton": (bodies, "svi:3", "newton"),
+    "svi, coupled": (coupled, "svi:3", "fixed-point"),
+    "svi, coupled, by Newton": (coupled, "svi:3", "newton"),
+    "gauss": (bodies, "gauss:3", "fixed-point"),
+    "gauss of a Hamiltonian": (hamiltonian, "gauss:3", "fixed-point"),
+    "composition": (bodies, {"method": "composition", "order": 8}, "auto"),
+    "leapfrog": (bodies, "stoermer-verlet", "explicit"),
+    "rattle": (rod, RATTLE, "auto"),
+    "lobatto": (rod, {"method": "svi", "degree": 3, "quadrature": "gauss-lobatto:4"}, "auto"),
+    "array": (array, "svi:3", "fixed-point"),
+    "array by Newton": (array, "svi:3", "newton"),
+    "composition of an array": (array, {"method": "composition", "order": 8}, "fixed-point"),
+}
+ARRAYS = [name for name, (system, *_) in CASES.items() if system is array]
+
+
+def compiled(name: str) -> Any:
+    system, method, solver = CASES[name]
+    method = sc.methods.method_from_specification(method) if isinstance(method, dict) else method
+    make = sc.compile_indexed if system is array else sc.compile_stepper
+    return make(system(), method, solver=solver, flags=QUICK_FLAGS)
+
+
+def exact(*values: Any) -> Fraction:
+    return sum((Fraction(float(x)) for x in values), Fraction(0))
+
+
+class Begun:
+    """A run with low words, and what is known of it exactly."""
+
+    def __init__(self, name: str, stepper: Any = None) -> None:
+        self.array, self.stepper = name in ARRAYS, stepper or compiled(name)
+        system = CASES[name][0]
+        self.q, self.p, self.masses = Q, P, MASSES
+        if system is rod:  # at rest beside each other along y, where w is 0
+            self.q, self.p = np.array([0.25, 1.25, 2.0, 0.0]), np.array([1.9, 0.95, -0.7, 0.4])
+            self.masses = (*MASSES, 0.0)
+        beside = {"parameters": {"m": np.array(MASSES)}} if self.array else {}
+        self.run = self.stepper.start(self.q, self.p, h=H, t=1 / 3, **beside)
+        low_q, low_p = (np.spacing(x[:3]) * LOW for x in (self.q, self.p))
+        carries = self.words()[2:]
+        carries[0][:3], carries[1][:3] = low_q, low_p
+        if not self.array:
+            self.run.resume_at(0, (self.run.t, 0.0), carries)
+
+    def words(self) -> tuple[Any, ...]:
+        """q, p and their low words; of an array those of the run itself."""
+        if self.array:
+            return tuple(self.run._numbers[name].ravel() for name in ("q", "p", "carry_q", "carry_p"))
+        return self.run.q, self.run.p, *self.run.carries
+
+    def time(self) -> Fraction:
+        memory = self.run._run if self.array else self.run._memory
+        return exact(memory.t, memory.t_low)
+
+    def invariants(self) -> tuple[Fraction, Fraction]:
+        """The momentum, and the sum of masses times positions."""
+        q, p, low_q, low_p = self.words()
+        momentum = sum((exact(a, b) for a, b, m in zip(p, low_p, self.masses, strict=True) if m), Fraction(0))
+        places = sum((Fraction(m) * exact(a, b) for a, b, m in zip(q, low_q, self.masses, strict=True)), Fraction(0))
+        return momentum, places
+
+    def off(self, start: tuple[Fraction, Fraction, Fraction]) -> tuple[float, float]:
+        """By how much the momentum, and the centre of mass, are not where they belong."""
+        momentum, places = self.invariants()
+        t, first, begun = start
+        return float(momentum - first), float(places - begun - first * (self.time() - t))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
+    own = Begun(name)
+    start = (own.time(), *own.invariants())
+    assert start[1] != exact(*own.p[:3])
+    worst = np.zeros(2)
+    for part in range(5):
+        own.run.advance(STEPS // 5)
+        worst = np.maximum(worst, np.abs(own.off(start)))
+        if part == 2:  # and as bytes, from there on
+            saved = own.run.save()
+            own.run = own.stepper.restore(saved)
+    assert own.time() == Fraction(1 / 3) + STEPS * Fraction(H)
+    assert worst[0] < 1e-17
+    assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits
+
+
+@pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
+def test_times_are_sums_of_all_steps(lengths: str) -> None:
+    """Of steps that choose their length, the last of which ends at t_end; and of pieces between breakpoints."""
+    own = Begun("svi")
+    if lengths == "tolerance":
+        own.run = own.stepper.start(own.q, own.p, t_end=1.7, tolerance=1e-6, t=1 / 3)
+    start = (own.time(), *own.invariants())
+    if lengths == "inputs":
+        for h in (0.1, 0.03, 1 / 7):
+            own.run.change(h=h)
+            own.run.advance(5)
+        assert abs(own.time() - (start[0] + 5 * exact(0.1, 0.03, 1 / 7))) < Fraction(1, 2**100)
+        return
+    while not own.run.arrived:
+        own.run.advance(1)
+        assert max(map(abs, own.off(start))) < 1e-15  # steps are long, and their increments as large as the state
+    assert own.run.t == 1.7
+
+
+def tables(code: str) -> dict[str, list[float]]:
+    """Numbers of every table of doubles that a text has."""
+    found = re.findall(r"static const (?:lanes|double) (\w+)(?:\[[^=]*\])? = (\{.*?\});", code, re.S)
+    return {name: [float(x) for x in re.findall(r"-?\d[\w.+-]*", text)] for name, text in found}
+
+
+@pytest.mark.parametrize("text", ["svi", "gauss", "ensemble", "array"])
+def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
+    """Of Gauss-Legendre points: c, A^2, b A and b of the tableau in 50 digits."""
+    stepper = compiled(text if text != "ensemble" else "svi")
+    code = stepper.ensemble.code if text == "ensemble" else stepper.source.code
+    found, own = tables(code), collocation_tableau(points("gauss", 3))
+    A, b, c = own["A"], own["b"], own["c"]
+    square = A @ A
+    wanted = {"DRIFT": c, "PRODUCT": square, "POINT_END_POSITION": b @ A, "POINT_END_MOMENTUM": b}
+    for name, exactly in wanted.items():
+        high, low = found[name], found[f"{name}_LOW"]
+        if text != "ensemble" and name == "PRODUCT":  # by columns, with a lane that is not used
+            exactly = exactly.T
+        numbers = [x for row in np.reshape(exactly, (-1, 3)) for x in row]
+        width = 3 if text == "ensemble" else 4
+        pairs = list(zip(high, low, strict=True))
+        words = [pair for k in range(0, len(high), width) for pair in pairs[k : k + width][:3]][: len(numbers)]
+        for (one, two), x in zip(words, numbers, strict=True):
+            assert one == float(x), name
+            assert abs(Fraction(two) + Fraction(one) - Fraction(str(x))) <= Fraction(abs(two)) / 2**52, name
+
+
+def test_work_is_the_sum_of_what_each_step_gives() -> None:
+    """Beside the exact sum, over steps that are taken again between kept states."""
+    system = sc.LagrangianSystem.from_text(
+        name="rubbed", coordinates=["x"], lagrangian="x_dot**2 - x**2", forces={"x": "sin(3*t) - x_dot/5"}
+    )
+    stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
+    run = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300)
+    states = zip(run.q[:-1], run.p[:-1], run.t[:-1].tolist(), strict=True)
+    given = [float(stepper.exchanged(q, p, 0.01, t)[2][0]) for q, p, t in states]
+    size = max(map(abs, given))
+    for n in (1, 150, 300):
+        assert abs(run.work()[n] - math.fsum(given[:n])) < 2.0**-52 * math.sqrt(n) * 30 * size
+    kept = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300, every=30)
+    assert np.abs(kept.work() - run.work()[::30]).max() < 1e-14
+
+
+BY_DESIGN = ("Newton", "rattle", "lobatto")
+"""Forces at the start of their steps are those of the high word: an error of the size of a rounding of the increment."""
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if not any(each in name for each in BY_DESIGN)])
+def test_low_words_count_wherever_the_state_does(name: str) -> None:
+    """A thousandth of the state as its low word, or in its high word: a step has the same forces and velocities."""
+    ends = []
+    for whole in (False, True):
+        own = Begun(name)
+        long = [np.cos(np.arange(len(x))) / 1024 for x in (own.q, own.p)]
+        q, p = (x + part if whole else x for x, part in zip((own.q, own.p), long, strict=True))
+        beside = {"parameters": {"m": np.array(MASSES)}} if own.array else {}
+        own.run = own.stepper.start(q, p, h=1 / 16, **beside)
+        if own.array:
+            for kept, part in zip(own.words()[2:], long, strict=True):
+                kept[:] = 0.0 if whole else part
+        elif not whole:
+            own.run.resume_at(0, (0.0, 0.0), tuple(long))
+        own.run.advance(1)
+        q, p, low_q, low_p = own.words()
+        ends.append(np.concatenate([q + low_q, p + low_p]))
+    last = 2e-6 if name == "array" else 1e-14  # sweeps over arrays take the low word in from the second on
+    assert np.abs(ends[1] - ends[0]).max() < last
