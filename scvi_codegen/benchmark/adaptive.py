@@ -64,7 +64,7 @@ def _ours(chosen: Case, *, quick: bool) -> list[Contender]:
     stepper, seconds = compiled(chosen, SVI(8))
     momenta = momenta_of(stepper, chosen)
     runs = [("controlled", _tolerance(each), {"t_end": chosen.span, "tolerance": each}) for each in TOLERANCES]
-    count = stepper.integrate(chosen.q[0], momenta[0], t_end=chosen.span).steps
+    count = stepper.integrate(chosen.q[0], momenta[0], t_end=chosen.span, check_growth=False).steps
     fixed = [("fixed", max(1, round(count * factor))) for factor in FIXED]
     made = [
         _contender(stepper, chosen, momenta, seconds, mode, setting, partial(_to_its_end, stepper, arguments))
@@ -132,7 +132,7 @@ def _by_so_many(stepper: Stepper, span: float, count: int, q: Array, p: Array) -
 
 
 def _whole(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
-    return lambda: stepper.integrate(q, p, every=LAST, **arguments).q[-1]
+    return lambda: stepper.integrate(q, p, every=LAST, check_growth=False, **arguments).q[-1]
 
 
 def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:
@@ -171,7 +171,7 @@ def _kepler_end(q: Array, v: Array, t: float) -> tuple[Any, Any]:
 def _ends(chosen: Case, velocity: Extended) -> Reference:
     stepper, field, m = compile_stepper(chosen.system, SVI(8)), field_of(chosen), chosen.dimension
     runs = [
-        stepper.integrate(q, velocity=v, t_end=chosen.span).t
+        stepper.integrate(q, velocity=v, t_end=chosen.span, check_growth=False).t
         for q, v in zip(chosen.q, velocity.astype(float), strict=True)
     ]
     start = np.concatenate([chosen.q.astype(np.longdouble), velocity], axis=1)

@@ -27,6 +27,7 @@ __all__ = [
     "warn_of_long_steps",
     "warn_of_lost_energies",
     "warn_of_lost_energy",
+    "warnings_wanted",
 ]
 
 TOLERABLE_ERROR: Final = 1e-3
@@ -104,6 +105,11 @@ def unwarned() -> Iterator[None]:
         yield
     finally:
         _heard.reset(token)
+
+
+def warnings_wanted() -> bool:
+    """Return whether accuracy warnings are wanted: not inside :func:`unwarned`."""
+    return _heard.get()
 
 
 def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = CONTROLLED) -> None:

@@ -20,6 +20,7 @@ from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array, TakesInputs, check_left_to_inputs, no_input
+from scvi_codegen.runtime.memory import UNHEARD_STEPS
 from scvi_codegen.runtime.standing import Standing
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Input",
     "Stretch",
+    "advance_to",
     "checked_inputs",
     "drive",
     "end_of",
@@ -230,8 +232,22 @@ def stretches(
         yield None
 
 
+def advance_to(run: Driven, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]) -> None:
+    """Advance a run of adaptive steps to a time, keeping nothing but the state there."""
+    for _ in stretches(run, inputs, t_end, values):
+        while not run.arrived:
+            run.advance(UNHEARD_STEPS)
+
+
 class Driven(Standing, Protocol):
     """What is asked of a run whose inputs are data."""
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the run stands at its goal."""
+
+    def advance(self, steps: int) -> None:
+        """So many steps, or those that lead to the goal."""
 
     def change(self, *, parameters: Array, h: float | None = None, goal: Goal | None = None) -> None:
         """Go on with others."""

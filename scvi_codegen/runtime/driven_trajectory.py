@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar
 
@@ -16,6 +16,7 @@ from scvi_codegen.files.labelled import to_dataset
 from scvi_codegen.given.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.dense_output import checked_times, within
 from scvi_codegen.runtime.events import Crossings
+from scvi_codegen.runtime.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.nearby_driven import NearbyDrivenMotions
 from scvi_codegen.runtime.quantities import quantities
@@ -35,14 +36,16 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DrivenTrajectory(NearbyDrivenMotions):
+class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
     """States along a run with inputs, and what follows from them, each with the parameters of its piece.
 
     Attributes:
         pieces: trajectories from breakpoint to breakpoint, the first state of each the last of the one before.
+        confirmation: as of :class:`Trajectory`.
     """
 
     pieces: tuple[Trajectory, ...]
+    confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         return holds(self, f", breakpoints between: {len(self.pieces) - 1}")

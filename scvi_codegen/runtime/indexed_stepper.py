@@ -20,8 +20,18 @@ from scvi_codegen.rendering.sharing import MOST_THREADS
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import GROSS_ERROR, MET, warn_of_energies, warn_of_long_steps
 from scvi_codegen.runtime.compiled_method import no_text
-from scvi_codegen.runtime.driven import checked_inputs, end_of, entered, parameters_at, planned, stretches
+from scvi_codegen.runtime.driven import (
+    advance_to,
+    checked_inputs,
+    end_of,
+    entered,
+    parameters_at,
+    planned,
+    stretches,
+)
+from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import EventLike, as_events
+from scvi_codegen.runtime.global_error import checked_error, confirmed_run
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import consistent, project
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, RunArrays, read_arrays
@@ -206,6 +216,8 @@ class IndexedStepper:
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
+        error: float | None = None,
+        check_growth: bool | None = None,
     ) -> IndexedTrajectory:
         """Run ``steps`` steps of h, or to t_end, and keep every ``every``-th state, the initial one first.
 
@@ -229,6 +241,7 @@ class IndexedStepper:
             events: zeros to find, as ``events`` of the trajectory; a terminal one ends it. An
                 :class:`~scvi_codegen.Event`, its function alone, ``"q[0] - 1"``, ``"sum(i in N, q[i]**2) - 5"``, of
                 coordinates, velocities, momenta, parameters and t, or several.
+            error, check_growth: as of :meth:`Stepper.integrate`; error needs all states, without ``observe``.
 
         Returns:
             :class:`IndexedTrajectory`, steps // every + 1 states; the one at t_end or at a terminal event is kept, too.
@@ -253,19 +266,29 @@ class IndexedStepper:
         count = np.inf if steps is None else checked_count(steps, "steps", least=0)
         beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
         beside |= {"options": options, "threads": threads}
+        if error is not None:
+            return confirmed_run(
+                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}),
+                partial(self.integrate, events=events),
+                self.integrate,
+                (q, p, velocity),
+                beside,
+                {"t_end": t_end, "every": every, "progress": progress},
+            )
         adaptive = t_end if h is None else None
         run = self.start(q, p, velocity=velocity, h=h, t_end=adaptive, tolerance=tolerance, **beside)
+        check = GrowthCheck(run, check_growth)
         record = IndexedRecord(run, observe, as_events(events))
         if h is None or t_end is None:
             record.follow(count, every, progress=progress)
-            return _said(record)
+            return _said(record, check)
         record.take(keep=True)
         for part in planned(run.t, t_end, h, {}):
             run.change(h=part.h)
             record.go_on(run.steps + part.steps, every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
-        return _said(record)
+        return _said(record, check)
 
     @takes(StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION)
     def drive(
@@ -288,6 +311,8 @@ class IndexedStepper:
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
+        error: float | None = None,
+        check_growth: bool | None = None,
     ) -> IndexedTrajectory:
         """Run a system whose inputs are data: steps end at their breakpoints, so that the order is kept.
 
@@ -297,6 +322,7 @@ class IndexedStepper:
             steps, t_end: with h one of both; without it ``t_end``.
             q, p, velocity, tolerance, every, t, parameters, tables: as of :meth:`integrate`.
             observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are kept, too.
+            error, check_growth: as of :meth:`integrate`.
 
         Raises:
             StateError: for inputs that are not given for all of the run, or make no function of time.
@@ -308,17 +334,27 @@ class IndexedStepper:
         controlled = {"t_end": end, "tolerance": tolerance} if h is None else {"h": h}
         beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
         beside |= {"options": options, "threads": threads}
+        if error is not None:
+            return confirmed_run(
+                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}),
+                partial(self.drive, events=events),
+                self.drive,
+                (q, p, velocity),
+                beside | {"inputs": inputs},
+                {"t_end": t_end, "every": every, "progress": progress},
+            )
         run = self.start(q, p, velocity=velocity, **controlled, **beside)
         numbers = np.array(run.problem.arrays.numbers)
         values = partial(parameters_at, self.interface.parameters, numbers, data)
         run.change(parameters=values(entered(t, end)))
+        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
         record = IndexedRecord(run, observe, as_events(events))
         record.take(keep=True)
         for count in stretches(run, data, end, values):
             record.go_on(np.inf if count is None else run.steps + count, every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
-        return _said(record)
+        return _said(record, check)
 
 
 def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal | None:
@@ -334,9 +370,10 @@ def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal
     return None
 
 
-def _said(record: IndexedRecord) -> IndexedTrajectory:
-    """What was kept, after what is to be said of its worst step, and of its energy."""
+def _said(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
+    """What was kept, after what is to be said of its worst step, of its energy and of the growth of errors."""
     found = record.trajectory()
+    check.warn(found)
     warn_of_long_steps(found, remedy="")
     if record.run.interface.conserves_energy:
         _say_lost_energy(found)

@@ -15,6 +15,7 @@ from scvi_codegen.files.export import write_whole
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.events import Event
+from scvi_codegen.runtime.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_between import Departure, states_between
 from scvi_codegen.runtime.indexed_events import IndexedCrossings, IndexedSearch
@@ -25,7 +26,7 @@ __all__ = ["IndexedRecord", "IndexedTrajectory", "check_npz"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndexedTrajectory:
+class IndexedTrajectory(Confirmed):
     """States along a run of k kept states, the initial one first.
 
     Attributes:
@@ -42,6 +43,7 @@ class IndexedTrajectory:
         goal: where steps lead that choose their length; rejected: those that were taken again, shorter.
         events: what was found of each event, in their order.
         departures: how the run goes on from each state, for those between.
+        confirmation: the comparison with a second run where ``error=`` asked for one, else ``None``.
     """
 
     t: Numbers
@@ -60,6 +62,7 @@ class IndexedTrajectory:
     rejected: int = 0
     events: tuple[IndexedCrossings, ...] = ()
     departures: tuple[Departure, ...] = field(default=(), repr=False)
+    confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())

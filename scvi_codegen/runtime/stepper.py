@@ -21,10 +21,12 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.driven import checked_inputs, drive, end_of, entered, parameters_of
+from scvi_codegen.runtime.driven import advance_to, checked_inputs, drive, end_of, entered, parameters_of
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensembles import Ensembles
+from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import Event, EventLike
+from scvi_codegen.runtime.global_error import checked_error, confirmed_run
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.observation import Observation, observed_until
@@ -61,6 +63,8 @@ class Stepper(Ensembles):
         progress: Callable[[int], None] | None = None,
         t_eval: ArrayLike | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
+        error: float | None = None,
+        check_growth: bool | None = None,
     ) -> Trajectory:
         """Run ``steps`` steps of h, or to t_end, and keep every ``every``-th state, the initial one first.
 
@@ -82,6 +86,14 @@ class Stepper(Ensembles):
             events: zero crossings to record as ``events`` of the trajectory; a terminal one ends it. An
                 :class:`~scvi_codegen.runtime.events.Event`, a function of (q, v, p, t) as text or SymPy expression, or
                 several. They are compiled with the integrator, once. By default those of :func:`compile_stepper`.
+            error: in place of a tolerance, bound of the relative global error of all kept states up to t_end. Local
+                tolerances are chosen until a second run, with other steps and a state changed in its last place,
+                confirms it: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. Where
+                binary64 does not allow it, as for chaotic motions, an :class:`~scvi_codegen.AccuracyWarning` gives the
+                time until which the bound is confirmed.
+            check_growth: after a run of adaptive steps, repeat up to 2048 of them (half, where errors grow slowly) from
+                a state changed in its last place, and warn if that ends elsewhere by more than 1e-7 of its size.
+                ``True``: all steps; ``False``: none.
 
         Returns:
             A :class:`Trajectory`: steps // every + 1 states, fewer if an event ended it. An
@@ -96,6 +108,15 @@ class Stepper(Ensembles):
         if t_eval is not None and every != 1:
             raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
         clocked = bool(self.interface.energy_parameter)
+        if error is not None:
+            return confirmed_run(
+                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, monitored=self._has_tau),
+                stepper.integrate,
+                stepper.with_events(()).integrate,
+                (q, p, velocity),
+                {"t": t, "parameters": parameters, "options": options},
+                {"t_end": t_end, "every": every, "progress": progress, "t_eval": t_eval},
+            )
         run = stepper.start(
             q,
             p,
@@ -107,6 +128,7 @@ class Stepper(Ensembles):
             parameters=parameters,
             options=options,
         )
+        check = GrowthCheck(run, check_growth)
         if h is not None and t_end is not None and not self.interface.monitor:
             whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
             if whole is None or whole % checked_count(every, "every", least=1):
@@ -117,10 +139,18 @@ class Stepper(Ensembles):
             found = run.record(steps, every=every, progress=progress)
             if run.leaving:
                 warn_of_long_steps(found)
-            return found
-        if clocked:
+        elif clocked:
             raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
-        return _said(Observation(run, times=times_of_run(t_eval, run.t, _end_of(run, steps))).advance(steps, progress))
+        else:
+            times = times_of_run(t_eval, run.t, _end_of(run, steps))
+            found = _said(Observation(run, times=times).advance(steps, progress))
+        check.warn(found)
+        return found
+
+    @property
+    def _has_tau(self) -> bool:
+        """Whether its steps are of tau, by a time transformation or a monitor."""
+        return bool(self.interface.energy_parameter or self.interface.monitor)
 
     @takes(StateError)
     def start(
@@ -177,6 +207,8 @@ class Stepper(Ensembles):
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
+        error: float | None = None,
+        check_growth: bool | None = None,
     ) -> DrivenTrajectory:
         """Run a system whose inputs are data: steps end at their breakpoints, so that the order is kept.
 
@@ -187,6 +219,7 @@ class Stepper(Ensembles):
             h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
             steps, t_end: with h one of both; without it ``t_end``.
             q, p, velocity, tolerance, every, t, parameters, options, progress, events: as of :meth:`integrate`.
+            error, check_growth: as of :meth:`integrate`.
 
         Raises:
             StateError: for inputs that are not given for all of the run, or make no function of time.
@@ -194,6 +227,15 @@ class Stepper(Ensembles):
         """
         stepper = self if events is None else self.with_events(events)
         data = checked_inputs(self.interface, inputs)
+        if error is not None:
+            return confirmed_run(
+                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, monitored=self._has_tau),
+                stepper.drive,
+                stepper.with_events(()).drive,
+                (q, p, velocity),
+                {"t": t, "parameters": parameters, "options": options, "inputs": inputs},
+                {"t_end": t_end, "every": every, "progress": progress},
+            )
         end = end_of(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         run = stepper.start(
@@ -207,7 +249,11 @@ class Stepper(Ensembles):
             parameters=values(entered(t, end)),
             options=options,
         )
-        return drive(run, data, end, every=checked_count(every, "every", least=1), values=values, progress=progress)
+        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
+        every = checked_count(every, "every", least=1)
+        found = drive(run, data, end, every=every, values=values, progress=progress)
+        check.warn(found)
+        return found
 
     def restore(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Self, overload
 
@@ -23,6 +23,7 @@ from scvi_codegen.runtime.dense_output import checked_times, states_at
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.exchanges import exchanged_until
+from scvi_codegen.runtime.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.kept_states import Array, checked_row
 from scvi_codegen.runtime.nearby import NearbyMotions
 from scvi_codegen.runtime.quantities import quantities
@@ -42,7 +43,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trajectory(NearbyMotions):
+class Trajectory(NearbyMotions, Confirmed):
     """States along a run, the initial one first.
 
     Attributes:
@@ -64,6 +65,7 @@ class Trajectory(NearbyMotions):
         step_error, step_error_t: an estimate of the relative error of the worst step of the run, beside its state, or
             beside the largest of the run where that is near rest at the origin; and when it began. Not numbers for
             methods without a curve to tell them from, or with curves that are no polynomials.
+        confirmation: the comparison with a second run where ``error=`` asked for one, else ``None``.
     """
 
     iterations: NDArray[np.int32]
@@ -72,6 +74,7 @@ class Trajectory(NearbyMotions):
     rejected: int = 0
     step_error: float = np.nan
     step_error_t: float = np.nan
+    confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         return holds(self, lengths_of(self.h, self.goal, tau=self.tau is not None))

@@ -1,0 +1,466 @@
+"""Global error of whole runs: the estimate bounds the true error, chaos ends what is confirmed, defaults warn."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import mpmath
+import numpy as np
+import pytest
+from extrapolation import Real, integrated
+
+import scvi_codegen as sc
+
+MASSES = np.array([3, 4, 5], dtype=Real)
+
+
+def burrau(t, y):
+    q, p = y[:6].reshape(3, 2), y[6:].reshape(3, 2)
+    apart = q[:, None] - q[None]
+    r = np.sqrt((apart**2).sum(-1)) + np.eye(3)
+    forces = -((MASSES[:, None] * MASSES / r**3)[..., None] * apart).sum(1)
+    return np.concatenate([(p / MASSES[:, None]).ravel(), forces.ravel()])
+
+
+def kepler(mu):
+    return lambda t, y: np.array([y[2], y[3], *(-Real(mu) * y[:2] / (y[0] ** 2 + y[1] ** 2) ** Real(1.5))])
+
+
+def on_an_ellipse(q, p, times):
+    """Kepler's problem with mu = 1 in 40 digits, by his equation; (n, 4) states at times, from (q, p) at the first."""
+    with mpmath.workdps(40):
+        (x, y), (vx, vy) = map(mpmath.mpf, q), map(mpmath.mpf, p)
+        r = mpmath.hypot(x, y)
+        a = 1 / (2 / r - vx**2 - vy**2)
+        n, e_sin, e_cos = a ** mpmath.mpf(-1.5), (x * vx + y * vy) / mpmath.sqrt(a), 1 - r / a
+        found = []
+        for t in times:
+            mean = n * (mpmath.mpf(float(t)) - mpmath.mpf(float(times[0])))
+            g = mean  # change of the eccentric anomaly: g - e_cos sin g + e_sin (1 - cos g) = mean
+            low, high = mean - 2, mean + 2
+            for _ in range(300):
+                rest = g - e_cos * mpmath.sin(g) + e_sin * (1 - mpmath.cos(g)) - mean
+                low, high = (low, g) if rest > 0 else (g, high)
+                new = g - rest / (1 - e_cos * mpmath.cos(g) + e_sin * mpmath.sin(g))
+                new = new if low < new < high else (low + high) / 2
+                if abs(new - g) < mpmath.mpf(10) ** -38:
+                    break
+                g = new
+            f, h = 1 - a / r * (1 - mpmath.cos(g)), (mean - g + mpmath.sin(g)) / n
+            now = a * (1 - e_cos * mpmath.cos(g) + e_sin * mpmath.sin(g))
+            f_dot, h_dot = -mpmath.sqrt(a) / (now * r) * mpmath.sin(g), 1 - a / now * (1 - mpmath.cos(g))
+            state = (f * x + h * vx, f * y + h * vy, f_dot * x + h_dot * vx, f_dot * y + h_dot * vy)
+            found.append([Real(mpmath.nstr(each, 30)) for each in state])
+    return np.array(found)
+
+
+def double_pendulum(t, y):
+    """Unit masses and lengths, g = 1; y is (a, b, p_a, p_b)."""
+    a, b, pa, pb = y
+    c, s = np.cos(a - b), np.sin(a - b)
+    d = 2 - c**2
+    va, vb = (pa - c * pb) / d, (2 * pb - c * pa) / d
+    return np.array([va, vb, -va * vb * s - 2 * np.sin(a), va * vb * s - np.sin(b)])
+
+
+def chain(t, y):
+    """Fixed ends, unit masses, springs q + 0.3 q^3."""
+    n, k = len(y) // 2, Real(0.3)
+    d = np.diff(np.concatenate([[Real(0)], y[:n], [Real(0)]]))
+    force = d + k * d**3
+    return np.concatenate([y[n:], force[1:] - force[:-1]])
+
+
+def made(name, coordinates, lagrangian, **more):
+    return sc.LagrangianSystem.from_text(name=name, coordinates=coordinates, lagrangian=lagrangian, **more)
+
+
+def pythagorean():
+    pairs = ((0, 1), (1, 2), (2, 0))
+    kinetic = " + ".join(f"{int(m)}*(x{i}_dot**2 + y{i}_dot**2)/2" for i, m in enumerate(MASSES))
+    attraction = " + ".join(f"{int(MASSES[i] * MASSES[j])}/sqrt((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in pairs)
+    return made("pythagorean", [f"{c}{i}" for i in range(3) for c in "xy"], f"{kinetic} + {attraction}")
+
+
+PYTHAGOREAN = [1.0, 3.0, -2.0, -1.0, 1.0, -1.0], [0.0] * 6
+
+
+class Case:
+    """A system with its equations of motion in extended precision, from other hands; y is (q, p)."""
+
+    def __init__(self, build, f, q, p, t, t_end, method="svi:8", parameters=None):
+        self.build, self.f, self.q, self.p, self.span = build, f, q, p, (t, t_end)
+        self.method, self.parameters = method, parameters
+
+    def run(self, error, **more):
+        start = {"t": self.span[0], "t_end": self.span[1], "parameters": self.parameters}
+        return sc.compile_stepper(self.build(), self.method).integrate(self.q, self.p, error=error, **start, **more)
+
+    def true_errors(self, trajectory):
+        """Relative to the largest state until then, as the estimate is, at up to 300 states."""
+        chosen = np.unique(np.linspace(0, len(trajectory) - 1, 300).astype(int))
+        m = len(self.q)
+        times = [self.span[0], *trajectory.t[chosen[1:]]]
+        if self.f is on_an_ellipse:
+            exact = on_an_ellipse(self.q, self.p, times)
+        else:
+            exact = integrated(self.f, [*self.q, *self.p], times)
+        early = np.abs(np.array(times) - times[0]) <= abs(self.span[1] - times[0]) / 16
+        worst = np.zeros(len(chosen))
+        for half, found in ((exact[:, :m], trajectory.q[chosen]), (exact[:, m:], trajectory.p[chosen])):
+            norms = np.sqrt((half**2).sum(1))
+            sizes = np.maximum.accumulate(np.maximum(norms, norms[early].max()))
+            worst = np.maximum(worst, np.sqrt(((half - found) ** 2).sum(1)) / sizes)
+        return trajectory.t[chosen], worst
+
+
+CASES = {
+    "oscillator, t0 and k not the defaults": Case(
+        lambda: made("o", ["x"], "x_dot**2/2 - k*x**2/2", parameters={"k": 1.0}),
+        lambda t, y: np.array([y[1], -Real(4.0) * y[0]]),
+        [0.7],
+        [-0.2],
+        3.0,
+        103.0,
+        parameters={"k": 4.0},
+    ),
+    "driven and damped, from rest at the origin": Case(
+        lambda: made("d", ["x"], "m*x_dot**2/2 - x**4/4", parameters={"m": 1.0}, forces={"x": "cos(t) - x_dot/10"}),
+        lambda t, y: np.array([y[1] / 2, -(y[0] ** 3) + np.cos(t) - y[1] / 2 / 10]),
+        [0.0],
+        [0.0],
+        -1.0,
+        25.0,
+        parameters={"m": 2.0},
+    ),
+    "near collision, e = 0.999": Case(
+        lambda: made("c", ["x", "y"], "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"),
+        on_an_ellipse,
+        [1.999, 0.0],
+        [0.0, 0.022366272],
+        0.0,
+        20.0,
+    ),
+    "Kepler backward, by SVI(4)": Case(
+        lambda: made("k", ["x", "y"], "(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2)", parameters={"mu": 1.0}),
+        kepler(1.5),
+        [0.5, 0.1],
+        [0.0, 1.6],
+        10.0,
+        -20.0,
+        method="svi:4",
+        parameters={"mu": 1.5},
+    ),
+    "double pendulum": Case(
+        lambda: made("p", ["a", "b"], "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b) + 2*cos(a) + cos(b)"),
+        double_pendulum,
+        [1.0, 0.5],
+        [0.3, 0.1],
+        0.0,
+        20.0,
+    ),
+    "stiff: a fast and a slow spring": Case(
+        lambda: made("s", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - 10000*x**2/2 - y**2/2 - x*y**2"),
+        lambda t, y: np.array([y[2], y[3], -10000 * y[0] - y[1] ** 2, -y[1] - 2 * y[0] * y[1]]),
+        [0.001, 1.0],
+        [0.0, 0.3],
+        0.0,
+        5.0,
+    ),
+    "Henon-Heiles, by Gauss(5)": Case(
+        lambda: made("h", ["x", "y"], "(x_dot**2 + y_dot**2 - x**2 - y**2)/2 - x**2*y + y**3/3"),
+        lambda t, y: np.array([y[2], y[3], -y[0] - 2 * y[0] * y[1], -y[1] - y[0] ** 2 + y[1] ** 2]),
+        [0.1, 0.2],
+        [0.3, 0.1],
+        0.0,
+        60.0,
+        method="gauss:5",
+    ),
+    "a coordinate that grows": Case(
+        lambda: made("g", ["x"], "x_dot**2/2 + x**2/2"),
+        lambda t, y: np.array([y[1], y[0]]),
+        [1.0],
+        [0.3],
+        0.0,
+        12.0,
+        method="scvi:5",
+    ),
+    "a charge in a field, no separable energy": Case(
+        lambda: made("m", ["x", "y"], "(x_dot**2 + y_dot**2)/2 + b*(x*y_dot - y*x_dot)/2 - x**4", parameters={"b": 1}),
+        lambda t, y: np.array(
+            [
+                y[2] + Real(2.5) * y[1] / 2,
+                y[3] - Real(2.5) * y[0] / 2,
+                Real(2.5) / 2 * (y[3] - Real(2.5) * y[0] / 2) - 4 * y[0] ** 3,
+                -Real(2.5) / 2 * (y[2] + Real(2.5) * y[1] / 2),
+            ]
+        ),
+        [0.4, 0.1],
+        [0.3, 0.6],
+        0.0,
+        40.0,
+        parameters={"b": 2.5},
+    ),
+    "a pulse in time": Case(
+        lambda: made("u", ["x"], "x_dot**2/2 - cosh(x) + x*exp(-(t - 6)**2*4)"),
+        lambda t, y: np.array([y[1], -np.sinh(y[0]) + np.exp(-((t - 6) ** 2) * 4)]),
+        [0.5],
+        [0.0],
+        1.0,
+        30.0,
+        method="radau-iia:5",
+    ),
+    "FPUT chain": Case(
+        lambda: made(
+            "f",
+            [f"x{i}" for i in range(4)],
+            " + ".join(
+                [f"x{i}_dot**2/2" for i in range(4)]
+                + [f"-({b} - {a})**2/2 - 0.3*({b} - {a})**4/4" for a, b in (("0", "x0"), ("x0", "x1"), ("x1", "x2"))]
+                + ["-(x3 - x2)**2/2 - 0.3*(x3 - x2)**4/4 - x3**2/2 - 0.3*x3**4/4"]
+            ),
+        ),
+        chain,
+        [0.5, -0.3, 0.8, 0.1],
+        [0.0, 0.4, 0.0, -0.2],
+        0.0,
+        30.0,
+        method="svi:6",
+    ),
+    "relativistic": Case(
+        lambda: made("r", ["x"], "-sqrt(1 - x_dot**2) - x**4/4"),
+        lambda t, y: np.array([y[1] / np.sqrt(1 + y[1] ** 2), -(y[0] ** 3)]),
+        [0.5],
+        [2.0],
+        0.0,
+        60.0,
+    ),
+}
+QUICK = (
+    "oscillator, t0 and k not the defaults",
+    "driven and damped, from rest at the origin",
+    "near collision, e = 0.999",
+)
+
+
+def check_bounds(name, error):
+    case = CASES[name]
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        trajectory = case.run(error)
+    t, true = case.true_errors(trajectory)
+    assert true.max() <= trajectory.global_error, "the estimate is no bound"
+    forward = math.copysign(1.0, case.span[1] - case.span[0])
+    confirmed = forward * (t - trajectory.confirmed_until) <= 0
+    assert true[confirmed].max() <= error
+    if trajectory.confirmation.confirmed:
+        assert trajectory.confirmed_until == case.span[1]
+        assert trajectory.global_error <= error
+        assert heard == []
+    else:
+        assert error < 1e-11 or "collision" in name, "binary64 allows this error"
+        assert "is confirmed until t = " in str(heard[0].message)
+
+
+class TestEstimatesBoundTheTrueError:
+    @pytest.mark.parametrize("error", [1e-5, 1e-9])
+    @pytest.mark.parametrize("name", QUICK)
+    def test_of_some_systems(self, name, error):
+        check_bounds(name, error)
+
+    @pytest.mark.full
+    @pytest.mark.parametrize("error", [1e-3, 1e-6, 1e-8, 1e-10, 1e-12])
+    @pytest.mark.parametrize("name", CASES)
+    def test_of_all_systems(self, name, error):
+        check_bounds(name, error)
+
+
+class TestChaos:
+    """Burrau's problem loses thirteen digits until t = 70, a double pendulum all of them until t = 50."""
+
+    def test_digits_are_confirmed_until_they_are_lost(self, burrau_stepper):
+        q, p = PYTHAGOREAN
+        until = {}
+        for error in (1e-6, 1e-9):
+            with pytest.warns(sc.AccuracyWarning, match=rf"global error {error:g} is confirmed until t = "):
+                run = burrau_stepper.integrate(q, p, t_end=70.0, error=error)
+            assert not run.confirmation.confirmed
+            assert run.confirmed_digits == 0
+            until[error] = run.confirmed_until
+            early = run.t <= min(run.confirmed_until, 9.0)
+            exact = integrated(burrau, [*q, *p], run.t[early][::20])
+            apart = np.abs(exact[:, :6] - run.q[early][::20]).max()
+            assert apart <= error * np.linalg.norm(q)
+        assert 5.0 < until[1e-9] < until[1e-6] < 20.0
+
+    @pytest.mark.full
+    def test_confirmed_digits_are_right(self, burrau_stepper):
+        q, p = PYTHAGOREAN
+        run = burrau_stepper.integrate(q, p, t_end=70.0, error=1e-6)
+        kept = np.append(np.flatnonzero(run.t <= run.confirmed_until)[::10], len(run) - 1)
+        exact = integrated(burrau, [*q, *p], run.t[kept])
+        apart = np.linalg.norm(exact[:, :6] - run.q[kept], axis=1)
+        assert apart[:-1].max() <= 1e-6 * np.linalg.norm(q)
+        assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
+
+    @pytest.mark.parametrize("more", [{}, {"every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
+    def test_a_default_run_warns(self, burrau_stepper, more):
+        with pytest.warns(sc.AccuracyWarning, match="magnifies errors: a run from an initial state changed by 8.9e-16"):
+            burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more)
+
+    @pytest.mark.filterwarnings("error")
+    def test_it_does_not_where_it_is_told_not_to_or_goes_on_for_less(self, burrau_stepper):
+        burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
+        burrau_stepper.integrate(*PYTHAGOREAN, t_end=3.0)
+
+    @pytest.mark.filterwarnings("error")
+    def test_regular_motions_are_no_reason(self, kepler_stepper):
+        kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, check_growth=True)
+        kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, tolerance=1e-9)
+
+    def test_states_are_the_same_with_the_check_and_without(self, burrau_stepper):
+        with pytest.warns(sc.AccuracyWarning):
+            one = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0)
+        other = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
+        assert np.array_equal(one.q, other.q)
+
+    def test_long_runs_are_checked_up_to_a_limit_or_as_a_whole(self):
+        """Duffing's oscillator with two wells, chaotic after t = 1000 alone."""
+        late = "(1 + tanh(t - 1000))/2"
+        wells = f"{late}*(x**2 - x**4/4 + x*cos(t)/2)"
+        system = made("late", ["x"], f"x_dot**2/2 - x**2/2 + x*cos(7*t)/100 + {wells}")
+        stepper = sc.compile_stepper(system, "svi:4")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            run = stepper.integrate([0.1], [0.3], t_end=1300.0)
+        assert run.steps > 2048
+        with pytest.warns(sc.AccuracyWarning, match="magnifies errors"):
+            stepper.integrate([0.1], [0.3], t_end=1300.0, check_growth=True)
+
+
+@pytest.fixture(scope="module")
+def burrau_stepper():
+    return sc.compile_stepper(pythagorean(), "svi:8")
+
+
+@pytest.fixture(scope="module")
+def kepler_stepper():
+    return sc.compile_stepper(sc.problem("kepler").system, "svi:8")
+
+
+class TestWhatIsRefused:
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"h": 0.1, "steps": 10}, "error=1e-06 and h=0.1 both determine the step size"),
+            ({"t_end": 1.0, "tolerance": 1e-9}, "and tolerance=1e-09 both determine the step size"),
+            ({"t_end": 1.0, "error": 0.0}, "error=0 is no bound .* give a number between 0 and 1"),
+            ({"t_end": 1.0, "error": math.nan}, "a finite number is wanted"),
+            ({}, "t_end"),
+            ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "needs adaptive steps"),
+        ],
+    )
+    def test_what_does_not_go_together(self, kepler_stepper, given, message):
+        with pytest.raises(sc.StateError, match=message):
+            kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], **{"error": 1e-6, **given})
+
+    def test_a_time_transformation(self):
+        stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:2", monitor="frequency")
+        with pytest.raises(sc.StateError, match="a time transformation has fixed steps of tau"):
+            stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0, error=1e-6)
+
+
+class TestOtherRuns:
+    def test_without_error_nothing_is_confirmed(self, kepler_stepper):
+        run = kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0)
+        assert run.confirmation is None
+        assert run.confirmed_digits is None
+        assert math.isnan(run.global_error)
+        assert math.isnan(run.confirmed_until)
+
+    def test_kept_states_and_events(self, kepler_stepper):
+        start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
+        at = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, t_eval=[10.0, 30.0])
+        assert at.t.tolist() == [10.0, 30.0] == at.confirmation.t.tolist()
+        assert at.confirmed_until == 30.0
+        ended = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, events=sc.Event("q2", terminal=2))
+        assert ended.confirmed_until == ended.t[-1] < 50.0
+        exact = on_an_ellipse(start["q"], start["p"], [0.0, *ended.t[1:]])
+        assert np.abs(exact[:, :2] - ended.q).max() <= 1.6 * ended.global_error
+        kept = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, every=10)
+        assert len(kept) == -(-kept.steps // 10) + 1
+        assert kept.global_error <= 1e-9
+
+    def test_constraints_against_an_angle(self):
+        """A pendulum held by x^2 + y^2 = 1 and one that has no other coordinate than its angle."""
+        held = made("h", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            run = sc.compile_stepper(held, sc.SVI(6, "gauss-lobatto:7")).integrate(
+                [1.0, 0.0], [0.0, 0.4], t_end=10.0, error=1e-8
+            )
+        exact = integrated(lambda t, y: np.array([y[1], -np.cos(y[0])]), [0.0, 0.4], run.t)[:, 0]
+        apart = np.hypot(run.q[:, 0] - np.cos(exact), run.q[:, 1] - np.sin(exact))
+        assert apart.max() <= run.global_error <= 1e-8
+
+    @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
+    def test_inputs(self, indexed):
+        """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
+        table = (np.array([0.5, 2.0, 6.0]), np.array([0.75, 0.0, 0.0]))
+        if indexed:
+            system = sc.IndexedSystem.from_text(
+                name="i",
+                coordinates=["q[N]"],
+                lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2 + u*q[i])",
+                inputs=["u"],
+            )
+            stepper = sc.compile_indexed(system, "svi:6")
+        else:
+            stepper = sc.compile_stepper(made("i", ["q"], "q_dot**2/2 - q**2/2 + u*q", inputs=["u"]), "svi:6")
+        run = stepper.drive([0.3], [0.1], inputs={"u": table}, t=0.5, t_end=6.0, error=1e-9)
+        q = (run.q["q"] if indexed else run.q)[:, 0]
+
+        def pushed(t):
+            """The particular solution is 1 - t/2."""
+            s = t - 0.5
+            return (0.3 - 0.75) * np.cos(s) + (0.1 + 0.5) * np.sin(s) + 1 - t / 2
+
+        at, rate = pushed(2.0), -(0.3 - 0.75) * np.sin(1.5) + 0.6 * np.cos(1.5) - 0.5
+        free = at * np.cos(run.t - 2.0) + rate * np.sin(run.t - 2.0)
+        exact = np.where(run.t <= 2.0, pushed(run.t), free)
+        assert np.abs(q - exact).max() <= run.global_error <= 1e-9
+        assert run.confirmed_until == 6.0
+
+    def test_arrays(self):
+        system = sc.IndexedSystem.from_text(
+            name="chain",
+            coordinates=["q[N]"],
+            lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N - 1, (q[i+1] - q[i])**2/2 + k*(q[i+1] - q[i])**4/4)"
+            " - q[0]**2/2 - k*q[0]**4/4 - q[N - 1]**2/2 - k*q[N - 1]**4/4",
+            parameters={"k": 0.0},
+        )
+        start = [0.5, -0.3, 0.8, 0.1]
+        stepper = sc.compile_indexed(system, "svi:6")
+        run = stepper.integrate(start, [0.0] * 4, t=2.0, t_end=12.0, parameters={"k": 0.3}, error=1e-9)
+        exact = integrated(chain, [*start, *[0.0] * 4], [2.0, *run.t[1:]])
+        size = np.linalg.norm(exact[:, :4], axis=1).max()
+        assert np.linalg.norm(exact[:, :4] - run.q["q"], axis=1).max() <= run.global_error * size
+        assert run.global_error <= 1e-9
+        with pytest.raises(sc.StateError, match="observe"):
+            stepper.integrate(start, t_end=12.0, observe=lambda run: run.energy, error=1e-9)
+
+    def test_arrays_that_are_chaotic_warn(self):
+        system = sc.IndexedSystem.from_text(
+            name="pendulums",
+            coordinates=["q[N]"],
+            lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))",
+        )
+        stepper = sc.compile_indexed(system, "svi:8")
+        for more in ({}, {"every": 5}):
+            with pytest.warns(sc.AccuracyWarning, match="magnifies errors"):
+                stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, check_growth=False)
+            stepper.integrate([0.2, 0.1, 0.0], [0.0, 0.0, 0.0], t_end=100.0)
