@@ -59,7 +59,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
     memcpy(m, past + CURVE_MEMORY, sizeof m);
   for (int k = 0; needs_sweep(&now); k++) {
     lanes change = lanes_of(0.0), r[M], gamma[M], corrected[M];
-    double total, misfit[M], last = now.last;
+    double total, misfit[M], last = now.last, before = now.before;
     evaluate_nodes(step, &curve, m, node, mass);
     factor_mass(mass);
     for (int i = 0; i < M; i++)
@@ -97,7 +97,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
       for (int i = 0; i < M; i++)
         curve.z[0][i] += STIR * corrected[i];
     if (settled && now.status == 0) {
-      now.status = comes_to_rest(total, last, options, ROUNDING_MARGIN);
+      now.status = comes_to_rest(total, last, before, options, ROUNDING_MARGIN);
     } else if (now.status > 0 && !settled) { /* once more: the rate of contraction shows late */
       settled = 1;
       now.status = 0;

@@ -80,7 +80,7 @@ static inline int settle(swept_step *at, int back, lanes (*x0)[M], lanes (*p0)[M
 {
   const lanes *table = back ? CHANGE_POSITION_BACK : CHANGE_MOMENTUM;
   lanes v[GROUPS][M], F[GROUPS][M], p[GROUPS][M];
-  double last = INFINITY;
+  sweep_changes past = {INFINITY, INFINITY};
   int status = 0;
   memset(v, 0, sizeof v);
   memset(p, 0, sizeof p);
@@ -103,7 +103,7 @@ static inline int settle(swept_step *at, int back, lanes (*x0)[M], lanes (*p0)[M
       }
     }
     if (k >= *look)
-      status = changes_rest(fabs(points_total(moved)), fabs(points_total(size)), &last, k, look);
+      status = changes_rest(fabs(points_total(moved)), fabs(points_total(size)), &past, k, look);
     place_changes(at, back, x0, v, f);
   }
   return status == 1 ? OK : NOT_CONVERGED;

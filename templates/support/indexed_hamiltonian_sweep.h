@@ -121,14 +121,15 @@ static double largest_yet(const run_memory *run, const lanes *velocity, long lon
 static double unresolved_of_block(const run_memory *run, const lanes *velocity, long long n, double decay,
     double largest, section here)
 {
+  const double scale = scale_of(largest), unit = scale * run->h;
   double least = 0.0;
   for (long long i = here.first; i < here.end; i++) {
     const lanes *rate = &velocity[i];
-    const double size = fabs(run->q[i]) + moved_by(run, velocity, n, i) + largest;
+    const double size = scale * (fabs(run->q[i]) + moved_by(run, velocity, n, i) + largest);
     const double start = at_point(rate, 2 * n, 0), middle = at_point(rate, 2 * n, KEPT / 2);
     const double ends = fabs(at_point(rate, 2 * n, KEPT - 1) - start) + fabs(middle - start);
-    const double bend = fabs(run->h) * ends + NEGLIGIBLE * size;
-    const double top = run->h * top_coefficient(rate, 2 * n, decay);
+    const double bend = fabs(unit) * ends + NEGLIGIBLE * size;
+    const double top = unit * top_coefficient(rate, 2 * n, decay);
     least = larger(least, top * top / larger(bend * size, DBL_MIN)); /* all may be 0 */
   }
   return least;

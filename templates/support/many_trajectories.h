@@ -41,13 +41,13 @@ static inline int start_velocities(const step_data *step, lanes (*z)[M])
 
 /* How the sweeps of a step come on. */
 typedef struct {
-  lanes first, last;
+  lanes first, last, before;
   int pending;
 } progress;
 
 static inline progress before_sweeps(void)
 {
-  const progress none = {lanes_of(0.0), lanes_of(INFINITY), 1};
+  const progress none = {lanes_of(0.0), lanes_of(INFINITY), lanes_of(INFINITY), 1};
   return none;
 }
 
@@ -59,17 +59,18 @@ static inline int needs_sweep(const progress *now)
 /* Trajectories that contract too slowly or left the domain become inactive. */
 static inline void take_change(progress *now, lanes change, const solver_options *options, int k, solver_report *report)
 {
-  const lane_view after = {change}, before = {now->last};
+  const lane_view after = {change}, last = {now->last}, before = {now->before};
   const solver_options wanted = *options; /* where nothing that is written can be meant */
   double *active = report->active;
   int pending = 0;
   for (int j = 0; j < LANES; j++) {
-    const int status = sweep_status(after.lane[j], before.lane[j], &wanted, k);
+    const int status = sweep_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
     active[j] = status < 0 ? 0.0 : active[j];
     pending += (active[j] > 0.0) & (status == 0);
   }
   now->pending = pending > 0;
   now->first = k == 0 ? change : now->first;
+  now->before = now->last;
   now->last = change;
   report->sweeps++;
 }

@@ -84,7 +84,7 @@ static inline int settle(swept_step *at, int back, lanes (*f)[M], int *look)
 {
   const lanes *table = back ? PRODUCT_BACK : PRODUCT;
   lanes(*x)[M + POINT_SLOPES] = at->u, x0[GROUPS][M];
-  double last = INFINITY;
+  sweep_changes past = {INFINITY, INFINITY};
   int status = 0;
   for (int n = 0; n < GROUPS; n++)
     memcpy(x0[n], x[n], sizeof x0[n]);
@@ -103,7 +103,7 @@ static inline int settle(swept_step *at, int back, lanes (*f)[M], int *look)
           size[n] += at->mass[i] * (next * next);
           x[n][i] = next;
         }
-      status = changes_rest(points_total(moved), points_total(size), &last, k, look);
+      status = changes_rest(points_total(moved), points_total(size), &past, k, look);
     }
     through_slopes(at, back, f);
   }
